@@ -1,0 +1,160 @@
+"""What does going through diffrax cost, against a hand-written scan?
+
+Three programs predict the same windows with the same hybrid, RK4 and held inputs; only the integrator differs:
+`hybrid_jax.rollout` (diffrax solver steps in a scan), a hand-written RK4 in a `lax.scan`, and one
+`diffrax.diffeqsolve` an interval. So do their gradients with respect to the hybrid's parameters. Then: how many windows
+of 1 s does `hybrid_jax.rollout` predict in a second, all at once and in chunks that stay in the cache?
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from rich.table import Table
+
+from benchmarks.plain import rk4
+from benchmarks.subjects import DT, make_windows, untrained
+from benchmarks.timing import Findings, Ratio, agree, compiled, in_turns, run
+from hybrid_jax.rollout import RK4, rollout
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
+
+REACH = 1.05  # times the hand-written scan
+# Float32 rounds at 6e-8, and each of up to 100 steps of ten operations may round otherwise; gradients add up windows.
+AGREEMENT = {"prediction": 1e-4, "gradient": 1e-3}
+CHUNK = 250  # windows, as in hybrid_jax.metrics
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Windows, steps of each, what is done with them, and turns."""
+
+    windows: int
+    cases: tuple[tuple[str, int], ...]
+    turns: int
+
+
+PRESETS = {
+    "full": Preset(1000, (("prediction", 10), ("prediction", 100), ("gradient", 10)), turns=30),
+    "smoke": Preset(20, (("prediction", 10), ("gradient", 10)), turns=2),
+}
+
+
+def by_diffeqsolve(field: AbstractVectorField, x0, u):
+    """One fixed step of `diffrax.diffeqsolve` an interval, as its documentation has it."""
+    term = diffrax.ODETerm(lambda t, x, held: field(x, held))
+
+    def interval(x, held):
+        solution = diffrax.diffeqsolve(term, RK4(), 0.0, DT, dt0=DT, y0=x, args=held, max_steps=1)
+        (x,) = jax.tree.leaves(solution.ys)[0]  # saved once, at the end
+        return x, x
+
+    return jax.lax.scan(interval, x0, u)[1]
+
+
+INTEGRATORS: dict[str, Callable] = {
+    "hybrid_jax": lambda field, x0, u: rollout(field, x0, u, DT),
+    "by_hand": rk4,
+    "diffeqsolve": by_diffeqsolve,
+}
+
+
+def prediction(integrate: Callable, field: AbstractVectorField, windows: Trajectories):
+    """The states of all windows."""
+    return jax.vmap(partial(integrate, field))(windows.x0, windows.u)
+
+
+def gradient(integrate: Callable, field: AbstractVectorField, windows: Trajectories):
+    """Of the mean squared error of the prediction with respect to the field's parameters."""
+    parameters, rest = eqx.partition(field, eqx.is_inexact_array)
+
+    def error(parameters):
+        predicted = prediction(integrate, eqx.combine(parameters, rest), windows)
+        return jnp.mean(jnp.square(predicted - windows.x))
+
+    return jax.grad(error)(parameters)
+
+
+WORK = {"prediction": prediction, "gradient": gradient}
+
+
+def measure_case(work: str, steps: int, preset: Preset) -> dict[str, Any]:
+    """All integrators on one task: compile seconds, agreement, median seconds."""
+    arguments = untrained("hybrid"), make_windows(preset.windows, steps)
+    programs = {name: compiled(partial(WORK[work], way), *arguments) for name, way in INTEGRATORS.items()}
+    calls = {name: call for name, (call, _) in programs.items()}
+    hand = calls["by_hand"]()
+    differences = {name: agree(f"{work}s of {name}", call(), hand, AGREEMENT[work]) for name, call in calls.items()}
+    times = in_turns(calls, preset.turns)
+    return {
+        "work": work,
+        "windows": preset.windows,
+        "steps": steps,
+        "difference": differences,
+        "compile_seconds": {name: seconds for name, (_, seconds) in programs.items()},
+        "seconds": times.medians(),
+        "times_by_hand": {name: times.ratio(name, "by_hand") for name in calls},
+    }
+
+
+def measure_forward(preset: Preset) -> dict[str, Any]:
+    """Windows of 1 s predicted per second, all at once and in chunks."""
+    arguments = untrained("hybrid"), make_windows(preset.windows, 100)
+    whole = partial(prediction, INTEGRATORS["hybrid_jax"])
+
+    def chunked(field, windows):
+        one = partial(INTEGRATORS["hybrid_jax"], field)
+        return jax.lax.map(lambda window: one(window.x0, window.u), windows, batch_size=min(CHUNK, preset.windows))
+
+    calls = {"at_once": compiled(whole, *arguments)[0], "chunks": compiled(chunked, *arguments)[0]}
+    agree("predictions in chunks", calls["chunks"](), calls["at_once"](), AGREEMENT["prediction"])
+    seconds = in_turns(calls, preset.turns).medians()
+    speeds = {name: preset.windows / taken for name, taken in seconds.items()}
+    return {"work": "forward", "windows": preset.windows, "steps": 100, "windows_per_second": speeds}
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The integrators for reading."""
+    heads = ("work", "steps", "integrator", "ms", "× by hand", "compile [s]", "differs by")
+    table = Table(*heads, title="the same hybrid")
+    for row in rows:
+        for name, seconds in row["seconds"].items():
+            ratio, compiling, difference = (row[k][name] for k in ("times_by_hand", "compile_seconds", "difference"))
+            numbers = f"{1e3 * seconds:.2f}", f"{ratio:.3f}", f"{compiling:.1f}", f"{difference:.0e}"
+            table.add_row(row["work"], str(row["steps"]), name, *numbers)
+    return table
+
+
+def forward_table(row: dict[str, Any]) -> Table:
+    """The speed of prediction for reading."""
+    table = Table("", "windows/s", title=f"forward prediction of 1 s, {row['windows']} windows")
+    for name, speed in row["windows_per_second"].items():
+        table.add_row(name.replace("_", " "), f"{speed:,.0f}")
+    return table
+
+
+def ratios_of(row: dict[str, Any]) -> list[Ratio]:
+    """Ours and diffeqsolve's time over that by hand; the reach is asked of our predictions."""
+    task = f"{row['work']}, {row['steps']} steps"
+    ours, solve = row["times_by_hand"]["hybrid_jax"], row["times_by_hand"]["diffeqsolve"]
+    return [
+        Ratio(f"{task}: hybrid_jax / by hand", ours, at_most=REACH),
+        Ratio(f"{task}: diffeqsolve / by hand", solve),
+    ]
+
+
+def measure(preset: Preset) -> Findings:
+    """Every case, then the speed of prediction."""
+    rows = [measure_case(work, steps, preset) for work, steps in preset.cases]
+    forward = measure_forward(preset)
+    ratios = [ratio for row in rows for ratio in ratios_of(row)]
+    return Findings([*rows, forward], [table_of(rows), forward_table(forward)], ratios)
+
+
+if __name__ == "__main__":
+    run("rollout", __doc__, PRESETS, measure)

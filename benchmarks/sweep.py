@@ -1,0 +1,186 @@
+"""Which width of a chunk of lanes is best on this backend, and what do lanes cost that have stopped?
+
+Lanes are models of the paper's protocol that train as in `hybrid_jax.sweep`. Measured is the cost of one epoch of one
+lane, for chunks of several widths, for one lane up to all, on one device and on all. Copies to and from the devices are
+part of it, and a chunk that is not full costs as much as a full one. The best width for all lanes on all devices is
+what `hybrid_jax.lanes.WIDTH` should say. Then the same few lanes train alone, and among others that have stopped. The
+results of all programs are compared before anything is timed.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import jax
+import numpy as np
+from rich.table import Table
+
+from benchmarks.subjects import make_windows, protocol
+from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch
+from experiments.conditions import pretraining, settings
+from experiments.protocol import Model
+from hybrid_jax import training
+from hybrid_jax.lanes import WIDTH, LaneMap, lane
+from hybrid_jax.training import FitState
+from hybrid_jax.vehicle import IRIS
+
+# Losses after some steps of Adam, which divides by small numbers, in float32 with sums in another order.
+AGREEMENT = 1e-3
+# What to reach: the cost of a lane among many over that of a few; the gain by each device; a stopped lane's cost.
+FLAT, SHARED, STOPPED = 1.15, 0.9, 0.05
+
+
+@dataclass(frozen=True)
+class Preset:
+    """What is swept over, what a lane does in an epoch, and turns.
+
+    Attributes:
+        one_device: whether to measure on one device too, not only on all.
+        lanes: how many train, in rising order; every program is made for the last.
+        active: how many train among stopped ones.
+    """
+
+    model: Model
+    one_device: bool
+    widths: tuple[int, ...]
+    lanes: tuple[int, ...]
+    active: int
+    n_train: int
+    validation: int
+    turns: int
+
+
+PRESETS = {
+    "full": Preset("hybrid", True, (1, 2, 5, 10), (1, 2, 5, 10, 20), active=5, n_train=500, validation=1000, turns=10),
+    "smoke": Preset("no_physics", False, (1, 2), (1, 2), active=1, n_train=100, validation=10, turns=2),
+}
+Program = Callable[[int], FitState]
+Place = tuple[int, int]  # devices, width
+
+
+def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Program:
+    """One epoch of the first so many of `lanes` lanes, as `hybrid_jax.sweep` runs a block of epochs."""
+    config = protocol(preset.lanes[-1], preset.n_train)
+    chosen = settings(config)
+
+    def epoch(lane, train, validation):
+        state, plan = lane
+        return training.run(state, plan, train, validation, chosen, state.epoch + 1)
+
+    mapped = LaneMap(epoch, width, jax.local_devices()[:devices])
+    start = lane(pretraining(preset.model, IRIS, config), np.arange(lanes))
+    shared = make_windows(preset.n_train, 10), make_windows(preset.validation, 10)
+    return lambda active: mapped(start, shared, [1.0] * lanes, range(active))
+
+
+def losses(states: FitState):
+    """What programs must agree on: each lane's losses after the epoch."""
+    return states.train_loss, states.best_mse
+
+
+def make_programs(preset: Preset) -> tuple[dict[Place, Program], dict[Place, float]]:
+    """A program for each place, and the seconds of each one's first run, most of them compilation.
+
+    Raises:
+        Disagreement: a lane's losses depend on which of them it ran in.
+    """
+    total, programs, seconds, first = preset.lanes[-1], {}, {}, None
+    for place in places_of(preset):
+        program = programs[place] = make_program(preset, total, *place)
+        states, seconds[place] = stopwatch(lambda program=program: program(total))
+        first = states if first is None else first
+        agree(f"losses on {place[0]} devices in chunks of {place[1]}", losses(states), losses(first), AGREEMENT)
+    return programs, seconds
+
+
+def places_of(preset: Preset) -> list[Place]:
+    """All numbers of devices times all widths, a backend's default width among them."""
+    every = jax.local_device_count()
+    devices = sorted({1, every}) if preset.one_device else [every]
+    widths = sorted({*preset.widths, default_width(preset)})
+    return [(number, width) for number in devices for width in widths]
+
+
+def default_width(preset: Preset) -> int:
+    """The width that a sweep takes unasked: a backend without a measured one takes all lanes at once."""
+    return WIDTH.get(jax.default_backend(), preset.lanes[-1])
+
+
+def measure_cells(preset: Preset, programs: dict[Place, Program], compiling: dict[Place, float]):
+    """The cost of a lane's epoch for every number of devices, width and number of lanes, as rows and as times."""
+    calls = {(*place, lanes): partial(program, lanes) for place, program in programs.items() for lanes in preset.lanes}
+    times = in_turns(calls, preset.turns)
+    rows = [
+        {
+            "devices": devices,
+            "width": width,
+            "lanes": lanes,
+            "seconds_per_lane_epoch": seconds / lanes,
+            "first_run_seconds": compiling[devices, width],
+        }
+        for (devices, width, lanes), seconds in times.medians().items()
+    ]
+    return rows, times
+
+
+def measure_stopped(preset: Preset, among: Program) -> dict[str, Any]:
+    """What each stopped lane adds, as a share of what an active one costs, at the default width on all devices."""
+    alone = make_program(preset, preset.active, jax.local_device_count(), default_width(preset))
+    calls = {"alone": partial(alone, preset.active), "among_stopped": partial(among, preset.active)}
+    lone, crowded = (losses(call()) for call in calls.values())
+    agree("losses among stopped lanes and alone", crowded, lone, AGREEMENT)
+    times = in_turns(calls, 3 * preset.turns)
+    stopped = preset.lanes[-1] - preset.active
+    share = (times.ratio("among_stopped", "alone") - 1) * preset.active / stopped
+    return {"active": preset.active, "stopped": stopped, "seconds": times.medians(), "stopped_share": share}
+
+
+def best_width(rows: list[dict[str, Any]]) -> int:
+    """The cheapest for most lanes on most devices."""
+    last = [row for row in rows if (row["devices"], row["lanes"]) == (rows[-1]["devices"], rows[-1]["lanes"])]
+    return min(last, key=lambda row: row["seconds_per_lane_epoch"])["width"]
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The cells for reading: a line for each width, a column for each number of lanes."""
+    counts = sorted({row["lanes"] for row in rows})
+    heads = ("devices", "width", *(f"{count} lane{'s'[: count > 1]}" for count in counts), "first run [s]")
+    table = Table(*heads, title="ms per lane and epoch")
+    lines: dict[Place, list[dict[str, Any]]] = {}
+    for row in rows:
+        lines.setdefault((row["devices"], row["width"]), []).append(row)
+    for (devices, width), line in lines.items():
+        costs = (f"{1e3 * row['seconds_per_lane_epoch']:.1f}" for row in line)
+        table.add_row(str(devices), str(width), *costs, f"{line[0]['first_run_seconds']:.1f}")
+    return table
+
+
+def ratios_of(preset: Preset, times: Times, width: int) -> list[Ratio]:
+    """Flatness over lanes on the fewest devices that were measured, and the gain by all devices."""
+    total, few, every = preset.lanes[-1], min(place[0] for place in times.seconds), jax.local_device_count()
+    least = next(lanes for lanes in preset.lanes if lanes >= width * few)
+    flat = times.ratio((few, width, total), (few, width, least)) * least / total
+    ratios = [Ratio(f"cost per lane on {few} device{'s'[: few > 1]}, {total} lanes / {least}", flat, at_most=FLAT)]
+    if few < every:
+        gain = times.ratio((few, width, total), (every, width, total))
+        ratios.append(Ratio(f"{total} lanes, {few} device / {every} devices", gain, at_least=SHARED * every))
+    return ratios
+
+
+def measure(preset: Preset) -> Findings:
+    """Widths, then stopped lanes."""
+    programs, compiling = make_programs(preset)
+    rows, times = measure_cells(preset, programs, compiling)
+    stopped = measure_stopped(preset, programs[jax.local_device_count(), default_width(preset)])
+    best = best_width(rows)
+    choice = {"backend": jax.default_backend(), "best_width": best, "default_width": default_width(preset)}
+    table = Table("backend", "best width", "hybrid_jax.lanes.WIDTH", title="all lanes on all devices")
+    table.add_row(*map(str, choice.values()))
+    idle = Ratio("a stopped lane / an active one", stopped["stopped_share"], at_most=STOPPED)
+    ratios = [*ratios_of(preset, times, choice["default_width"]), idle]
+    return Findings([*rows, stopped, choice], [table_of(rows), table], ratios)
+
+
+if __name__ == "__main__":
+    run("sweep", __doc__, PRESETS, measure)

@@ -1,0 +1,70 @@
+"""What the commands of all experiments share: options, presets, one-line errors, exit codes."""
+
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import tyro
+from rich.console import Console
+
+from experiments.protocol import PRESETS, Config
+from hybrid_jax.runtime import configure
+
+BAD_INPUT, INTERRUPTED = 2, 130
+
+
+def run(
+    name: str, about: str, experiment: Callable[[Config, Console], None], arguments: Sequence[str] | None = None
+) -> None:
+    """Read the command line and run an experiment. Bad input ends in one line on stderr and exit code 2."""
+    arguments = sys.argv[1:] if arguments is None else list(arguments)
+    try:
+        config = read(name, about, arguments)
+        check_folder("--out", config.out)
+        configure(config.cache)
+        experiment(config, Console(stderr=True))
+    except (ValueError, OSError) as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted; the same command goes on after the last finished stage", file=sys.stderr)
+        sys.exit(INTERRUPTED)
+
+
+def read(name: str, about: str, arguments: list[str]) -> Config:
+    """The configuration of a command line: the preset, and what the other options change of it.
+
+    Raises:
+        ValueError: an unknown preset, or options that do not fit together.
+    """
+    preset = PRESETS[_preset(arguments)]
+    description = f"{about}\n\n{Config.__doc__}"
+    return tyro.cli(
+        Config, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
+    )
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Make the folder, or say in one line why results could not be written there, before hours are spent on them.
+
+    Raises:
+        ValueError: it cannot be made, or not be written.
+    """
+    probe = folder / ".writable"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
+
+
+def _preset(arguments: list[str]) -> str:
+    for i, argument in enumerate(arguments):
+        name, _, value = argument.partition("=")
+        if name == "--preset":
+            chosen = value or next(iter(arguments[i + 1 :]), "")
+            if chosen not in PRESETS:
+                raise ValueError(f"--preset must be one of {', '.join(PRESETS)}, got {chosen!r}")
+            return chosen
+    return Config.preset

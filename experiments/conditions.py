@@ -1,0 +1,101 @@
+"""What each lane of a sweep starts from and is asked to do: models by seed, plans by size (paper, App. A)."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import PRNGKeyArray
+
+from experiments.protocol import Config, Stopping, column
+from hybrid_jax import training
+from hybrid_jax.lanes import count, lane, stack
+from hybrid_jax.loss import REGULARISERS
+from hybrid_jax.residual import InputScaling, ResidualNetwork, residual_network
+from hybrid_jax.rigid_body import guess
+from hybrid_jax.rollout import SOLVERS
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.training import FitState, Plan, Settings, make_plan
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid
+from hybrid_jax.vehicle import Vehicle
+
+PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION = range(5)  # what the keys of a seed are for
+
+
+def settings(config: Config) -> Settings:
+    """What all lanes of the experiment share."""
+    return Settings(config.batch_size, REGULARISERS.get(config.regulariser), SOLVERS[config.solver])
+
+
+def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
+    """The untrained models of all seeds, stacked. A seed gives the hybrid and its rivals the same parts."""
+
+    def build(seed):
+        physics = guess(vehicle, _key(seed, PHYSICS), low=config.guess[0], high=config.guess[1])
+        network = _network(vehicle, config, _key(seed, NETWORK))
+        return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
+
+    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(np.arange(config.seeds)))
+
+
+def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, Plan]:
+    """One lane a seed, on all source trajectories."""
+    rate, rule = _pretraining_rule(model, config)
+    everything = np.arange(config.source_train)
+    plan = _plan(model, config, rate, rule, everything, config.source_train)
+    starts = _starts(fresh_fields(model, vehicle, config), np.arange(config.seeds), PRETRAINING)
+    return starts, stack([plan] * config.seeds)
+
+
+def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, Plan]:
+    """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
+    pool = max(config.sizes)
+    subsets = [np.asarray(jax.random.permutation(_key(seed, SUBSET), pool)) for seed in range(config.seeds)]
+    plans = [
+        _plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size)
+        for size in config.sizes
+        for subset in subsets
+    ]
+    seeds = np.tile(np.arange(config.seeds), len(config.sizes))
+    return _starts(lane(fields, seeds), seeds, ADAPTATION), stack(plans)
+
+
+def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> ResidualNetwork:
+    # Around hover, in tenths of it: then rotor speeds are of the size of the other inputs.
+    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+    scaling = {"hover": hover, "raw": InputScaling()}[config.inputs]
+    return residual_network(STATE_SIZE, INPUT_SIZE, key, hidden=config.hidden, scaling=scaling)
+
+
+def _pretraining_rule(model: str, config: Config) -> tuple[float, Stopping]:
+    patience = config.patience
+    no_physics = model == "no_physics"
+    return config.rates.pretraining, patience.no_physics_pretraining if no_physics else patience.hybrid_pretraining
+
+
+def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[float, Stopping]:
+    """The rate of θ_d and the stopping rule of a size."""
+    rates, patience, i = config.rates, config.patience, column(size)
+    if model == "no_physics":
+        rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
+        return rate, patience.no_physics
+    return rates.hybrid[i], Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
+
+
+def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.ndarray, size: int) -> Plan:
+    physics: Any = config.rates.physics
+    network: Any = rate
+    rates = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
+    return make_plan(rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight)
+
+
+def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> FitState:
+    def begin(field, seed):
+        return training.start(field, _key(seed, purpose))
+
+    assert count(fields) == len(seeds)
+    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(begin))(fields, seeds))
+
+
+def _key(seed, purpose: int) -> PRNGKeyArray:
+    return jax.random.fold_in(jax.random.key(seed), purpose)

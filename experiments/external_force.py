@@ -1,0 +1,47 @@
+"""Experiment 2 (paper, Sec. 4.5): a side wind pushes with [0, −4 + sin(2π t / 3), 0] N.
+
+python -m experiments.external_force --help
+"""
+
+import numpy as np
+from rich.console import Console
+
+from experiments import command
+from experiments.outcome import write_outcome
+from experiments.protocol import Config
+from experiments.study import EVERY, study
+from hybrid_jax.sim.domain import EXTERNAL_FORCE
+from hybrid_jax.sim.flight import DT
+from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
+from hybrid_jax.vehicle import IRIS
+
+NAME, TITLE = "external_force", "External force"
+
+
+def experiment(config: Config, console: Console) -> None:
+    """Run the protocol in the wind and write what came of it, beside the error that the wind's sine alone makes."""
+    found = study(EXTERNAL_FORCE, IRIS, config, console)
+    times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)
+    floor = sine_floor(IRIS.mass, times)
+    write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, Console(), floor)
+
+
+def sine_floor(mass: float, times: np.ndarray) -> float:
+    """L_MSE at the times [s] of a model that is perfect but for the wind's sine, which ẋ = f(x, u) cannot see.
+
+    With a = (A / m) sin(ω t), unseen from a start of random phase on, the mean squares over the phase are
+    (A / m)² (1 − cos ωs) / ω² in velocity and (A / m)² (s² / 2ω² + (1 − cos ωs) / ω⁴ − s sin ωs / ω³) in position.
+    """
+    w, s = WIND_ANGULAR_FREQUENCY, times
+    velocity = (1 - np.cos(w * s)) / w**2
+    position = s**2 / (2 * w**2) + (1 - np.cos(w * s)) / w**4 - s * np.sin(w * s) / w**3
+    return float((WIND_AMPLITUDE / mass) ** 2 * np.mean(velocity + position))
+
+
+def main() -> None:
+    """The command line."""
+    command.run(NAME, "A side wind that the model has never felt: adapt to it.", experiment)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,130 @@
+"""Record random flights of a true system as a dataset: python -m experiments.make_flights --help"""
+
+import sys
+from collections.abc import Callable, Mapping
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import tyro
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.table import Table
+
+from hybrid_jax.datasets import Dataset, config_hash, load_dataset, save_dataset
+from hybrid_jax.sim.domain import DOMAINS, Domain
+from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
+from hybrid_jax.sim.render import picture
+
+NOTES = Console(stderr=True)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Fly a simulated quadrotor at random and save windows of the flights as one dataset file.
+
+    The pilot wanders between waypoints at up to about 5 m/s, two fifths of the time less than 0.5 m above ground, and
+    shakes the vehicle so that its inertia shows. Every split comes from flights of its own. The same arguments give the
+    same file, byte for byte; a file that exists with other content is never overwritten.
+
+    Example: python -m experiments.make_flights --domain source --out source.npz --train 10000 --validation 1000
+    """
+
+    domain: Literal["source", "parameter_shift", "external_force"]
+    """source: drag and ground effect. parameter_shift: the same with Ix 0.040, Iy 0.020 kg m². external_force: the same
+    with side wind."""
+    out: Path
+    """File to write (.npz)."""
+    seed: int = 0
+    """Everything random follows from it."""
+    train: int = 1000
+    """Windows of 0.1 s (10 steps) to learn from; 0 leaves a split out."""
+    validation: int = 1000
+    """Windows of 0.1 s."""
+    test: int = 0
+    """Windows of 1 s (100 steps)."""
+    test_with_past: int = 0
+    """Windows of 0.2 s: 10 steps of past and the 10 to predict."""
+    picture: Path | None = None
+    """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
+
+    def splits(self) -> dict[str, SplitSpec]:
+        """The splits asked for.
+
+        Raises:
+            ValueError: none, or a negative size.
+        """
+        steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}
+        splits = {name: SplitSpec(getattr(self, name), n) for name, n in steps.items() if getattr(self, name) != 0}
+        if not splits:
+            raise ValueError("no windows asked for: give --train, --validation, --test or --test-with-past")
+        return splits
+
+
+def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_dir: str | Path) -> Dataset:
+    """The dataset of a domain from the cache folder, flown and put there if it is not.
+
+    Raises:
+        ValueError: a cached file is damaged; says which, so that it can be deleted.
+    """
+    digest = config_hash(configuration(domain, splits, seed))
+    return read_or_fly(Path(cache_dir) / f"flights-{domain.name}-{digest[:12]}.npz", domain, splits, seed)
+
+
+def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
+    """The dataset in a file, flown and written there if the file does not exist.
+
+    Raises:
+        ValueError: the file is damaged or holds a dataset of another configuration.
+    """
+    if not path.exists():
+        with progress_bar(f"flying {domain.name}") as advance:
+            save_dataset(path, make_dataset(domain, splits, seed, advance))
+    return load_dataset(path, configuration(domain, splits, seed))
+
+
+class progress_bar(AbstractContextManager):
+    """A bar on stderr; entering gives the function to call with the share done, 0 … 1."""
+
+    def __init__(self, title: str):
+        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
+        self._progress = Progress(*columns, console=NOTES, transient=True)
+        self._task = self._progress.add_task(title, total=1.0)
+
+    def __enter__(self) -> Callable[[float], None]:
+        self._progress.start()
+        return lambda share: self._progress.update(self._task, completed=share)
+
+    def __exit__(self, *exception) -> None:
+        self._progress.stop()
+
+
+def statistics_table(dataset: Dataset) -> Table:
+    """What was flown, left out and recorded, a column for each split."""
+    tallies, statistics = dataset.metadata["tallies"], dataset.metadata["statistics"]
+    table = Table("", *dataset.splits, title=f"{dataset.config['domain']}, seed {dataset.config['seed']}")
+    table.add_row("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))
+    for name in next(iter(tallies.values())):
+        table.add_row(name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
+    for name in next(iter(statistics.values())):
+        table.add_row(escape(name), *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
+    return table
+
+
+def main() -> None:
+    """Read the command line, record what is not there yet, print the table."""
+    options = tyro.cli(Options, prog="python -m experiments.make_flights", description=Options.__doc__)
+    try:
+        dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
+        if options.picture is not None:
+            picture(options.picture)
+    except (ValueError, OSError) as error:
+        print(f"make_flights: {error}", file=sys.stderr)
+        sys.exit(2)
+    Console().print(statistics_table(dataset))
+
+
+if __name__ == "__main__":
+    main()

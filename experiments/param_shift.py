@@ -1,0 +1,30 @@
+"""Experiment 1 (paper, Sec. 4.4): the inertia shifts, Ix 0.02912 → 0.040, Iy 0.02912 → 0.020 kg m².
+
+python -m experiments.param_shift --help
+"""
+
+from rich.console import Console
+
+from experiments import command
+from experiments.outcome import write_outcome
+from experiments.protocol import Config
+from experiments.study import study
+from hybrid_jax.sim.domain import PARAMETER_SHIFT
+from hybrid_jax.vehicle import IRIS
+
+NAME, TITLE = "param_shift", "Parameter shift"
+
+
+def experiment(config: Config, console: Console) -> None:
+    """Run the protocol on the shifted vehicle and write what came of it."""
+    found = study(PARAMETER_SHIFT, IRIS, config, console)
+    write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())
+
+
+def main() -> None:
+    """The command line."""
+    command.run(NAME, "The vehicle's roll and pitch inertia change: adapt to it.", experiment)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,140 @@
+"""Map one function over many independent lanes: chunks of lanes under `vmap`, chunks in a loop, loops on all devices.
+
+A lane is a slice of a pytree along its first axis. On a CPU a chunk of one lane is fastest, because one lane fills the
+cache; on a GPU a chunk holds all lanes. Which lanes run is data, not shape: one compilation serves a sweep to its end.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
+from jaxtyping import Int, PyTree
+
+Numbers = Sequence[Any] | np.ndarray
+AXIS = "lanes"
+WIDTH = {"cpu": 1}  # measured by benchmarks/sweep.py; a backend that is not listed takes all lanes at once
+
+
+def stack(lanes: Sequence[PyTree]) -> PyTree:
+    """One tree whose arrays have a first axis over the lanes; leaves that are no arrays must agree."""
+    return jax.tree.map(lambda *leaves: np.stack(leaves) if eqx.is_array_like(leaves[0]) else leaves[0], *lanes)
+
+
+def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
+    """The lane, or lanes, at an index of the first axis."""
+    # An entry of a NumPy vector is a scalar, which is no array: asarray makes it one again.
+    return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
+
+
+def count(lanes: PyTree) -> int:
+    """How many lanes there are."""
+    return next(leaf.shape[0] for leaf in jax.tree.leaves(lanes) if eqx.is_array(leaf))
+
+
+def deal(costs: Numbers, active: Numbers, devices: int, width: int) -> list[np.ndarray]:
+    """For each device, which of the active lanes it runs and in which order.
+
+    The dearest chunk goes first, to the device that has least to do; lanes of equal cost share a chunk, so that none of
+    them waits long for another.
+    """
+    ordered = sorted(active, key=lambda i: -costs[i])
+    chunks = [ordered[i : i + width] for i in range(0, len(ordered), width)]
+    hands: list[list[int]] = [[] for _ in range(devices)]
+    loads = [0.0] * devices
+    for chunk in chunks:
+        device = int(np.argmin(loads))
+        hands[device] += chunk
+        loads[device] += float(max(costs[i] for i in chunk))
+    return [np.array(hand, int) for hand in hands]
+
+
+class LaneMap:
+    """`function(lane, *shared) -> lane's result`, compiled once for all lanes, chunks and devices.
+
+    Args:
+        function: from one lane and the shared arguments to a pytree of arrays.
+        width: lanes in a chunk; by default what was measured for the backend.
+        devices: where chunks run; by default all devices of this process.
+    """
+
+    def __init__(self, function: Callable[..., PyTree], width: int | None = None, devices: Any = None):
+        self.devices = jax.local_devices() if devices is None else list(devices)
+        self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
+        self._mesh = Mesh(np.array(self.devices), (AXIS,))
+        self._run = jax.jit(self._on_mesh(function), static_argnums=0)
+
+    def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
+        """The results of the active lanes, in the order of `active`, as host arrays."""
+        total, width = count(lanes), self.width or count(lanes)
+        hands = deal(costs, active, len(self.devices), width)
+        capacity = -(-total // width) * width
+        places = np.stack([np.resize(np.concatenate([hand, [0]]), capacity) for hand in hands])
+        chunks = np.array([-(-len(hand) // width) for hand in hands])
+        results = self._launch(width, lane(lanes, places.ravel()), chunks, shared)
+        where = {i: capacity * d + j for d, hand in enumerate(hands) for j, i in enumerate(hand)}
+        return lane(results, np.array([where[i] for i in active], int))
+
+    def _launch(self, width: int, lanes: PyTree, chunks: Int[np.ndarray, " d"], shared: tuple) -> PyTree:
+        split, whole = NamedSharding(self._mesh, PartitionSpec(AXIS)), NamedSharding(self._mesh, PartitionSpec())
+        arrays, rest = eqx.partition((lanes, shared), eqx.is_array)
+        lanes, shared = jax.device_put(arrays[0], split), jax.device_put(arrays[1], whole)
+        static = _Static(width, rest)
+        return jax.device_get(self._run(static, lanes, jax.device_put(chunks, split), shared))
+
+    def _on_mesh(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
+        split, whole = PartitionSpec(AXIS), PartitionSpec()
+
+        def run(static, lanes, chunks, shared):
+            def share(lanes, chunks, shared):
+                whole_lanes, whole_shared = eqx.combine((lanes, shared), static.rest)
+                return _loop(function, static.width, whole_lanes, chunks[0], whole_shared)
+
+            mapped = jax.shard_map(
+                share, mesh=self._mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False
+            )
+            return mapped(lanes, chunks, shared)
+
+        return run
+
+
+class _Static:
+    """What a compilation depends on beside shapes: the chunk's width and the leaves that are no arrays."""
+
+    def __init__(self, width: int, rest: PyTree):
+        self.width, self.rest = width, rest
+        leaves, structure = jax.tree.flatten(rest)
+        self._identity = (width, tuple(leaves), structure)
+
+    def __hash__(self):
+        return hash(self._identity)
+
+    def __eq__(self, other):
+        return self._identity == other._identity
+
+
+def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], shared: tuple) -> PyTree:
+    """The results of the first `chunks` chunks of this device's lanes; the others' places hold zeros."""
+    arrays, rest = eqx.partition(lanes, eqx.is_array)
+
+    def one(arrays):
+        return eqx.filter(function(eqx.combine(arrays, rest), *shared), eqx.is_array)
+
+    def chunk(arrays):
+        if width > 1:
+            return jax.vmap(one)(arrays)
+        # Without vmap a loop inside keeps a scalar condition and copies nothing that it does not change.
+        return jax.tree.map(lambda leaf: leaf[None], one(jax.tree.map(lambda leaf: leaf[0], arrays)))
+
+    def body(i, results):
+        part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i * width, width), arrays)
+        return jax.tree.map(
+            lambda whole, new: jax.lax.dynamic_update_slice_in_dim(whole, new, i * width, 0), results, chunk(part)
+        )
+
+    shapes = jax.eval_shape(one, jax.tree.map(lambda leaf: leaf[0], arrays))
+    results = jax.tree.map(lambda s: jnp.zeros((count(lanes), *s.shape), s.dtype), shapes)
+    return jax.lax.fori_loop(0, chunks, body, results)

@@ -1,0 +1,34 @@
+"""How well a model predicts: L_MSE on windows, and ρ, what fine-tuning gained (paper, Sec. 3.3 and Eq. 9)."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax.rollout import rollout
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
+
+
+def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window."""
+    return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
+
+
+def deployed_mse(
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = 250
+) -> Float[Array, ""]:
+    """L_MSE of a field as deployed, mean over windows, compared with the truth at every `every`-th interval's end.
+
+    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache.
+    """
+
+    def one(window: Trajectories) -> Float[Array, ""]:
+        predicted = rollout(field, window.x0, window.u, window.dt, solver)
+        return mse(predicted[every - 1 :: every], jnp.asarray(window.x)[every - 1 :: every])
+
+    return jnp.mean(jax.lax.map(one, windows, batch_size=min(chunk, len(windows))))
+
+
+def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no gain, negative means that fine-tuning hurt (paper, Eq. 9)."""
+    return (source_mse - adapted_mse) / source_mse

@@ -1,0 +1,130 @@
+"""Trained models as files: saved, loaded with one call, used for prediction. Loading runs no code from the file."""
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.archive import load_archive, save_archive
+from hybrid_jax.residual import BatchNorm, InputScaling, ResidualNetwork
+from hybrid_jax.rigid_body import RigidBody
+from hybrid_jax.rollout import rollout, rollout_batch
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid, Statistics
+from hybrid_jax.vehicle import Vehicle
+
+FORMAT = "hybrid_jax model 1"
+_KINDS: dict[str, type] = {}
+
+
+def portable(kind: type) -> type:
+    """Let a module class be saved and loaded under its name; use it as a decorator on a field of one's own.
+
+    The class must be made from its fields: numbers, text, arrays, tuples, dictionaries and other portable classes.
+    """
+    _KINDS[kind.__name__] = kind
+    return kind
+
+
+for _kind in (BatchNorm, Hybrid, InputScaling, ResidualNetwork, RigidBody, Statistics, Vehicle):
+    portable(_kind)
+
+
+@dataclass(frozen=True)
+class Model:
+    """A vector field that has left the lab, with what is known about it.
+
+    Attributes:
+        field: the vector field ẋ = f(x, u).
+        about: JSON values: where it comes from, how well it did.
+    """
+
+    field: AbstractVectorField
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def predict(
+        self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
+    ) -> Float[Array, "*n t d"]:
+        """The states after each of t intervals of dt [s] with the inputs held over them; one window or n.
+
+        Raises:
+            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive.
+        """
+        x0, u = jnp.asarray(x0, float), jnp.asarray(u, float)
+        if x0.ndim not in (1, 2) or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
+            raise ValueError(f"x0 (d,) and u (t, m), or (n, d) and (n, t, m), expected; got {x0.shape} and {u.shape}")
+        if not (np.isfinite(x0).all() and np.isfinite(u).all()):
+            raise ValueError("x0 and u must be finite")
+        if not dt > 0:
+            raise ValueError(f"dt must be a positive number of seconds, got {dt}")
+        return _predict(self.field, x0, u, dt)
+
+
+@eqx.filter_jit
+def _predict(field, x0, u, dt):
+    return rollout(field, x0, u, dt) if x0.ndim == 1 else rollout_batch(field, x0, u, dt)
+
+
+def save(path: str | Path, field: AbstractVectorField, about: Mapping[str, Any] | None = None) -> None:
+    """Write a field and what is known about it to one file.
+
+    Raises:
+        ValueError: the field holds something that is not portable; says what and how to mend it.
+        OSError: the folder cannot be written.
+    """
+    arrays: dict[str, np.ndarray] = {}
+    save_archive(path, FORMAT, {"field": _encode(field, "field", arrays), "about": dict(about or {})}, arrays)
+
+
+def load(path: str | Path) -> Model:
+    """Read a model that `save` wrote.
+
+    Raises:
+        ValueError: the file is missing, damaged, no model, or of a class that this program has not made portable.
+    """
+    metadata, arrays = load_archive(path, FORMAT)
+    try:
+        return Model(_decode(metadata["field"], arrays), metadata["about"])
+    except (KeyError, TypeError, AttributeError) as error:
+        raise ValueError(f"{path}: not a whole model: {error}") from error
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
+    name = type(value).__name__
+    if _KINDS.get(name) is type(value):
+        parts = {f.name: _encode(getattr(value, f.name), f"{path}/{f.name}", arrays) for f in fields(value)}
+        return {"kind": name, "fields": parts}
+    match value:
+        case jax.Array() | np.ndarray():
+            arrays[path] = np.asarray(value)
+            return {"array": path}
+        case dict():
+            return {"items": {key: _encode(item, f"{path}/{key}", arrays) for key, item in value.items()}}
+        case tuple():
+            return {"tuple": [_encode(item, f"{path}/{i}", arrays) for i, item in enumerate(value)]}
+        case None | bool() | int() | float() | str():
+            return value
+    raise ValueError(f"{path} is a {name}, which cannot be saved; decorate its class with hybrid_jax.models.portable")
+
+
+def _decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    match value:
+        case {"kind": str() as name, "fields": dict() as parts}:
+            if name not in _KINDS:
+                raise ValueError(f"a model of class {name!r}, which no class here made portable")
+            return _KINDS[name](**{key: _decode(part, arrays) for key, part in parts.items()})
+        case {"array": str() as path}:
+            return jnp.asarray(arrays[path])
+        case {"items": dict() as items}:
+            return {key: _decode(item, arrays) for key, item in items.items()}
+        case {"tuple": list() as items}:
+            return tuple(_decode(item, arrays) for item in items)
+    return value

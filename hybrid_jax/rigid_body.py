@@ -1,0 +1,80 @@
+"""f_p: the Newton–Euler equations of a quadrotor with unknown Ix, Iy and k (paper, Eq. 10)."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from hybrid_jax import rotation
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
+from hybrid_jax.vehicle import Vehicle
+
+LEARNED = ("Ix", "Iy", "k")
+
+
+class RigidBody(AbstractVectorField):
+    """A rigid body carried by four rotors, with no drag, ground effect or wind.
+
+    θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
+    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+
+    Attributes:
+        log_ratios: log(Ix / nominal), log(Iy / nominal), log(k / nominal).
+        vehicle: the known constants and the nominal values.
+    """
+
+    log_ratios: dict[str, Float[Array, ""]]
+    vehicle: Vehicle = eqx.field(static=True)
+
+    def theta(self) -> dict[str, Float[Array, ""]]:
+        """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
+        return {name: value * jnp.exp(self.log_ratios[name]) for name, value in nominal(self.vehicle).items()}
+
+    def __call__(self, x: Float[Array, "13 *b"], u: Float[Array, "4 *b"]) -> Float[Array, "13 *b"]:
+        q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
+        theta = self.theta()
+        thrust, torque = _wrench(self.vehicle, theta["k"], u)
+        gravity = jnp.reshape(jnp.array([0.0, 0.0, -self.vehicle.gravity], x.dtype), (3,) + (1,) * (x.ndim - 1))
+        acceleration = (thrust / self.vehicle.mass) * rotation.body_z(q) + gravity
+        inertia = (theta["Ix"], theta["Iy"], self.vehicle.inertia[2])
+        return jnp.concatenate([v, rotation.derivative(q, omega), acceleration, _euler(inertia, torque, omega)])
+
+
+def rigid_body(vehicle: Vehicle) -> RigidBody:
+    """The rigid body at the vehicle's nominal θ_p."""
+    return RigidBody({name: jnp.zeros(()) for name in LEARNED}, vehicle)
+
+
+def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
+    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm."""
+    factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
+    return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
+
+
+def nominal(vehicle: Vehicle) -> dict[str, float]:
+    """The vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
+    return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}
+
+
+def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Float[Array, "4 *b"]):
+    """Total thrust [N] and body torque [N m] of the rotors: thrust × arm, and the reaction torque c_m u²."""
+    arms = np.asarray(vehicle.rotor_positions)
+    # One small matrix product gives Σu², Σ y u², −Σ x u², Σ s u²; coefficients come after it.
+    mixer = np.stack([np.ones(4), arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)]).astype(u.dtype)
+    total, roll, pitch, yaw = jnp.tensordot(mixer, u * u, axes=1)
+    return k * total, (k * roll, k * pitch, vehicle.torque_coefficient * yaw)
+
+
+def _euler(inertia, torque, omega: Float[Array, "3 *b"]) -> Float[Array, "3 *b"]:
+    """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
+    (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
+    return jnp.stack(
+        [(tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz]
+    )
+
+
+@evaluate_batch.register
+def _(field: RigidBody, x, u):
+    return field(x, u)

@@ -1,0 +1,118 @@
+"""Trajectories of a vector field under inputs that are held over each interval, by any diffrax solver.
+
+One long solve that looks its input up by time is silently wrong: a stage at the end of a step reads the next input.
+So an interval is a step of its own, with its input as `args`, and a `scan` goes over the intervals.
+"""
+
+from collections.abc import Callable
+from typing import ClassVar
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
+
+Derivative = Callable[[Float[Array, "d *b"], Float[Array, "m *b"]], Float[Array, "d *b"]]
+
+
+class RK4(diffrax.AbstractSolver):
+    """The classical fourth-order Runge–Kutta method (Kutta 1901), which diffrax does not ship; fixed steps only."""
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 4
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        half, middle = (t1 - t0) / 2, (t0 + t1) / 2
+        k1 = terms.vf(t0, y0, args)
+        k2 = terms.vf(middle, y0 + half * k1, args)
+        k3 = terms.vf(middle, y0 + half * k2, args)
+        k4 = terms.vf(t1, y0 + 2 * half * k3, args)
+        y1 = y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def integrate(
+    derivative: Derivative,
+    x0: Float[Array, "d *b"],
+    u: Float[Array, "t m *b"],
+    dt: float,
+    solver: diffrax.AbstractSolver,
+    substeps: int = 1,
+) -> Float[Array, "t d *b"]:
+    """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
+    term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    times = (0.0, dt / substeps)
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        times = tuple(jnp.asarray(time) for time in times)  # its root finder accepts no plain numbers
+
+    def interval(x, held):
+        # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
+        state = solver.init(term, *times, x, held)
+        for _ in range(substeps):
+            x, _, _, state, _ = solver.step(term, *times, x, held, state, made_jump=False)
+        return x, x
+
+    return jax.lax.scan(interval, x0, u)[1]
+
+
+def rollout(
+    field: AbstractVectorField,
+    x0: Float[Array | np.ndarray, " d"],
+    u: Float[Array | np.ndarray, "t m"],
+    dt: float,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+) -> Float[Array, "t d"]:
+    """The trajectory of a field as deployed: x[i] is the state (i + 1) dt [s] after x0; u[i] is held until then."""
+    return integrate(field, jnp.asarray(x0), jnp.asarray(u), dt, RK4() if solver is None else solver, substeps)
+
+
+def rollout_batch(
+    field: AbstractVectorField,
+    x0: Float[Array | np.ndarray, "n d"],
+    u: Float[Array | np.ndarray, "n t m"],
+    dt: float,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+) -> Float[Array, "n t d"]:
+    """`rollout` of each of n windows."""
+    return jax.vmap(lambda start, held: rollout(field, start, held, dt, solver, substeps))(x0, u)
+
+
+def rollout_minibatch(
+    field: AbstractVectorField,
+    x0: Float[Array, "d b"],
+    u: Float[Array, "t m b"],
+    dt: float,
+    solver: diffrax.AbstractSolver,
+    substeps: int = 1,
+) -> Float[Array, "t d b"]:
+    """The trajectories of a minibatch as in training, features first: each evaluation sees the whole minibatch."""
+    return integrate(lambda x, held: evaluate_batch(field, x, held), x0, u, dt, solver, substeps)
+
+
+def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
+    """The (state, input) pairs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
+    starts = jnp.concatenate([x0[None], x[:-1]])
+    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], -1) for a in (starts, u))
+
+
+SOLVERS: dict[str, diffrax.AbstractSolver] = {
+    "rk4": RK4(),
+    "heun": diffrax.Heun(),
+    "midpoint": diffrax.Midpoint(),
+    "tsit5": diffrax.Tsit5(),
+    "dopri5": diffrax.Dopri5(),
+}

@@ -1,0 +1,69 @@
+"""Quaternion algebra; q = (w, x, y, z) turns body vectors into world vectors.
+
+Source: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017 (Hamilton convention).
+"""
+
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+Quaternion = Float[Array, "4"]
+Vector = Float[Array, "3"]
+
+
+def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
+    """The Hamilton product a ⊗ b."""
+    aw, ax, ay, az = a
+    bw, bx, by, bz = b
+    return jnp.stack(
+        [
+            aw * bw - ax * bx - ay * by - az * bz,
+            aw * bx + ax * bw + ay * bz - az * by,
+            aw * by - ax * bz + ay * bw + az * bx,
+            aw * bz + ax * by - ay * bx + az * bw,
+        ]
+    )
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """q̄, the inverse rotation of a unit quaternion."""
+    w, x, y, z = q
+    return jnp.stack([w, -x, -y, -z])
+
+
+def rotate(q: Quaternion, v: Vector) -> Vector:
+    """The vector part of q ⊗ [0, v] ⊗ q̄: a body vector in the world frame (scaled by |q|² if q is not unit)."""
+    return multiply(multiply(q, pure(v)), conjugate(q))[1:]
+
+
+def body_z(q: Quaternion) -> Vector:
+    """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
+    w, x, y, z = q
+    return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
+
+
+def pure(v: Vector) -> Quaternion:
+    """[0, v]."""
+    x, y, z = v
+    return jnp.stack([jnp.zeros_like(x), x, y, z])
+
+
+def derivative(q: Quaternion, body_rates: Vector) -> Quaternion:
+    """q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
+    return 0.5 * multiply(q, pure(body_rates))
+
+
+def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
+    """The unit quaternion of the same direction."""
+    return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
+
+
+def angle_between(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:
+    """The angle [rad, 0 … π] of the rotation from a to b; q and −q are the same rotation."""
+    alignment = jnp.abs(jnp.sum(normalise(a) * normalise(b), axis=-1))
+    return 2 * jnp.arccos(jnp.clip(alignment, 0.0, 1.0))
+
+
+def from_axis_angle(axis: Vector, angle: Float[Array, ""]) -> Quaternion:
+    """The rotation by angle [rad] about a unit axis."""
+    half = jnp.asarray(angle) / 2
+    return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * jnp.asarray(axis)])

@@ -1,0 +1,28 @@
+"""How this process uses the machine: one JAX device for each CPU core, and compiled programs kept between runs."""
+
+import os
+from pathlib import Path
+
+import jax
+
+
+def configure(cache: Path) -> None:
+    """Set both up; call it before the first array is made, because JAX's devices are fixed by then.
+
+    Raises:
+        ValueError: the cache folder cannot be made.
+    """
+    programs = cache / "programs"
+    try:
+        programs.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ValueError(f"--cache {cache}: cannot be written: {error.strerror}") from error
+    jax.config.update("jax_num_cpu_devices", cores())
+    jax.config.update("jax_compilation_cache_dir", str(programs))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def cores() -> int:
+    """The CPU cores that this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

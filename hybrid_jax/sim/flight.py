@@ -1,0 +1,91 @@
+"""Random flights of a domain: the pilot and the true vehicle in closed loop."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key, PRNGKeyArray
+
+from hybrid_jax.sim import pilot
+from hybrid_jax.sim.domain import Domain
+from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
+from hybrid_jax.sim.quadrotor import CHUNK, Quadrotor
+from hybrid_jax.state import POSITION, VELOCITY
+from hybrid_jax.vehicle import IRIS
+
+DT = pilot.PERIOD  # s
+CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), so that windows see the wind at every phase
+
+# A flight that leaves these bounds, or whose centre is below ground, has gone wrong.
+MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
+
+
+class Flights(NamedTuple):
+    """n flights of t decisions, float64.
+
+    Attributes:
+        states: from take-off on.
+        inputs: held from one state to the next [rad/s].
+        lowest_rotor: the altitude of the lowest rotor at each state [m].
+        start: time of take-off [s].
+    """
+
+    states: Float[Array | np.ndarray, "*n t+1 13"]
+    inputs: Float[Array | np.ndarray, "*n t 4"]
+    lowest_rotor: Float[Array | np.ndarray, "*n t+1"]
+    start: Float[Array | np.ndarray, "*n"]
+
+
+def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
+    """Random closed-loop flights at 100 Hz; float64 on the CPU whatever the caller's precision and device.
+
+    Flight i depends on the key and i alone.
+
+    Raises:
+        ValueError: no flights or no time.
+    """
+    steps = round(seconds / DT)
+    if flights < 1 or steps < 1:
+        raise ValueError(f"flights and seconds must be positive, got flights={flights}, seconds={seconds}")
+    cpu = jax.devices("cpu")[0]
+    with jax.enable_x64(True), jax.default_device(cpu):
+        truth = domain.quadrotor()
+        keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpu)))(jnp.arange(-(-flights // CHUNK) * CHUNK))
+        # Chunks of one size share one compilation.
+        parts = [_fly_chunk(truth, parameters_of(IRIS), chunk, steps) for chunk in keys.reshape(-1, CHUNK)]
+        return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
+
+
+@partial(jax.jit, static_argnames="steps")
+def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int) -> Flights:
+    return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps))(keys)
+
+
+def _fly_once(truth: Quadrotor, nominal: Parameters, key: PRNGKeyArray, steps: int) -> Flights:
+    key_plan, key_start, key_clock = jax.random.split(key, 3)
+    plan = pilot.draw_plan(key_plan, steps)
+    x0 = pilot.starting_state(key_start, plan)
+    start = jax.random.uniform(key_clock, maxval=CLOCK)
+
+    def decide(carry, now):
+        memory, x, t = carry
+        memory, u = pilot.act(memory, x, now, nominal, IRIS.max_rotor_speed)
+        x = truth.step(x, u, t, DT)
+        return (memory, x, t + DT), (x, u)
+
+    _, (x, u) = jax.lax.scan(decide, (pilot.Memory(jnp.zeros(3)), x0, start), plan)
+    states = jnp.concatenate([x0[None], x])
+    altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
+    return Flights(states, u, altitudes.min(axis=1), start)
+
+
+def gone_wrong(states: Float[Array | np.ndarray, "n t 13"]) -> np.ndarray:
+    """Which flights (n,) diverged, left the arena, were too fast or crashed."""
+    finite = np.isfinite(states).all(axis=(1, 2))
+    p, v = states[..., POSITION], states[..., VELOCITY]
+    far = np.linalg.norm(p[..., :2], axis=-1) > MAX_DISTANCE
+    fast = np.linalg.norm(v, axis=-1) > MAX_SPEED
+    outside = (p[..., 2] > MAX_ALTITUDE) | (p[..., 2] < 0)
+    return ~finite | (far | fast | outside).any(axis=1)

@@ -1,0 +1,118 @@
+"""What acts on the true vehicle beyond rotor thrust, reaction torque and gravity.
+
+A force is a function (x, u, t, parameters) → Wrench. To add one, write the function and put it into the tuple that
+`Quadrotor` takes.
+"""
+
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax.rotation import body_z, normalise, rotate
+from hybrid_jax.state import POSITION, QUATERNION, VELOCITY, Input, State
+from hybrid_jax.vehicle import Vehicle
+
+Scalar = Float[Array, ""]
+
+DRAG_COEFFICIENT = 0.4  # kg/s; the paper gives no value
+WIND_MEAN = -4.0  # N
+WIND_AMPLITUDE = 1.0  # N
+WIND_ANGULAR_FREQUENCY = 2 / 3 * math.pi  # rad/s
+
+
+class Wrench(NamedTuple):
+    """A force and a torque on the body, as MuJoCo's xfrc_applied takes them.
+
+    Attributes:
+        force: at the centre of mass, world frame [N].
+        torque: about the centre of mass, world frame [N m].
+    """
+
+    force: Float[Array, "3"]
+    torque: Float[Array, "3"]
+
+
+class Parameters(eqx.Module):
+    """The numbers of one true vehicle as array leaves, so that they can be traced, swept and vmapped; SI units.
+
+    Attributes:
+        mass: [kg].
+        inertia: principal moments (Ix, Iy, Iz) [kg m²].
+        thrust_coefficient: k [N/(rad/s)²].
+        torque_coefficient: c_m [N m/(rad/s)²].
+        rotor_positions: x, y, z = 0 of each rotor, body frame [m].
+        spin: sign of each rotor's reaction torque about body z.
+        rotor_radius: R [m].
+        gravity: [m/s²].
+        drag_coefficient: C_D [kg/s].
+    """
+
+    mass: Scalar
+    inertia: Float[Array, "3"]
+    thrust_coefficient: Scalar
+    torque_coefficient: Scalar
+    rotor_positions: Float[Array, "4 3"]
+    spin: Float[Array, "4"]
+    rotor_radius: Scalar
+    gravity: Scalar
+    drag_coefficient: Scalar
+
+
+def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) -> Parameters:
+    """The parameters of a vehicle, in the precision that is on when this is called."""
+    return Parameters(
+        mass=jnp.asarray(vehicle.mass),
+        inertia=jnp.asarray(vehicle.inertia),
+        thrust_coefficient=jnp.asarray(vehicle.thrust_coefficient),
+        torque_coefficient=jnp.asarray(vehicle.torque_coefficient),
+        rotor_positions=jnp.asarray([(x, y, 0.0) for x, y in vehicle.rotor_positions]),
+        spin=jnp.asarray(vehicle.spin),
+        rotor_radius=jnp.asarray(vehicle.rotor_radius),
+        gravity=jnp.asarray(vehicle.gravity),
+        drag_coefficient=jnp.asarray(drag_coefficient),
+    )
+
+
+Force = Callable[[State, Input, Scalar, Parameters], Wrench]
+
+
+def drag(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
+    """D = −C_D v, linear in the velocity [m/s, world]."""
+    velocity = x[VELOCITY]
+    return Wrench(-parameters.drag_coefficient * velocity, jnp.zeros_like(velocity))
+
+
+def wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
+    """The gust of experiment 2, [0, −4 + sin(⅔ π t), 0] N, t [s]."""
+    sideways = WIND_MEAN + WIND_AMPLITUDE * jnp.sin(WIND_ANGULAR_FREQUENCY * t)
+    none = jnp.zeros_like(x[VELOCITY])
+    return Wrench(none.at[1].set(sideways), none)
+
+
+def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
+    """The thrust that the ground adds to each rotor over k u², and its torque (Eq. 11)."""
+    gain = thrust_gain(rotor_altitudes(x, parameters.rotor_positions), parameters.rotor_radius)
+    excess = (gain - 1) * parameters.thrust_coefficient * u**2
+    q = normalise(x[QUATERNION])
+    arm_torque = jnp.cross(parameters.rotor_positions, excess[:, None] * jnp.array([0.0, 0.0, 1.0])).sum(axis=0)
+    return Wrench(excess.sum() * body_z(q), rotate(q, arm_torque))
+
+
+def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Float[Array, "*rotors"]:
+    """T/T∞ = 1 / (1 − (R / 4h)²) (Cheeseman and Bennett 1955) of rotors at altitude h [m] over level ground.
+
+    h is floored at R/2, where the gain is 4/3: the formula is meant for h > R/2 and diverges at R/4.
+    """
+    height = jnp.maximum(altitude, rotor_radius / 2)
+    return 1 / (1 - (rotor_radius / (4 * height)) ** 2)
+
+
+def rotor_altitudes(x: State, rotor_positions: Float[Array, "4 3"]) -> Float[Array, "4"]:
+    """The altitude [m, world z] of each rotor."""
+    q = normalise(x[QUATERNION])
+    return x[POSITION][2] + jax.vmap(rotate, in_axes=(None, 0))(q, rotor_positions)[:, 2]

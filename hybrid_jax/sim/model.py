@@ -1,0 +1,82 @@
+"""iris.xml with the numbers of a Vehicle: for C MuJoCo, and as traced numbers for MJX."""
+
+# MuJoCo's compiled modules carry no type stubs.
+# pyright: reportAttributeAccessIssue=false
+
+from functools import lru_cache
+from pathlib import Path
+from typing import cast
+
+import jax
+import jax.numpy as jnp
+import mujoco
+from mujoco import mjx
+
+from hybrid_jax.sim.forces import Parameters
+from hybrid_jax.vehicle import IRIS, Vehicle
+
+MODEL_FILE = Path(__file__).with_name("iris.xml")
+
+
+def build_model(vehicle: Vehicle) -> mujoco.MjModel:
+    """The scene for C MuJoCo: one free body whose controls are the squared rotor speeds [(rad/s)²]."""
+    spec = mujoco.MjSpec.from_file(str(MODEL_FILE))
+    spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
+    body = spec.body("vehicle")
+    body.mass, body.inertia = vehicle.mass, vehicle.inertia
+    reaction = vehicle.torque_coefficient / vehicle.thrust_coefficient
+    for i, (x, y) in enumerate(vehicle.rotor_positions):
+        spec.site(f"rotor{i}").pos = [x, y, 0.0]
+        actuator = spec.actuator(f"rotor{i}")
+        actuator.gainprm[0] = vehicle.thrust_coefficient
+        actuator.gear = [0, 0, 1, 0, 0, vehicle.spin[i] * reaction]
+        _draw_arm(body, x, y, vehicle.rotor_radius)
+    return spec.compile()
+
+
+def _draw_arm(body: mujoco.MjsBody, x: float, y: float, radius: float) -> None:
+    """An arm from the hub, a motor, and above it a propeller in the disc it sweeps; nothing weighs or collides."""
+    kind = mujoco.mjtGeom
+    disc = "front" if x > 0 else "rear"
+    root = [0.35 * x, 0.22 * y, -0.008]
+    parts = (
+        (kind.mjGEOM_CAPSULE, "carbon", [0.0095, 0, 0], {"fromto": [*root, x, y, -0.004]}),
+        (kind.mjGEOM_CAPSULE, "carbon", [0.0048, 0, 0], {"fromto": [*root, 0.75 * x, 0.75 * y, -0.1]}),
+        (kind.mjGEOM_CYLINDER, "metal", [0.0155, 0.013, 0], {"pos": [x, y, 0.006]}),
+        (kind.mjGEOM_ELLIPSOID, "carbon", [0.97 * radius, 0.0095, 0.0022], {"pos": [x, y, 0.022]}),
+        (kind.mjGEOM_CYLINDER, disc, [radius, 0.0008, 0], {"pos": [x, y, 0.022]}),
+        (kind.mjGEOM_CAPSULE, disc + "_cap", [0.005, 0.006, 0], {"pos": [x, y, 0.024]}),
+    )
+    for shape, material, size, place in parts:
+        body.add_geom(type=shape, material=material, size=size, contype=0, conaffinity=0, mass=0, **place)
+
+
+@lru_cache(maxsize=1)
+def _iris() -> mujoco.MjModel:
+    return build_model(IRIS)
+
+
+def bare_model() -> mjx.Model:
+    """The scene for MJX in the precision that is on; its vehicle's numbers are to be replaced."""
+    # Concrete even while tracing, so that MJX sees the model's structure as constants.
+    with jax.ensure_compile_time_eval():
+        return mjx.put_model(_iris())
+
+
+def with_parameters(model: mjx.Model, parameters: Parameters) -> mjx.Model:
+    """The MJX model with every number of the vehicle replaced by that of the parameters, which may be traced."""
+    p = parameters
+    thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
+    ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
+    replaced = model.tree_replace(
+        {
+            "opt.gravity": jnp.array([0.0, 0.0, -1.0]) * p.gravity,
+            "body_mass": model.body_mass.at[1].set(p.mass),
+            "body_subtreemass": model.body_subtreemass.at[:].set(p.mass),
+            "body_inertia": model.body_inertia.at[1].set(p.inertia),
+            "site_pos": p.rotor_positions,
+            "actuator_gear": thrust + ratio[:, None] * reaction,
+            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
+        }
+    )
+    return cast(mjx.Model, replaced)

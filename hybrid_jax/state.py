@@ -1,0 +1,20 @@
+"""Where each quantity of a multirotor sits in its state x (13) and input u (4).
+
+x = [p, q, v, ω]: position p [m, world frame, z up]; unit quaternion q = (w, x, y, z), body → world; velocity
+v [m/s, world frame]; body rates ω [rad/s, body frame: x forward, y left, z up]. u: the four rotor speeds [rad/s].
+"""
+
+from jaxtyping import Array, Float
+
+POSITION = slice(0, 3)
+QUATERNION = slice(3, 7)
+VELOCITY = slice(7, 10)
+BODY_RATES = slice(10, 13)
+
+STATE_NAMES = ("px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
+INPUT_NAMES = ("u0", "u1", "u2", "u3")
+STATE_SIZE = len(STATE_NAMES)
+INPUT_SIZE = len(INPUT_NAMES)
+
+State = Float[Array, "13"]
+Input = Float[Array, "4"]  # rad/s

@@ -1,0 +1,153 @@
+"""Many training runs as one compiled program: every seed, size and rate is a lane (see lanes.py).
+
+A host loop takes the active lanes through blocks of epochs. Between two blocks it drops the lanes that have stopped,
+so that these cost nothing, reports progress, and is where a run can be interrupted.
+"""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from hybrid_jax import training
+from hybrid_jax.lanes import LaneMap, count, lane
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.training import FitState, Plan, Settings
+from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.vector_field import AbstractVectorField
+
+FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
+
+
+@dataclass(frozen=True)
+class Progress:
+    """What a sweep knows after a block of epochs.
+
+    Attributes:
+        active: lanes still training.
+        lanes: all lanes.
+        epochs: the most epochs that a lane has completed.
+        best: the smallest validation L_MSE of any lane.
+        longest: epochs that the active lanes may still need at the most, and need at the least.
+        seconds: since the sweep began.
+    """
+
+    active: int
+    lanes: int
+    epochs: int
+    best: float
+    at_least: int
+    at_most: int
+    seconds: float
+
+
+def sweep(
+    states: FitState,
+    plans: Plan,
+    train: Trajectories,
+    validation: Trajectories,
+    settings: Settings,
+    *,
+    width: int | None = None,
+    block_seconds: float = 4.0,
+    on_block: Callable[[FitState, Progress], None] | None = None,
+) -> FitState:
+    """Take every lane to its end.
+
+    Args:
+        states: stacked starts, one a lane (`training.start`, `lanes.stack`).
+        plans: stacked plans, one a lane.
+        train: the windows that plans index into; shared by all lanes.
+        width: lanes in a chunk; see `LaneMap`.
+        on_block: called after each block with all states and the progress.
+
+    Returns:
+        The stacked final states as host arrays, in the order given. A lane whose loss was not finite has status
+        DIVERGED and the best epoch that it had; it changes no other lane.
+
+    Raises:
+        ValueError: bad data, or a plan that asks for more windows than `train` has or for less than a minibatch.
+    """
+    states, plans = jax.device_get((states, plans))
+    _check(plans, train, validation, settings)
+    block = _block(settings, width)
+    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
+    shared = (train, validation)
+    block((states, plans), (*shared, np.int32(0)), costs, range(len(costs)))  # compiles, trains nothing
+    more, began = FIRST_BLOCK, time.perf_counter()
+    while len(active := np.flatnonzero(states.status == training.RUNNING)):
+        start = time.perf_counter()
+        states = _merge(states, active, block((states, plans), (*shared, np.int32(more)), costs, active))
+        if on_block is not None:
+            on_block(states, _progress(states, plans, time.perf_counter() - began))
+        more = int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more))
+    return states
+
+
+def evaluate(
+    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings
+) -> Float[np.ndarray, " lanes"]:
+    """L_MSE of each lane's field as deployed, on windows that all lanes share."""
+    lanes = count(fields)
+    errors = _evaluation(settings, every)
+    return errors(jax.device_get(fields), (windows,), np.ones(lanes), range(lanes))
+
+
+def _block(settings: Settings, width: int | None) -> LaneMap:
+    def block(lane: tuple[FitState, Plan], train, validation, more) -> FitState:
+        state, plan = lane
+        return training.run(state, plan, train, validation, settings, state.epoch + more)
+
+    return LaneMap(block, width)
+
+
+def _evaluation(settings: Settings, every: int) -> LaneMap:
+    return LaneMap(lambda field, windows: deployed_mse(field, windows, every, settings.solver))
+
+
+def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
+    """All states, the active lanes' replaced."""
+
+    def put(old, new):
+        old = np.array(old)
+        old[active] = new
+        return old
+
+    arrays, rest = eqx.partition(states, eqx.is_array)
+    return eqx.combine(jax.tree.map(put, arrays, after), rest)
+
+
+def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
+    running: Bool[Array, " lanes"] = states.status == training.RUNNING
+    left = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
+    return Progress(
+        active=int(running.sum()),
+        lanes=len(running),
+        epochs=int(states.epoch.max()),
+        best=float(np.min(states.best_mse)),
+        at_least=int(np.max(left, where=running, initial=0)),
+        at_most=int(np.max(plans.max_epochs - states.epoch, where=running, initial=0)),
+        seconds=seconds,
+    )
+
+
+def _check(plans: Plan, train: Trajectories, validation: Trajectories, settings: Settings) -> None:
+    check(train, "train")
+    check(validation, "validation")
+    for size in np.unique(plans.n_train):
+        if not settings.batch_size <= size <= len(train):
+            raise ValueError(
+                f"n_train={size} must lie between batch_size={settings.batch_size} and {len(train)} windows of train"
+            )
+
+
+def best_fields(states: FitState) -> AbstractVectorField:
+    """Each lane's field of its best validation epoch, stacked."""
+    return states.best
+
+
+__all__ = ["Progress", "best_fields", "evaluate", "lane", "sweep"]

@@ -1,0 +1,223 @@
+"""One training run as a pure function: minibatches, Adam, validation, the best epoch, early stopping.
+
+What is swept over (rates, data size, patience, …) is an argument, `Plan`; what shapes the program is `Settings`.
+"""
+
+from dataclasses import dataclass, field
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
+
+from hybrid_jax.loss import Regulariser, loss, minibatch
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.rollout import RK4, along, rollout_minibatch
+from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.vector_field import AbstractVectorField, observe, trainable
+
+RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
+STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
+
+
+@dataclass(frozen=True)
+class Settings:
+    """What is the same for all lanes of a sweep and fixed when it is compiled."""
+
+    batch_size: int = 100
+    regulariser: Regulariser | None = None
+    solver: diffrax.AbstractSolver = field(default_factory=RK4)
+
+
+class Plan(eqx.Module):
+    """What may differ between the lanes of a sweep.
+
+    Attributes:
+        rates: Adam's learning rates, a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
+        subset: indices of training windows in the order in which this lane may use them.
+        n_train: how many of `subset` it does use; nested by construction.
+        min_epochs: no early stop before this many epochs.
+        patience: stop after this many epochs without a better validation loss.
+        max_epochs: the cap.
+        regulariser_weight: λ.
+    """
+
+    rates: PyTree
+    subset: Int[Array, " n"]
+    n_train: Int[Array, ""]
+    min_epochs: Int[Array, ""]
+    patience: Int[Array, ""]
+    max_epochs: Int[Array, ""]
+    regulariser_weight: Float[Array, ""]
+
+
+class FitState(eqx.Module):
+    """A run between two epochs; all that is needed to go on.
+
+    `best` is the field of the best validation loss so far: the start itself until an epoch has been completed.
+    """
+
+    field: AbstractVectorField
+    adam: PyTree
+    best: AbstractVectorField
+    best_mse: Float[Array, ""]
+    best_epoch: Int[Array, ""]
+    epoch: Int[Array, ""]
+    status: Int[Array, ""]
+    train_loss: Float[Array, ""]
+    key: PRNGKeyArray
+
+
+def start(field: AbstractVectorField, key: PRNGKeyArray) -> FitState:
+    """A run at epoch 0; the key sets the order of minibatches."""
+    zero = jnp.zeros((), jnp.int32)
+    infinity = jnp.array(jnp.inf)
+    adam = optax.scale_by_adam().init(eqx.filter(field, trainable(field)))
+    # Raw key data is an ordinary array: it can be stacked by lane, moved to the host and saved.
+    key = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+    return FitState(field, adam, field, infinity, zero, zero, zero + RUNNING, infinity, key)
+
+
+def run(
+    state: FitState,
+    plan: Plan,
+    train: Trajectories,
+    validation: Trajectories,
+    settings: Settings,
+    until: Int[Array, ""] | int,
+) -> FitState:
+    """Go on until the run has stopped or has completed `until` epochs."""
+
+    def going(state: FitState) -> Bool[Array, ""]:
+        return (state.status == RUNNING) & (state.epoch < until)
+
+    # A user's field may hold leaves that are no arrays (an activation function); a loop carries arrays only.
+    arrays, rest = eqx.partition(state, eqx.is_array)
+
+    def one_epoch(arrays):
+        return eqx.filter(epoch(eqx.combine(arrays, rest), plan, train, validation, settings), eqx.is_array)
+
+    arrays = jax.lax.while_loop(lambda arrays: going(eqx.combine(arrays, rest)), one_epoch, arrays)
+    return eqx.combine(arrays, rest)
+
+
+def epoch(state: FitState, plan: Plan, train: Trajectories, validation: Trajectories, settings: Settings) -> FitState:
+    """One pass over the lane's training windows in a new order, then a validation."""
+    key, order_key = jax.random.split(state.key)
+    order = _shuffled(plan, order_key)
+    batches = plan.n_train // settings.batch_size
+
+    arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run`
+
+    def update(i, carry):
+        arrays, adam, total = carry
+        picked = jax.lax.dynamic_slice(order, (i * settings.batch_size,), (settings.batch_size,))
+        field, adam, value = gradient_step(eqx.combine(arrays, rest), adam, plan, train[picked], settings)
+        return eqx.filter(field, eqx.is_array), adam, total + value
+
+    arrays, adam, total = jax.lax.fori_loop(0, batches, update, (arrays, state.adam, jnp.zeros(())))
+    field = eqx.combine(arrays, rest)
+    error = deployed_mse(field, validation, solver=settings.solver)
+    return _judge(state, plan, field, adam, key, total / batches, error)
+
+
+def gradient_step(
+    field: AbstractVectorField, adam: PyTree, plan: Plan, windows: Trajectories, settings: Settings
+) -> tuple[AbstractVectorField, PyTree, Float[Array, ""]]:
+    """One step of Adam on one minibatch; running statistics move along the predicted trajectories."""
+    learned = trainable(field)
+    parameters, rest = eqx.partition(field, learned)
+    # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
+    batch = jax.lax.optimization_barrier(minibatch(windows))
+
+    def objective(parameters):
+        candidate = eqx.combine(parameters, rest)
+        predicted = rollout_minibatch(candidate, batch.x0, batch.u, batch.dt, settings.solver)
+        return loss(candidate, batch, predicted, settings.regulariser, plan.regulariser_weight), predicted
+
+    (value, predicted), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)
+    direction, adam = optax.scale_by_adam().update(gradient, adam)
+    moved = _descend(plan.rates, parameters, direction)
+    x, u = along(batch.x0, predicted, batch.u)
+    return observe(eqx.combine(moved, rest), x, u), adam, value
+
+
+def fit(
+    field: AbstractVectorField,
+    train: Trajectories,
+    validation: Trajectories,
+    key: PRNGKeyArray,
+    *,
+    rates: PyTree,
+    min_epochs: int = 100,
+    patience: int = 20,
+    max_epochs: int = 2000,
+    regulariser_weight: float = 1e-3,
+    settings: Settings | None = None,
+) -> FitState:
+    """Train one field on all windows of `train`; `result.best` is the field of the best validation epoch.
+
+    Raises:
+        ValueError: data that do not pass `trajectories.check`, or fewer training windows than a minibatch.
+    """
+    settings = Settings() if settings is None else settings
+    check(train, "train")
+    check(validation, "validation")
+    if len(train) < settings.batch_size:
+        raise ValueError(f"train has {len(train)} windows, fewer than batch_size={settings.batch_size}")
+    plan = make_plan(rates, jnp.arange(len(train)), len(train), min_epochs, patience, max_epochs, regulariser_weight)
+    state = start(field, key)
+    return _fit(state, plan, train, validation, settings)
+
+
+def make_plan(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> Plan:
+    """A plan with every number as an array, as `vmap` wants it."""
+
+    def integer(number) -> Int[Array, "..."]:
+        return jnp.asarray(number, jnp.int32)
+
+    return Plan(
+        rates=jax.tree.map(jnp.asarray, rates),
+        subset=integer(subset),
+        n_train=integer(n_train),
+        min_epochs=integer(min_epochs),
+        patience=integer(patience),
+        max_epochs=integer(max_epochs),
+        regulariser_weight=jnp.asarray(regulariser_weight, float),
+    )
+
+
+@eqx.filter_jit
+def _fit(state, plan, train, validation, settings):
+    return run(state, plan, train, validation, settings, plan.max_epochs)
+
+
+def _shuffled(plan: Plan, key: PRNGKeyArray) -> Int[Array, " n"]:
+    """The first n_train of the lane's windows in random order, then the rest."""
+    ticket = jax.random.uniform(key, plan.subset.shape)
+    inside = jnp.arange(plan.subset.shape[0]) < plan.n_train
+    return plan.subset[jnp.argsort(jnp.where(inside, ticket, jnp.inf))]
+
+
+def _descend(rates: PyTree, parameters: AbstractVectorField, direction: PyTree) -> AbstractVectorField:
+    def part(rate, parameters, direction):
+        return jax.tree.map(lambda p, d: (p - rate * d).astype(p.dtype), parameters, direction)
+
+    return jax.tree.map(part, rates, parameters, direction)
+
+
+def _judge(state, plan, field, adam, key, train_loss, error) -> FitState:
+    """The state after an epoch: is it the best, and does the run go on?"""
+    finished = state.epoch + 1
+    finite = jnp.isfinite(train_loss) & jnp.isfinite(error)
+    better = finite & (error < state.best_mse)
+    best = jax.tree.map(lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new, field, state.best)
+    best_epoch = jnp.where(better, finished, state.best_epoch)
+    patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
+    status = jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING)
+    status = jnp.where(patient, status, STOPPED)
+    status = jnp.where(finite, status, DIVERGED)
+    best_mse = jnp.where(better, error, state.best_mse)
+    return FitState(field, adam, best, best_mse, best_epoch, finished, status, train_loss, key)

@@ -1,0 +1,72 @@
+"""Vector fields ẋ = f(x, u): what a model is. Physics, a network, their sum and a user's own are all values of it.
+
+A field is any Equinox module that maps one state x (d,) and one input u (m,) to ẋ (d,). Training evaluates a field on a
+whole minibatch, features first: x (d, b), u (m, b). `evaluate_batch` does that by `vmap`, so a user writes code for one
+sample and is done. A field registers its own version when the batch means something to it (batch normalisation), or
+when its code, in terms of x[0], x[1], …, serves a batch as it stands and is twice as fast without the transposes.
+"""
+
+from abc import abstractmethod
+from functools import singledispatch
+
+import equinox as eqx
+import jax
+from jaxtyping import Array, Float
+
+Batch = Float[Array, "d b"]
+
+
+class AbstractVectorField(eqx.Module):
+    """ẋ = f(x, u) for one sample, as in deployment; every inexact array inside is learned (see `trainable`)."""
+
+    @abstractmethod
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        """The derivative of the state at state x under input u."""
+
+
+class Hybrid(AbstractVectorField):
+    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4)."""
+
+    physics: AbstractVectorField
+    residual: AbstractVectorField
+
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        return self.physics(x, u) + self.residual(x, u)
+
+
+@singledispatch
+def evaluate_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+    """ẋ on a minibatch, as in training: features first, one column a sample."""
+    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+
+
+@evaluate_batch.register
+def _(field: Hybrid, x, u):
+    return evaluate_batch(field.physics, x, u) + evaluate_batch(field.residual, x, u)
+
+
+@singledispatch
+def observe(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
+    """The field after it has seen a training batch: running statistics move, learned parameters do not."""
+    return field
+
+
+@observe.register
+def _(field: Hybrid, x, u):
+    return Hybrid(observe(field.physics, x, u), observe(field.residual, x, u))
+
+
+class Statistics(eqx.Module):
+    """Running mean and variance of hidden units: state that training observes and the optimiser leaves alone."""
+
+    mean: Float[Array, " h"]
+    variance: Float[Array, " h"]
+
+
+def trainable(field: AbstractVectorField) -> AbstractVectorField:
+    """A tree like `field` with True at each leaf that the optimiser may move, for `equinox.partition`."""
+
+    def leaves(node):
+        return False if isinstance(node, Statistics) else eqx.is_inexact_array(node)
+
+    return jax.tree.map(leaves, field, is_leaf=lambda node: isinstance(node, Statistics))

@@ -1,0 +1,116 @@
+"""What is known of a multirotor before any flight: mass, geometry, nominal coefficients."""
+
+import math
+import tomllib
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Vehicle:
+    """The constants of a quadrotor, SI units, body frame x forward, y left, z up.
+
+    Attributes:
+        mass: [kg].
+        inertia: principal moments (Ix, Iy, Iz) [kg m²].
+        thrust_coefficient: k, thrust of a rotor is k u² [N/(rad/s)²].
+        torque_coefficient: c_m, reaction torque of a rotor is c_m u² [N m/(rad/s)²].
+        rotor_positions: (x, y) of each rotor [m].
+        spin: sign of each rotor's reaction torque about body z, ±1.
+        rotor_radius: [m].
+        max_rotor_speed: [rad/s].
+        gravity: [m/s²].
+
+    Raises:
+        ValueError: a constant that is not finite or not positive, or a list of the wrong length.
+    """
+
+    mass: float
+    inertia: tuple[float, float, float]
+    thrust_coefficient: float
+    torque_coefficient: float
+    rotor_positions: tuple[tuple[float, float], ...]
+    spin: tuple[float, ...]
+    max_rotor_speed: float
+    rotor_radius: float = 0.0
+    gravity: float = 9.81
+    name: str = "vehicle"
+
+    def __post_init__(self):
+        for name in ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity"):
+            _require_positive(name, getattr(self, name))
+        if not _is_finite(self.rotor_radius) or self.rotor_radius < 0:
+            raise ValueError(f"rotor_radius must be a finite number of at least 0, got {self.rotor_radius!r}")
+        if not isinstance(self.inertia, tuple) or len(self.inertia) != 3:
+            raise ValueError(f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {self.inertia!r}")
+        for name, moment in zip(("Ix", "Iy", "Iz"), self.inertia, strict=True):
+            _require_positive(f"inertia {name}", moment)
+        if not _is_four(self.rotor_positions, _is_point):
+            raise ValueError(f"rotor_positions must be a tuple of four pairs (x, y) [m], got {self.rotor_positions!r}")
+        if not _is_four(self.spin, lambda sign: sign in (-1, 1)):
+            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {self.spin!r}")
+
+    @property
+    def hover_speed(self) -> float:
+        """The rotor speed [rad/s] at which four equal rotors carry the weight."""
+        return math.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient))
+
+
+def load_vehicle(path: str | Path) -> Vehicle:
+    """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
+
+    Raises:
+        ValueError: the file, the key and what was expected, in one line.
+    """
+    try:
+        table = tomllib.loads(Path(path).read_text())["vehicle"]
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"{path}: not a readable TOML file: {error}") from error
+    except KeyError as error:
+        raise ValueError(f"{path}: has no table [vehicle]") from error
+    if not isinstance(table, dict):
+        raise ValueError(f"{path}: has no table [vehicle]")
+    unknown = sorted(table.keys() - {field.name for field in fields(Vehicle)})
+    if unknown:
+        raise ValueError(f"{path}: [vehicle]: {', '.join(unknown)}: no constant of a vehicle")
+    try:
+        return Vehicle(**{key: _as_tuple(value) for key, value in table.items()})
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: [vehicle]: {str(error).replace('Vehicle.__init__()', 'table')}") from error
+
+
+def _require_positive(name: str, value: float) -> None:
+    if not _is_finite(value) or value <= 0:
+        raise ValueError(f"{name} must be a positive finite number, got {value!r}")
+
+
+def _is_finite(value: Any) -> bool:
+    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+
+
+def _is_point(value: Any) -> bool:
+    return isinstance(value, tuple) and len(value) == 2 and all(_is_finite(number) for number in value)
+
+
+def _is_four(values: Any, is_right: Callable[[Any], bool]) -> bool:
+    return isinstance(values, tuple) and len(values) == 4 and all(is_right(value) for value in values)
+
+
+def _as_tuple(value: Any) -> Any:
+    return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value
+
+
+# Pegasus Simulator's 3DR Iris, as the paper uses it.
+IRIS = Vehicle(
+    name="iris",
+    mass=1.5,
+    inertia=(0.02912, 0.02912, 0.05522),
+    thrust_coefficient=8.54858e-6,
+    torque_coefficient=1e-6,
+    rotor_positions=((0.13799, -0.20672), (-0.12511, 0.21875), (0.13800, 0.20258), (-0.12415, -0.22235)),
+    spin=(-1.0, -1.0, 1.0, 1.0),
+    rotor_radius=0.128,
+    max_rotor_speed=1100.0,
+)

@@ -1,0 +1,43 @@
+"""A system that is not a quadrotor: a pendulum driven by a torque, with flights of it. For the tests of learning."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.models import portable
+from hybrid_jax.rollout import rollout_batch
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
+
+GRAVITY = 9.81
+LENGTH, DAMPING = 0.5, 0.8  # of the true pendulum: [m], [1/s]
+
+
+@portable
+class Pendulum(AbstractVectorField):
+    """x = (angle [rad], rate [rad/s]), u = (torque / inertia [1/s²],); the length is unknown, the damping known."""
+
+    log_length: Float[Array, ""]
+    damping: float = eqx.field(static=True, default=0.0)
+
+    def __call__(self, x, u):
+        angle, rate = x
+        return jnp.stack([rate, u[0] - GRAVITY / jnp.exp(self.log_length) * jnp.sin(angle) - self.damping * rate])
+
+
+def pendulum(length=LENGTH, damping=0.0):
+    """A pendulum of a length [m] and damping [1/s]."""
+    return Pendulum(jnp.log(jnp.asarray(length)), damping)
+
+
+@cache
+def swings(count, steps=8, seed=0, dt=0.05, damping=DAMPING):
+    """Windows of the true pendulum from random starts under random torques."""
+    rng = np.random.default_rng(seed)
+    x0 = jnp.asarray(rng.uniform(-1, 1, (count, 2)) * [2.0, 4.0], np.float32)
+    u = jnp.asarray(rng.normal(size=(count, steps, 1)) * 3, np.float32)
+    return Trajectories(x0, u, jax.jit(rollout_batch)(pendulum(damping=damping), x0, u, dt), dt)

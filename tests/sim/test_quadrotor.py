@@ -1,0 +1,203 @@
+"""Laws of the true vehicle's dynamics."""
+
+import math
+from dataclasses import replace
+
+import diffrax
+import jax
+import jax.numpy as jnp
+import mujoco
+import numpy as np
+import pytest
+
+from hybrid_jax.rotation import derivative as quaternion_derivative
+from hybrid_jax.rotation import rotate
+from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, wind
+from hybrid_jax.sim.model import build_model
+from hybrid_jax.sim.quadrotor import Quadrotor
+from hybrid_jax.vehicle import IRIS
+
+ALL = (drag, ground_effect, wind)
+ODD = replace(
+    IRIS,
+    mass=2.1,
+    inertia=(0.05, 0.02, 0.06),
+    thrust_coefficient=1.1e-5,
+    torque_coefficient=2e-6,
+    rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)),
+    spin=(1.0, 1.0, -1.0, -1.0),
+    gravity=9.7,
+)
+
+
+def newton_euler(x, u, vehicle, force=None, torque=None, np=np):
+    """Eq. 10 a second time, for NumPy or jax.numpy: [v̇ (world), ω̇ (body)] with an added wrench (world)."""
+    w, a, b, c = x[3:7]
+    turn = np.array(
+        [
+            [1 - 2 * (b * b + c * c), 2 * (a * b - c * w), 2 * (a * c + b * w)],
+            [2 * (a * b + c * w), 1 - 2 * (a * a + c * c), 2 * (b * c - a * w)],
+            [2 * (a * c - b * w), 2 * (b * c + a * w), 1 - 2 * (a * a + b * b)],
+        ]
+    )
+    thrusts = vehicle.thrust_coefficient * u**2
+    reaction = vehicle.torque_coefficient * np.array(vehicle.spin) * u**2
+    arm_x, arm_y = np.array(vehicle.rotor_positions).T
+    body_torque = np.array([(arm_y * thrusts).sum(), -(arm_x * thrusts).sum(), reaction.sum()])
+    inertia, rates = np.array(vehicle.inertia), x[10:]
+    total = turn[:, 2] * thrusts.sum() + (0 if force is None else force)
+    if torque is not None:
+        body_torque = body_torque + turn.T @ torque
+    gravity = np.array([0.0, 0.0, -vehicle.gravity])
+    spin_up = (body_torque - np.cross(rates, inertia * rates)) / inertia
+    return np.concatenate([total / vehicle.mass + gravity, spin_up])
+
+
+def quadrotor(vehicle, *forces):
+    return Quadrotor(parameters_of(vehicle), forces)
+
+
+def total_wrench(vehicle, x, u, t):
+    wrenches = [force(jnp.asarray(x), jnp.asarray(u), jnp.asarray(t), parameters_of(vehicle)) for force in ALL]
+    return (np.asarray(sum(part)) for part in zip(*wrenches, strict=True))
+
+
+def at_rest(altitude=5.0):
+    return jnp.zeros(13).at[2].set(altitude).at[3].set(1.0)
+
+
+@pytest.mark.parametrize("vehicle", [IRIS, ODD], ids=["iris", "odd"])
+def test_without_aerodynamics_mjx_is_newton_euler(vehicle, states, derivative):
+    for x, u in zip(*states, strict=True):
+        found = derivative(quadrotor(vehicle), x, u, jnp.asarray(0.0))
+        expected = newton_euler(x, u, vehicle)
+        # Round-off of float64 at accelerations of up to some 100 rad/s².
+        np.testing.assert_allclose(found[7:], expected, rtol=0, atol=4e-15 * max(100, np.abs(expected).max()))
+        np.testing.assert_array_equal(found[:3], x[7:10])
+        np.testing.assert_allclose(
+            found[3:7], quaternion_derivative(jnp.asarray(x[3:7]), jnp.asarray(x[10:])), atol=1e-15
+        )
+
+
+@pytest.mark.parametrize("vehicle", [IRIS, ODD], ids=["iris", "odd"])
+def test_with_all_forces_mjx_is_newton_euler_and_c_mujoco(vehicle, states, derivative):
+    model = build_model(vehicle)
+    data = mujoco.MjData(model)
+    for x, u in zip(*states, strict=True):
+        found = derivative(quadrotor(vehicle, *ALL), x, u, jnp.asarray(0.7))[7:]
+        force, torque = total_wrench(vehicle, x, u, 0.7)
+        data.qpos, data.qvel, data.ctrl = x[:7], x[7:], u**2
+        data.xfrc_applied[1] = np.concatenate([force, torque])
+        mujoco.mj_forward(model, data)
+        np.testing.assert_allclose(found, newton_euler(x, u, vehicle, force, torque), rtol=1e-13, atol=4e-13)
+        np.testing.assert_allclose(found, data.qacc, rtol=1e-13, atol=4e-13)
+
+
+def test_hover_is_an_equilibrium(derivative):
+    speeds = np.linalg.solve(
+        [np.ones(4), *np.array(IRIS.rotor_positions).T, IRIS.spin], [IRIS.mass * IRIS.gravity, 0, 0, 0]
+    )
+    u = jnp.sqrt(speeds / IRIS.thrust_coefficient)
+    slope = derivative(quadrotor(IRIS), at_rest(), u, jnp.asarray(0.0))
+    np.testing.assert_allclose(slope, 0, atol=1e-13)
+
+
+def test_free_fall_is_exact(step):
+    x = at_rest().at[7:10].set(jnp.array([1.0, -2.0, 3.0]))
+    for _ in range(50):
+        x = step(quadrotor(IRIS), x, jnp.zeros(4), jnp.asarray(0.0), 0.02)
+    expected = np.array([1.0, -2.0, 5 + 3 - 0.5 * IRIS.gravity, 1, 0, 0, 0, 1, -2, 3 - IRIS.gravity, 0, 0, 0])
+    np.testing.assert_allclose(x, expected, atol=1e-13)
+
+
+def test_torque_free_spin_conserves_energy_and_angular_momentum(step):
+    inertia = jnp.array(IRIS.inertia).at[0].set(0.02)
+    vehicle = replace(IRIS, inertia=tuple(inertia.tolist()))
+
+    def invariants(x):
+        momentum = inertia * x[10:]
+        return jnp.append(rotate(x[3:7], momentum), 0.5 * jnp.dot(x[10:], momentum))
+
+    x = at_rest().at[10:].set(jnp.array([2.0, 5.0, 1.0]))
+    before = invariants(x)
+    for _ in range(100):
+        x = step(quadrotor(vehicle), x, jnp.zeros(4), jnp.asarray(0.0), 0.01)
+    # One second of RK4 at 0.01 s and 5 rad/s: (5 · 0.01)⁴ · 5 / 120 = 3e-7 of the momentum 0.15.
+    np.testing.assert_allclose(invariants(x), before, atol=5e-8)
+    assert abs(jnp.linalg.norm(x[3:7]) - 1) < 1e-15
+
+
+def test_falling_with_drag_follows_the_exponential_to_terminal_velocity(step, derivative):
+    body = quadrotor(IRIS, *ALL)
+    drag_coefficient = float(body.parameters.drag_coefficient)
+    terminal = IRIS.mass * IRIS.gravity / drag_coefficient
+    settled = derivative(body, at_rest(5000.0).at[9].set(-terminal), jnp.zeros(4), jnp.asarray(0.0))
+    np.testing.assert_allclose(settled[9:], 0, atol=1e-13)
+    x = at_rest(5000.0)
+    for _ in range(20):
+        x = step(body, x, jnp.zeros(4), jnp.asarray(0.0), 0.05)
+    expected = -terminal * (1 - math.exp(-drag_coefficient / IRIS.mass))
+    assert float(x[9]) == pytest.approx(expected, abs=3e-9)  # 20 steps of RK4, each (C_D dt / m)⁵ / 120 of 37 m/s
+
+
+def reference_flight(x0, u, t0, duration):
+    """The analytic equations with all forces, integrated to 1e-12."""
+
+    def slope(t, x, _):
+        parameters = parameters_of(IRIS)
+        wrenches = [force(x, u, t, parameters) for force in ALL]
+        force, torque = (sum(part) for part in zip(*wrenches, strict=True))
+        unit = x.at[3:7].set(x[3:7] / jnp.linalg.norm(x[3:7]))
+        return jnp.concatenate(
+            [x[7:10], quaternion_derivative(x[3:7], x[10:]), newton_euler(unit, u, IRIS, force, torque, np=jnp)]
+        )
+
+    solution = diffrax.diffeqsolve(
+        diffrax.ODETerm(slope),
+        diffrax.Dopri8(),
+        t0,
+        t0 + duration,
+        0.001,
+        x0,
+        stepsize_controller=diffrax.PIDController(rtol=1e-12, atol=1e-12),
+    )
+    return solution.ys[0]
+
+
+def convergence(step, intervals=(10, 20, 40), duration=0.4):
+    """Errors of the state against the reference after a turning flight in ground effect and wind, by step count."""
+    x0 = at_rest(0.35).at[7:13].set(jnp.array([2.0, -1.0, 0.4, 0.5, -0.8, 1.5]))
+    u = jnp.array([650.0, 660.0, 655.0, 668.0])
+    truth = jax.jit(reference_flight)(x0, u, 0.2, duration)
+    errors = []
+    for count in intervals:
+        x, dt = x0, duration / count
+        for i in range(count):
+            x = step(quadrotor(IRIS, *ALL), x, u, jnp.asarray(0.2 + i * dt), dt)
+        errors.append(float(jnp.abs(x - truth).max()))
+    return errors
+
+
+def test_order_of_convergence_is_four(step):
+    errors = convergence(step)
+    orders = np.log2(np.array(errors[:-1]) / errors[1:])
+    np.testing.assert_allclose(orders, 4, atol=0.25)
+    assert errors[-1] < 1e-7  # 0.4 s at dt = 0.01
+
+
+def test_a_rollout_is_its_steps_and_forces_are_recomputed_at_its_own_time(step):
+    body, dt = quadrotor(IRIS, *ALL), 0.01
+    u = jnp.asarray(np.random.default_rng(0).uniform(600, 700, (2, 5, 4)))
+    x0, t0 = jnp.stack([at_rest(), at_rest(0.2)]), jnp.array([0.0, 1.1])
+    together = jax.jit(lambda q, *flight: q.rollouts(*flight, dt, chunk=1))(body, x0, u, t0)
+    for n in range(2):
+        x, t = x0[n], t0[n]
+        for i in range(5):
+            x, t = step(body, x, u[n, i], t, dt), t + dt
+            np.testing.assert_allclose(together[n, i], x, rtol=0, atol=1e-13)
+
+
+def test_single_precision_stays_single():
+    with jax.enable_x64(False):
+        shape = jax.eval_shape(quadrotor(IRIS, *ALL).step, at_rest(), jnp.zeros(4), jnp.asarray(0.0), 0.01)
+    assert shape.dtype == jnp.float32

@@ -1,0 +1,181 @@
+"""Laws of the recorded flights."""
+
+import jax
+import numpy as np
+import pytest
+
+from experiments import make_flights
+from hybrid_jax.datasets import content_hash, load_dataset
+from hybrid_jax.sim import record as recording
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.flight import Flights, fly, gone_wrong
+from hybrid_jax.sim.record import SplitSpec, Tally, cut, make_dataset, record
+from hybrid_jax.vehicle import IRIS
+
+
+def specs(dataset):
+    return {name: SplitSpec(len(split), split.horizon) for name, split in dataset.splits.items()}
+
+
+def level_flights(count, steps=40):
+    """Flights that stand still at 1 m."""
+    states = np.zeros((count, steps + 1, 13))
+    states[..., 2], states[..., 3] = 1.0, 1.0
+    return Flights(states, np.zeros((count, steps, 4)), np.ones((count, steps + 1)), np.zeros(count))
+
+
+def test_splits_have_exactly_the_windows_asked_for_in_single_precision(source):
+    for name, split in source.splits.items():
+        spec = SplitSpec(**source.config["splits"][name])
+        assert split.x.shape == (spec.windows, spec.steps, 13)
+        assert split.u.shape == (spec.windows, spec.steps, 4)
+        assert split.x.dtype == split.u.dtype == split.x0.dtype == np.float32
+
+
+def test_same_seed_same_bytes_other_seed_other_bytes(source):
+    again = make_dataset(SOURCE, specs(source), seed=3)
+    other = make_dataset(SOURCE, specs(source), seed=4)
+    assert content_hash(again) == content_hash(source)
+    assert not np.isin(other.splits["train"].x0[:, 0], source.splits["train"].x0[:, 0]).any()
+
+
+def test_a_split_does_not_depend_on_the_others(source):
+    alone = make_dataset(SOURCE, {"test": specs(source)["test"]}, seed=3)
+    np.testing.assert_array_equal(alone.splits["test"].x, source.splits["test"].x)
+
+
+def test_flights_are_lively_and_partly_in_ground_effect(source):
+    """What the paper's claims rest on: without low flight there is no residual, without rotation no inertia."""
+    statistics = source.metadata["statistics"]["train"]
+    assert statistics["windows below 0.5 m"] > 0.15
+    assert statistics["windows below 0.2 m"] > 0.05
+    assert 3.5 < statistics["speed [m/s] p99"] < 7
+    assert 25 < statistics["tilt [deg] p99"] < 45
+    assert statistics["altitude [m] p99"] > 2
+    assert statistics["distance from home [m] p99"] < 15
+
+
+def test_a_hundred_windows_identify_the_shifted_inertia_and_the_thrust_coefficient():
+    """Least squares of Newton–Euler on one-step differences; the residual forces bias it by a few percent."""
+    windows = make_dataset(PARAMETER_SHIFT, {"train": SplitSpec(100, 10)}, seed=0).splits["train"]
+    before = np.concatenate([windows.x0[:, None], windows.x[:, :-1]], axis=1).astype(float)
+    middle = 0.5 * (before + windows.x)
+    slope = (windows.x.astype(float) - before) / windows.dt
+    thrusts = IRIS.thrust_coefficient * windows.u.astype(float) ** 2
+    arm_x, arm_y = np.array(IRIS.rotor_positions).T
+    wx, wy, wz = np.moveaxis(middle[..., 10:], -1, 0)
+    ix, iy, iz = PARAMETER_SHIFT.vehicle.inertia
+    for torque, spin, truth in (
+        ((arm_y * thrusts).sum(-1) - (iz - iy) * wy * wz, slope[..., 10], ix),
+        (-(arm_x * thrusts).sum(-1) - (ix - iz) * wx * wz, slope[..., 11], iy),
+    ):
+        assert (torque * spin).sum() / (spin**2).sum() == pytest.approx(truth, rel=0.05)
+    up = 1 - 2 * (middle[..., 4] ** 2 + middle[..., 5] ** 2)
+    lift = IRIS.mass * (slope[..., 9] + IRIS.gravity) + 0.4 * middle[..., 9]
+    assert (lift * up * thrusts.sum(-1)).sum() / ((up * thrusts.sum(-1)) ** 2).sum() == pytest.approx(1, rel=0.02)
+
+
+def test_the_pilot_stays_in_bounds_in_wind_it_does_not_know():
+    flights = fly(EXTERNAL_FORCE, 64, recording.SECONDS, jax.random.key(1))
+    assert not gone_wrong(flights.states).any()
+    assert np.linalg.norm(flights.states[..., :2], axis=-1).max() < 15
+    assert flights.inputs.min() >= 0
+    assert flights.inputs.max() <= IRIS.max_rotor_speed
+    assert (flights.lowest_rotor < 0).mean() < 1e-3
+
+
+def test_a_flight_does_not_depend_on_how_many_are_flown():
+    few, many = (fly(SOURCE, count, recording.SECONDS, jax.random.key(5)) for count in (2, 65))
+    assert few.states.shape[0] == 2
+    np.testing.assert_array_equal(few.states, many.states[:2])
+
+
+def test_flights_that_go_wrong_are_dropped_and_counted():
+    flights = level_flights(6)
+    flights.states[1, 20, 11] = np.nan
+    flights.states[2, 5, 0] = 21.0
+    flights.states[3, 5, 8] = 16.0
+    flights.states[4, 30, 2] = -0.1
+    tally = Tally()
+    assert sum(map(len, cut(flights, 10, tally))) == 8
+    assert (tally.flights, tally.dropped_flights, tally.windows, tally.rejected_windows) == (6, 4, 8, 0)
+
+
+@pytest.mark.parametrize(("sample", "rejected"), [(0, 1), (15, 1), (20, 2)])
+def test_windows_with_a_rotor_below_ground_are_rejected_and_counted(sample, rejected):
+    flights = level_flights(1)
+    flights.lowest_rotor[0, sample] = -0.001  # sample 20 ends one window and starts the next
+    tally = Tally()
+    assert sum(map(len, cut(flights, 10, tally))) == 4 - rejected
+    assert tally.rejected_windows == rejected
+
+
+def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatch):
+    flown = []
+
+    def numbered(domain, count, seconds, key):
+        flights = level_flights(count)
+        flights.states[..., 0] = len(flown) * 0.01 + np.arange(count)[:, None] * 1e-4  # which flight
+        flights.states[..., 1] = np.arange(41) * 0.1  # which sample
+        flown.append(jax.random.key_data(key).tolist())
+        return flights
+
+    monkeypatch.setattr(recording, "fly", numbered)
+    windows, tallies = record(SOURCE, {"a": SplitSpec(300, 10), "b": SplitSpec(150, 20)}, jax.random.key(0))
+    numbers = {name: set(split.x0[:, 0].tolist()) for name, split in windows.items()}
+    assert not numbers["a"] & numbers["b"]
+    assert len({tuple(key) for key in flown}) == len(flown) == (tallies["a"].flights + tallies["b"].flights) // 64
+    starts = [(row[0], round(float(row[1]), 3)) for row in windows["a"].x0.tolist()]
+    assert len(set(starts)) == 300
+    assert {start for _, start in starts} == {0.0, 1.0, 2.0, 3.0}
+
+
+def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
+    broken = level_flights(64)
+    broken.states[:, 3, 2] = np.nan
+    monkeypatch.setattr(recording, "fly", lambda *_: broken)
+    with pytest.raises(ValueError, match="domain source: none of 64 flights"):
+        record(SOURCE, {"train": SplitSpec(1, 10)}, jax.random.key(0))
+
+
+@pytest.mark.parametrize(("windows", "steps"), [(0, 10), (5, 0), (5, 1101)])
+def test_impossible_splits_are_refused(windows, steps):
+    with pytest.raises(ValueError, match="windows >= 1"):
+        SplitSpec(windows, steps)
+
+
+def call(monkeypatch, *arguments):
+    monkeypatch.setattr("sys.argv", ["make_flights", *map(str, arguments)])
+    make_flights.main()
+
+
+def test_the_command_writes_a_dataset_prints_a_table_and_keeps_what_exists(tmp_path, monkeypatch, capsys):
+    file = tmp_path / "source.npz"
+    call(monkeypatch, "--domain", "source", "--out", file, "--train", 20, "--validation", 10)
+    assert "windows below 0.5 m" in capsys.readouterr().out
+    before = file.read_bytes()
+    assert len(load_dataset(file).splits["train"]) == 20
+    call(monkeypatch, "--domain", "source", "--out", file, "--train", 20, "--validation", 10)
+    with pytest.raises(SystemExit) as stop:
+        call(monkeypatch, "--domain", "source", "--out", file, "--train", 30, "--validation", 10)
+    assert stop.value.code == 2
+    message = capsys.readouterr().err.strip().splitlines()
+    assert len(message) == 1
+    assert "splits.train.windows is 20, expected 30" in message[0]
+    assert file.read_bytes() == before
+
+
+def test_wrong_numbers_are_one_line_and_exit_2(tmp_path, monkeypatch, capsys):
+    with pytest.raises(SystemExit) as stop:
+        call(monkeypatch, "--domain", "source", "--out", tmp_path / "a.npz", "--train", -3)
+    assert stop.value.code == 2
+    assert len(capsys.readouterr().err.strip().splitlines()) == 1
+
+
+def test_the_cache_is_flown_once_and_named_by_its_configuration(tmp_path, monkeypatch):
+    splits = {"train": SplitSpec(5, 10)}
+    first = make_flights.flights(SOURCE, splits, 0, tmp_path)
+    monkeypatch.setattr(make_flights, "make_dataset", None)
+    assert content_hash(make_flights.flights(SOURCE, splits, 0, tmp_path)) == content_hash(first)
+    with pytest.raises(TypeError):
+        make_flights.flights(SOURCE, splits, 1, tmp_path)

@@ -1,0 +1,125 @@
+"""Every benchmark runs, compares what it times, and says what it found; how fast that was is nobody's business here."""
+
+import json
+import math
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks import environment, training_step
+from benchmarks.operations import count_operations
+from benchmarks.timing import Disagreement, Ratio, Times, agree
+
+
+def run(name, *options):
+    command = [sys.executable, "-m", f"benchmarks.{name}", *map(str, options)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+
+
+def smoke(name, folder):
+    """The report of the smallest preset, and what was printed."""
+    finished = run(name, "--preset", "smoke", "--out", folder / "report.json")
+    assert finished.returncode == 0, finished.stderr
+    report = json.loads((folder / "report.json").read_text())
+    assert (report["benchmark"], report["preset"]) == (name, "smoke")
+    assert report["environment"]["versions"]["jax"] == jax.__version__
+    assert report["environment"]["hardware"]["cores"] >= report["cores_used"] >= 1
+    assert all(math.isfinite(ratio["value"]) for ratio in report["ratios"])
+    return report, finished.stdout
+
+
+def test_the_environment_agrees_with_c_mujoco(tmp_path):
+    report, printed = smoke("environment", tmp_path)
+    assert "C MuJoCo" in printed
+    assert "Failed to import" not in printed
+    (row,) = report["rows"]
+    assert row["difference"] < 1e-5
+    assert set(row["steps_per_second"]) == {"ours", "ours_with_forces", "mujoco"}
+
+
+def test_three_integrators_predict_alike_and_have_the_same_gradient(tmp_path):
+    report, printed = smoke("rollout", tmp_path)
+    assert "diffeqsolve" in printed
+    *cases, forward = report["rows"]
+    assert {row["work"] for row in cases} == {"prediction", "gradient"}
+    for row in cases:
+        for entry in ("seconds", "compile_seconds", "times_by_hand", "difference"):
+            assert set(row[entry]) == {"hybrid_jax", "by_hand", "diffeqsolve"}
+        assert max(row["difference"].values()) < 1e-5
+    assert set(forward["windows_per_second"]) == {"at_once", "chunks"}
+    assert {ratio["at_most"] for ratio in report["ratios"]} == {1.05, None}
+
+
+def test_our_gradient_step_is_the_plain_one(tmp_path):
+    report, printed = smoke("training_step", tmp_path)
+    assert "GFLOP/s" in printed
+    (row,) = report["rows"]
+    assert row["model"] == "hybrid"
+    assert row["difference"] < 1e-5
+    assert min(row["windows_per_second"], row["gflops"], row["matrix_product_gflops"]) > 0
+    assert set(row["seconds"]) == set(row["compile_seconds"]) == {"ours", "plain"}
+
+
+def test_widths_of_chunks_train_alike(tmp_path):
+    report, printed = smoke("sweep", tmp_path)
+    assert "best width" in printed
+    *cells, stopped, choice = report["rows"]
+    assert {(row["width"], row["lanes"]) for row in cells} == {(width, lanes) for width in (1, 2) for lanes in (1, 2)}
+    assert all(row["seconds_per_lane_epoch"] > 0 for row in cells)
+    assert (stopped["active"], stopped["stopped"]) == (1, 1)
+    assert choice["best_width"] in (1, 2)
+
+
+@pytest.mark.parametrize("name", ["environment", "rollout", "training_step", "sweep"])
+def test_a_result_that_could_not_be_written_is_refused_before_it_is_measured(name, tmp_path):
+    (tmp_path / "file").write_text("kept")
+    for out in (tmp_path / "file" / "report.json", tmp_path):
+        finished = run(name, "--preset", "smoke", "--out", out)
+        assert (finished.returncode, finished.stdout) == (2, "")
+        (line,) = finished.stderr.splitlines()
+        assert line.startswith(f"{name}: --out {tmp_path}")
+    assert (tmp_path / "file").read_text() == "kept"
+
+
+def test_an_unknown_preset_is_one_line():
+    finished = run("rollout", "--preset", "huge")
+    assert finished.returncode == 2
+    assert finished.stderr == "rollout: --preset must be one of full, smoke, got 'huge'\n"
+
+
+def test_results_that_differ_are_not_timed():
+    flight = np.zeros((2, 10, 13))
+    with pytest.raises(Disagreement, match="differ by"):
+        environment.compare(flight, flight + 0.01)
+    with pytest.raises(Disagreement, match="sums differ by"):
+        agree("sums", [np.ones(3), np.ones(2)], [np.ones(3), np.array([1, 1.1])], 0.05)
+    with pytest.raises(Disagreement, match="nan"):
+        agree("sums", np.array([np.nan]), np.ones(1), 0.05)
+
+
+def test_a_ratio_is_taken_within_turns():
+    # The machine was ten times slower in the second turn: that is not a difference between the two.
+    times = Times({"a": [1.0, 20.0, 3.0], "b": [2.0, 40.0, 4.0]})
+    assert times.ratio("a", "b") == 0.5
+    assert times.medians() == {"a": 3.0, "b": 4.0}
+    assert [Ratio("", 1.0, at_most=1.1).holds, Ratio("", 1.0, at_least=1.1).holds, Ratio("", 1.0).holds] == [1, 0, None]
+
+
+def test_operations_are_counted_in_loops_and_calls():
+    def program(weight, x):
+        return jax.lax.scan(lambda x, _: (jax.jit(jnp.tanh)(weight @ x), None), x, length=7)[0]
+
+    # 7 products of (5, 5) by (5,), each of 25 multiply-adds, and 7 × 5 hyperbolic tangents.
+    assert count_operations(program, np.ones((5, 5)), np.ones(5)) == Counter(matrix=7 * 50, elementwise=35)
+
+
+def test_the_preset_that_is_reported_times_each_call_ten_times():
+    from benchmarks import rollout, sweep
+
+    assert all(module.PRESETS["full"].turns >= 10 for module in (environment, rollout, sweep, training_step))

@@ -1,0 +1,77 @@
+"""Imports point down only, and the simulator and learning never meet below the experiments."""
+
+import ast
+from graphlib import TopologicalSorter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+FLOORS = (
+    "state rotation files lanes runtime",
+    "vehicle archive trajectories rows",
+    "vector_field datasets summary",
+    "rigid_body residual rollout environment",
+    "loss metrics models claims",
+    "training report_tables figures",
+    "sweep report_page flight_figures",
+    "report",
+)
+FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
+LEARNING = {"vector_field", "rigid_body", "residual", "rollout", "loss", "metrics", "models", "training", "sweep"}
+REPORTING = {"rows", "summary", "claims", "report", "report_tables", "report_page", "figures", "flight_figures"}
+
+
+def imported(path):
+    """The project's modules that a file imports, anywhere in it."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{path}: relative import"
+            found |= {node.module, *(f"{node.module}.{alias.name}" for alias in node.names)}
+    return {name for name in found if (ROOT / name.replace(".", "/")).with_suffix(".py").exists()}
+
+
+def modules(package):
+    """Dotted name → imported modules, for every module of a package."""
+    files = sorted((ROOT / package).rglob("*.py"))
+    return {".".join(path.relative_to(ROOT).with_suffix("").parts): imported(path) for path in files}
+
+
+LIBRARY = {name: needs for name, needs in modules("hybrid_jax").items() if not name.endswith("__init__")}
+CORE = {name.split(".")[1]: needs for name, needs in LIBRARY.items() if not name.startswith("hybrid_jax.sim.")}
+SIM = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.sim.")}
+
+
+def test_every_module_has_a_floor():
+    assert set(CORE) == set(FLOOR)
+
+
+@pytest.mark.parametrize("name", sorted(CORE))
+def test_imports_point_down(name):
+    for needed in CORE[name]:
+        assert needed.startswith("hybrid_jax.")
+        assert not needed.startswith("hybrid_jax.sim")
+        assert FLOOR[needed.split(".")[1]] < FLOOR[name], f"{name} imports {needed}"
+
+
+@pytest.mark.parametrize("name", sorted(SIM))
+def test_the_simulator_knows_nothing_of_learning(name):
+    for needed in SIM[name]:
+        assert needed.startswith("hybrid_jax.")
+        assert needed.split(".")[1] not in LEARNING | REPORTING | {"lanes"}, f"{name} imports {needed}"
+
+
+def test_there_is_no_cycle():
+    everything = {**modules("hybrid_jax"), **modules("experiments"), **modules("benchmarks")}
+    list(TopologicalSorter(everything).static_order())
+
+
+def test_the_test_sees_imports():
+    """A parser that finds nothing would let everything pass."""
+    assert "hybrid_jax.vector_field" in CORE["rigid_body"]
+    assert "hybrid_jax.rotation" in CORE["rigid_body"]
+    assert "hybrid_jax.sim.model" in SIM["hybrid_jax.sim.render"]
+    assert "hybrid_jax.training" in modules("experiments")["experiments.conditions"]

@@ -1,0 +1,51 @@
+"""Laws of the metrics."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import DAMPING, pendulum, swings
+
+from hybrid_jax import metrics
+from hybrid_jax.rollout import SOLVERS, rollout_batch
+
+
+def test_a_perfect_model_has_no_error():
+    windows = swings(20)
+    # Equal up to float32 round-off of states of about 10: (1e-6)² a number, and the order of vmap.
+    assert metrics.deployed_mse(pendulum(damping=DAMPING), windows) < 1e-10
+    assert metrics.deployed_mse(pendulum(damping=0.0), windows) > 1e-3
+
+
+@pytest.mark.parametrize(("every", "chunk"), [(1, 250), (2, 7), (4, 250), (8, 20)])
+def test_it_is_the_definition_at_every_so_many_intervals(every, chunk):
+    windows, field = swings(20), pendulum(0.6)
+    predicted = np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt), np.float64)
+    squares = np.square(predicted - np.asarray(windows.x)).sum(-1)
+    rows = [i for i in range(8) if (i + 1) % every == 0]
+    found = metrics.deployed_mse(field, windows, every, chunk=chunk)
+    np.testing.assert_allclose(found, squares[:, rows].mean(), rtol=1e-5)  # float32 sums of 160 numbers
+
+
+def test_the_solver_is_the_one_asked_for():
+    windows, field = swings(20), pendulum(damping=DAMPING)
+    # The data are RK4's own; Heun differs by its error at a step of 0.05.
+    assert metrics.deployed_mse(field, windows, solver=SOLVERS["heun"]) > 1e-6
+
+
+def test_mse_keeps_the_windows_apart():
+    truth = jnp.zeros((3, 2, 2))
+    predicted = truth.at[1].set(2.0)
+    np.testing.assert_array_equal(metrics.mse(predicted, truth), [0, 8, 0])
+
+
+def test_improvement():
+    np.testing.assert_allclose(
+        metrics.improvement(jnp.array([2.0, 2.0, 2.0]), jnp.array([0.0, 2.0, 3.0])), [1, 0, -0.5]
+    )
+
+
+def test_an_error_beyond_float_is_infinite_or_nan_and_not_hidden():
+    lost = pendulum(damping=-1e6)
+    assert not jnp.isfinite(metrics.deployed_mse(lost, swings(20)))
+    assert not jax.numpy.isnan(metrics.improvement(jnp.array(1.0), jnp.array(jnp.inf)))

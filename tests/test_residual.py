@@ -1,0 +1,139 @@
+"""Laws of the network f_d and its batch normalisation."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybrid_jax.residual import BatchNorm, InputScaling, ResidualNetwork, residual_network
+from hybrid_jax.vector_field import Hybrid, Statistics, evaluate_batch, observe, trainable
+
+STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
+
+
+def network(seed=0, hidden=HIDDEN):
+    """A network whose gains, shifts and running statistics are not those of a fresh one."""
+    keys = jax.random.split(jax.random.key(seed), 5)
+    fresh = residual_network(STATES, INPUTS, keys[0], hidden=hidden, scaling=InputScaling(2.0, 3.0))
+    gain, shift, mean = (jax.random.normal(key, (hidden,)) for key in keys[1:4])
+    running = Statistics(mean, jax.random.uniform(keys[4], (hidden,), minval=0.5, maxval=2.0))
+    return eqx.tree_at(lambda field: field.norm, fresh, BatchNorm(gain, shift, running))
+
+
+def batch(seed=0, columns=COLUMNS):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(3 + 2 * rng.normal(size=(STATES, columns))), jnp.asarray(rng.normal(size=(INPUTS, columns)))
+
+
+def plain(field, x, u):
+    """The training formula as the papers write it, for autodiff: γ (h − mean) / √(variance + ε) + β."""
+    hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
+    mean, variance = hidden.mean(1, keepdims=True), hidden.var(1, keepdims=True)
+    normal = (hidden - mean) / jnp.sqrt(variance + field.norm.epsilon)
+    active = jnp.maximum(field.norm.gain[:, None] * normal + field.norm.shift[:, None], 0)
+    return field.weight_out @ active + field.bias_out[:, None]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(seed):
+    with jax.enable_x64(True):
+        field, (x, u) = network(seed), batch(seed)
+        weights = jax.random.normal(jax.random.key(9), (STATES, COLUMNS))
+
+        def gradients(formula):
+            parameters, rest = eqx.partition((field, x, u), eqx.is_inexact_array)
+            return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
+
+        np.testing.assert_allclose(evaluate_batch(field, x, u), plain(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(formula)) for formula in (evaluate_batch, plain))
+        assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
+        for one, other in zip(found, expected, strict=True):
+            # Round-off of float64 on gradients of up to about 100.
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
+        assert sum(float(jnp.abs(leaf).max()) > 1e-3 for leaf in expected) == 7
+
+
+def test_in_training_hidden_units_have_mean_zero_and_variance_one():
+    """As torch.nn.BatchNorm1d in training: the batch's own mean and biased variance, ε = 1e-5."""
+    with jax.enable_x64(True):
+        # relu(h) − relu(−h) = h: with weights ±1 the output shows the normalised units themselves.
+        inner = jax.random.normal(jax.random.key(0), (STATES, STATES + INPUTS))
+        both = BatchNorm(jnp.ones(2 * STATES), jnp.zeros(2 * STATES), Statistics(jnp.zeros(10), jnp.ones(10)))
+        field = ResidualNetwork(
+            jnp.concatenate([inner, -inner]), both, jnp.hstack([jnp.eye(STATES), -jnp.eye(STATES)]), jnp.zeros(STATES)
+        )
+        x, u = batch(columns=50)
+        normalised = np.asarray(evaluate_batch(field, x, u))
+        variance = np.asarray(inner @ jnp.concatenate([x, u])).var(1)
+        np.testing.assert_allclose(normalised.mean(1), 0, atol=1e-13)
+        np.testing.assert_allclose(normalised.var(1), variance / (variance + 1e-5), rtol=1e-12)
+
+
+def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+        target = Statistics(hidden.mean(1), hidden.var(1))
+        before, observed = field.norm.running, field
+        for _ in range(20):
+            observed = observe(observed, x, u)
+        for name in ("mean", "variance"):
+            start, end, goal = (getattr(each, name) for each in (before, observed.norm.running, target))
+            np.testing.assert_allclose(end - goal, 0.9**20 * (start - goal), rtol=0, atol=1e-12)
+        untouched = eqx.tree_at(lambda field: field.norm.running, observed, before)
+        assert eqx.tree_equal(untouched, field)
+
+
+def test_deployment_is_training_when_the_running_statistics_are_the_batch_s():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+        here = Statistics(hidden.mean(1), hidden.var(1))
+        field = eqx.tree_at(lambda field: field.norm.running, field, here)
+        deployed = jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+        np.testing.assert_allclose(deployed, evaluate_batch(field, x, u), rtol=0, atol=1e-12)
+
+
+def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
+    field = network()
+    x, u = jnp.ones((STATES, COLUMNS)), jnp.ones((INPUTS, COLUMNS))
+    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(evaluate_batch(field, x, u))))(x)
+    assert jnp.isfinite(value)
+    assert jnp.isfinite(slope).all()
+
+
+def test_running_statistics_are_not_trainable_and_all_else_is():
+    marks = trainable(Hybrid(network(), network()))
+    for part in (marks.physics, marks.residual):
+        assert jax.tree.leaves(part.norm.running) == [False]
+        assert jax.tree.leaves(eqx.tree_at(lambda part: part.norm.running, part, None)) == [True] * 5
+
+
+def test_the_paper_s_network_has_the_paper_s_size():
+    field = residual_network(13, 4, jax.random.key(0))
+    learned = eqx.filter(field, trainable(field))
+    # 17 × 64 (its bias would be removed by batch norm), γ and β of 64, 64 × 13 + 13.
+    assert sum(leaf.size for leaf in jax.tree.leaves(learned)) == 17 * 64 + 2 * 64 + 64 * 13 + 13
+    for weight, fan_in in ((field.weight_in, 17), (field.weight_out, 64), (field.bias_out, 64)):
+        assert 0.85 / fan_in**0.5 < jnp.abs(weight).max() <= 1 / fan_in**0.5  # 13 draws or more, of a fixed seed
+
+
+def test_inputs_are_scaled_before_the_network():
+    x, u = jnp.arange(5.0), jnp.array([7.0, -3.0])
+    scaled, raw = (eqx.tree_at(lambda f: f.scaling, network(), s) for s in (InputScaling(1.0, 4.0), InputScaling()))
+    np.testing.assert_allclose(scaled(x, 4 * u + 1), raw(x, u), rtol=1e-5)  # float32 round-off
+
+
+def test_lanes_of_networks_are_the_networks_one_by_one():
+    fields = [network(seed) for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fields)
+    x, u = (part.astype(np.float32) for part in batch())
+    cost = jax.value_and_grad(lambda field: jnp.sum(evaluate_batch(field, x, u) ** 2))
+    values, slopes = jax.jit(jax.vmap(cost))(stacked)
+    alone = jax.jit(cost)
+    for i, field in enumerate(fields):
+        value, slope = alone(field)
+        np.testing.assert_allclose(values[i], value, rtol=1e-5)  # float32 round-off in another order of sums
+        for one, other in zip(jax.tree.leaves(slopes), jax.tree.leaves(slope), strict=True):
+            np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-5 * max(1, jnp.abs(other).max()))

@@ -1,0 +1,113 @@
+"""Laws of windows cut from flights."""
+
+from dataclasses import replace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybrid_jax.trajectories import Trajectories, check, concatenate, windows_of
+
+STEPS = 5
+
+
+def flight(intervals=23, seed=0):
+    rng = np.random.default_rng(seed)
+    return rng.normal(size=(intervals + 1, 3)), rng.normal(size=(intervals, 2))
+
+
+def windows():
+    return windows_of(*flight(), 0.01, steps=STEPS)
+
+
+def test_windows_partition_a_flight():
+    states, inputs = flight()
+    cut = windows_of(states, inputs, 0.01, steps=STEPS)
+    assert (len(cut), cut.horizon, cut.dt) == (4, STEPS, 0.01)
+    np.testing.assert_array_equal(np.concatenate(cut.u), inputs[:20])
+    np.testing.assert_array_equal(np.concatenate(cut.x), states[1:21])
+    np.testing.assert_array_equal(cut.x0, states[[0, 5, 10, 15]])
+
+
+def test_each_window_starts_where_the_last_one_ended():
+    cut = windows()
+    np.testing.assert_array_equal(cut.x[:-1, -1], cut.x0[1:])
+
+
+def test_with_a_stride_windows_overlap():
+    states, inputs = flight()
+    cut = windows_of(states, inputs, 0.01, steps=STEPS, stride=2)
+    assert len(cut) == 10  # starts 0, 2, …, 18; the window from 18 ends with the flight
+    np.testing.assert_array_equal(cut.x[-1, -1], states[-1])
+    np.testing.assert_array_equal(cut.u[3], inputs[6:11])
+
+
+@pytest.mark.parametrize(("intervals", "steps", "stride"), [(4, 5, None), (23, 0, None), (23, 5, 0), (23, 5, -1)])
+def test_a_flight_without_a_window_is_refused(intervals, steps, stride):
+    with pytest.raises(ValueError, match="has no window of steps"):
+        windows_of(*flight(intervals), 0.01, steps=steps, stride=stride)
+
+
+def test_concatenate_keeps_order_and_refuses_what_does_not_fit():
+    a, b = windows(), windows_of(*flight(seed=1), 0.01, steps=STEPS)
+    joined = concatenate([a, b])
+    np.testing.assert_array_equal(joined.x[4:], b.x)
+    for other in (replace(b, dt=0.02), windows_of(*flight(), 0.01, steps=4)):
+        with pytest.raises(ValueError, match="share dt and horizon"):
+            concatenate([a, other])
+    with pytest.raises(ValueError, match="share dt and horizon"):
+        concatenate([])
+
+
+def test_windows_are_picked_by_slices_and_by_traced_indices():
+    cut = windows()
+    np.testing.assert_array_equal(cut[1:3].u, cut.u[1:3])
+    picked = jax.jit(lambda index, windows: windows[index])(jnp.array([3, 0]), jax.tree.map(jnp.asarray, cut))
+    np.testing.assert_array_equal(picked.x, cut.x.astype(np.float32)[[3, 0]])
+    assert picked.dt == cut.dt
+
+
+def test_sound_windows_pass_unchanged():
+    cut = windows()
+    assert check(cut) is cut
+
+
+@pytest.mark.parametrize(("field", "index"), [("x0", (2, 1)), ("u", (1, 3, 0)), ("x", (3, 4, 2))], ids=["x0", "u", "x"])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_the_number_that_is_not_finite_is_named(field, index, value):
+    cut = windows()
+    getattr(cut, field)[index] = value
+    with pytest.raises(ValueError, match="mine") as error:
+        check(cut, "mine")
+    assert f"{field}{list(index)} is not finite" in str(error.value)
+
+
+@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
+def test_dt_must_be_positive(dt):
+    with pytest.raises(ValueError, match="dt must be a positive number"):
+        check(replace(windows(), dt=dt))
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda w: replace(w, x0=w.x0[:-1]),
+        lambda w: replace(w, u=w.u[:, :-1]),
+        lambda w: replace(w, x=w.x[..., :-1]),
+    ],
+    ids=["x0 short", "u short", "x narrow"],
+)
+def test_shapes_that_do_not_agree_are_named(change):
+    with pytest.raises(ValueError, match=r"trajectories: shapes of x0 .* do not agree"):
+        check(change(windows()))
+
+
+def test_single_and_empty_windows_are_refused():
+    with pytest.raises(ValueError, match="must have 2, 3, 3 axes"):
+        check(windows()[0])
+    with pytest.raises(ValueError, match="is empty"):
+        check(windows()[:0])
+    nothing = Trajectories(np.zeros((2, 3)), np.zeros((2, 0, 1)), np.zeros((2, 0, 3)), 0.1)
+    with pytest.raises(ValueError, match="is empty"):
+        check(nothing)
