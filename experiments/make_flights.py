@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hybrid_jax.datasets import Dataset, config_hash, load_dataset, save_dataset
+from hybrid_jax.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
 from hybrid_jax.sim.render import picture
@@ -83,6 +83,24 @@ def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], see
         with progress_bar(f"flying {domain.name}") as advance:
             save_dataset(path, make_dataset(domain, splits, seed, advance))
     return load_dataset(path, configuration(domain, splits, seed))
+
+
+def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
+    """The windows asked for, the first of each split of a file that was made before.
+
+    Raises:
+        ValueError: the file is damaged, of another domain, or has fewer windows or others than asked for.
+    """
+    whole = load_dataset(path)
+    expected = domain.describe()
+    require_config(path, {key: whole.config.get(key) for key in expected}, expected)
+    parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
+    for name, spec in splits.items():
+        if parts[name].horizon != spec.steps:
+            raise ValueError(
+                f"{path}: split {name!r} has windows of {parts[name].horizon} steps, expected {spec.steps}"
+            )
+    return Dataset(parts, whole.metadata, origin=str(path))
 
 
 class progress_bar(AbstractContextManager):

@@ -29,7 +29,7 @@ class SweepLine(AbstractContextManager):
         if self._live is not None:
             self._live.stop()
 
-    def show(self, _, progress: Progress) -> None:
+    def show(self, progress: Progress) -> None:
         """Draw where the sweep is."""
         line = f"{self._name}: {describe(progress)}"
         if self._live is not None:

@@ -77,6 +77,10 @@ class Config:
     """Target test trajectories of 1 s."""
     data_seed: int = 0
     """Seed of all flights."""
+    source_flights: Path | None = None
+    """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
+    target_flights: Path | None = None
+    """The same for the target, with the splits train, validation and test."""
     hidden: int = 64
     """Hidden units of f_d."""
     inputs: Literal["hover", "raw"] = "hover"

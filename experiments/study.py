@@ -65,12 +65,14 @@ def study(domain: Domain, vehicle: Vehicle, config: Config, console: Console) ->
         vehicle: what the engineer knows of the vehicle; its nominal θ_p is where the models start from.
     """
     stages = Stages(config.cache / "sweeps", console)
-    source = stages.timed(
-        "source flights", lambda: flights(SOURCE, source_splits(config), config.data_seed, config.cache)
-    )
-    target = stages.timed(
-        "target flights", lambda: flights(domain, target_splits(config), config.data_seed, config.cache)
-    )
+
+    def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
+        if file is not None:
+            return chosen_flights(file, of, splits)
+        return stages.timed(f"flights {of.name}", lambda: flights(of, splits, config.data_seed, config.cache))
+
+    source = get(config.source_flights, SOURCE, source_splits(config))
+    target = get(config.target_flights, domain, target_splits(config))
     lanes: list[Lanes] = []
     for model in config.models:
         lanes += _model_lanes(model, vehicle, config, stages, source, target)

@@ -36,7 +36,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
         archive.writestr(zipfile.ZipInfo(HEADER), encode(header))
         for name, array in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, np.ascontiguousarray(array), allow_pickle=False)
+                np.lib.format.write_array(entry, _contiguous(array), allow_pickle=False)
     write_whole(path, buffer.getvalue())
 
 
@@ -72,7 +72,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
     """
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
-        array = np.ascontiguousarray(arrays[name])
+        array = _contiguous(arrays[name])
         found.update(encode([name, array.dtype.str, list(array.shape)]))
         found.update(array.tobytes())
     return found.hexdigest()
@@ -117,3 +117,8 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
 
 def _read_array(entry: bytes) -> np.ndarray:
     return np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+
+
+def _contiguous(array: np.ndarray) -> np.ndarray:
+    # np.ascontiguousarray would make a vector of a scalar.
+    return np.asarray(array, order="C")

@@ -87,7 +87,7 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
     for name, windows in splits.items():
         check(windows, f"{path}: split {name!r}")
     if expected_config is not None:
-        _require_config(path, dataset.config, expected_config)
+        require_config(path, dataset.config, expected_config)
     return dataset
 
 
@@ -131,7 +131,12 @@ def _has_content(path: Path, digest: str) -> bool:
         return False
 
 
-def _require_config(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+def require_config(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
+    """Compare two configurations.
+
+    Raises:
+        ValueError: they differ; one line that names the file and shows every field that does.
+    """
     found, expected = _flatten(found), _flatten(expected)
     differing = [
         f"{key} is {found.get(key, 'absent')}, expected {expected.get(key, 'absent')}"

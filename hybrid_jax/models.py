@@ -61,7 +61,7 @@ class Model:
             raise ValueError(f"x0 (d,) and u (t, m), or (n, d) and (n, t, m), expected; got {x0.shape} and {u.shape}")
         if not (np.isfinite(x0).all() and np.isfinite(u).all()):
             raise ValueError("x0 and u must be finite")
-        if not dt > 0:
+        if not 0 < dt < float("inf"):
             raise ValueError(f"dt must be a positive number of seconds, got {dt}")
         return _predict(self.field, x0, u, dt)
 
