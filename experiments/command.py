@@ -1,5 +1,7 @@
 """What the commands of all experiments share: options, presets, one-line errors, exit codes."""
 
+import contextlib
+import io
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -39,9 +41,23 @@ def read(name: str, about: str, arguments: list[str]) -> Config:
     """
     preset = PRESETS[_preset(arguments)]
     description = f"{about}\n\n{Config.__doc__}"
-    return tyro.cli(
-        Config, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
-    )
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(
+                Config, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
+            )
+    except SystemExit as stop:
+        if not stop.code:
+            raise  # --help
+        raise ValueError(f"{_essence(said.getvalue())}; see --help") from None
+
+
+def _essence(box: str) -> str:
+    """What tyro says in the first part of the box that it draws around an error."""
+    lines = [line.strip("│ ") for line in box.splitlines()]
+    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰"))]
+    return " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
 
 
 def check_folder(option: str, folder: Path) -> None:

@@ -19,6 +19,7 @@ from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 
 FLIGHT_SECONDS = 11.0
+PLACES = ("out", "cache")  # where files lie is not what was run
 
 
 def write_outcome(
@@ -35,7 +36,7 @@ def write_outcome(
     save_models(out / "models", found)
     report = Report(
         experiment=experiment,
-        config=asdict(config),
+        config={name: value for name, value in asdict(config).items() if name not in PLACES},
         environment=environment(found.seconds),
         rows=found.rows,
         claims=claims(found.rows, experiment, truth_theta),
@@ -75,9 +76,10 @@ def draw(
             "Test error and gain against N (paper, Figs. 3, 5)",
         ),
         "example_flight": (example_flight(states, inputs, DT), "A flight like those of the data (paper, Fig. 7)"),
-        "theta": (theta(found.rows, truth), "Physical parameters after training, against the truth"),
     }
-    if len(config.models) > 0:
+    if {*config.models} - {"no_physics"}:
+        figures["theta"] = (theta(found.rows, truth), "Physical parameters after training, against the truth")
+    if {*config.models} - {"physics_only"}:
         figures["predictions"] = (paths(title, found), "A test flight and its predictions (paper, Figs. 2, 4)")
     for name, (figure, _) in figures.items():
         save_figure(figure, out / name)

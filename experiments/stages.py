@@ -11,6 +11,7 @@ from rich.console import Console
 from experiments.progress import SweepLine, clock
 from hybrid_jax.archive import digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.datasets import Dataset, content_hash, versions
+from hybrid_jax.models import describe
 from hybrid_jax.sweep import Progress, sweep
 from hybrid_jax.training import FitState, Plan, Settings
 
@@ -116,7 +117,9 @@ def summary(states: FitState) -> str:
 
 def _identity(states: FitState, plans: Plan, settings: Settings, data: Dataset) -> str:
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
-    fixed = [RECIPE, settings.batch_size, regulariser, type(settings.solver).__name__, content_hash(data)]
+    shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
+    # Leaves say nothing of what is static in a field: the vehicle, how inputs are scaled.
+    fixed = [RECIPE, *shared, describe(states.field), content_hash(data)]
     return digest(fixed, named_leaves({"start": states, "plan": plans}))
 
 

@@ -2,12 +2,13 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 from rich.console import Console
 
 from experiments.conditions import adaptation, fresh_fields, pretraining, settings
-from experiments.make_flights import flights
+from experiments.make_flights import chosen_flights, flights
 from experiments.protocol import Config
 from experiments.stages import Stages
 from hybrid_jax.datasets import Dataset

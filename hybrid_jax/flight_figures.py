@@ -130,7 +130,7 @@ def _draw_space(axes: Any, states: States) -> None:
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Path (grey: its shadow on the ground)")
     axes.set_zlim(bottom=0)
     axes.locator_params(nbins=5)
-    axes.set_box_aspect(None, zoom=0.88)  # room for the label of z
+    axes.set_box_aspect(None, zoom=0.8)  # room for the label of z
 
 
 def _draw_rotors(axes: Axes, time: np.ndarray, inputs: np.ndarray) -> None:

@@ -97,6 +97,15 @@ def load(path: str | Path) -> Model:
         raise ValueError(f"{path}: {error}") from error
 
 
+def describe(field: AbstractVectorField) -> Any:
+    """What a field is apart from its arrays, as JSON values: classes, the vehicle, scalings, names of parameters.
+
+    Raises:
+        ValueError: as `save`.
+    """
+    return _encode(field, "field", {})
+
+
 def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
     name = type(value).__name__
     if _KINDS.get(name) is type(value):

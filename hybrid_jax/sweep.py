@@ -7,6 +7,7 @@ so that these cost nothing, reports progress, and is where a run can be interrup
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -14,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from hybrid_jax import training
-from hybrid_jax.lanes import LaneMap, count, lane
+from hybrid_jax.lanes import LaneMap, count
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.training import FitState, Plan, Settings
 from hybrid_jax.trajectories import Trajectories, check
@@ -97,6 +98,7 @@ def evaluate(
     return errors(jax.device_get(fields), (windows,), np.ones(lanes), range(lanes))
 
 
+@cache  # a sweep of the same shapes, later in the same process, compiles nothing
 def _block(settings: Settings, width: int | None) -> LaneMap:
     def block(lane: tuple[FitState, Plan], train, validation, more) -> FitState:
         state, plan = lane
@@ -105,6 +107,7 @@ def _block(settings: Settings, width: int | None) -> LaneMap:
     return LaneMap(block, width)
 
 
+@cache
 def _evaluation(settings: Settings, every: int) -> LaneMap:
     return LaneMap(lambda field, windows: deployed_mse(field, windows, every, settings.solver))
 
@@ -123,14 +126,15 @@ def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
 
 def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
     running: Bool[Array, " lanes"] = states.status == training.RUNNING
-    left = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
+    at_most = plans.max_epochs - states.epoch
+    at_least = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
     return Progress(
         active=int(running.sum()),
         lanes=len(running),
         epochs=int(states.epoch.max()),
         best=float(np.min(states.best_mse)),
-        at_least=int(np.max(left, where=running, initial=0)),
-        at_most=int(np.max(plans.max_epochs - states.epoch, where=running, initial=0)),
+        at_least=int(np.max(np.minimum(at_least, at_most), where=running, initial=0)),
+        at_most=int(np.max(at_most, where=running, initial=0)),
         seconds=seconds,
     )
 
@@ -138,16 +142,14 @@ def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
 def _check(plans: Plan, train: Trajectories, validation: Trajectories, settings: Settings) -> None:
     check(train, "train")
     check(validation, "validation")
+    listed = plans.subset.shape[-1]
     for size in np.unique(plans.n_train):
-        if not settings.batch_size <= size <= len(train):
+        if not settings.batch_size <= size <= min(listed, len(train)):
             raise ValueError(
-                f"n_train={size} must lie between batch_size={settings.batch_size} and {len(train)} windows of train"
+                f"n_train={size} must lie between batch_size={settings.batch_size} and the number of windows: "
+                f"{len(train)} in train, {listed} in subset"
             )
-
-
-def best_fields(states: FitState) -> AbstractVectorField:
-    """Each lane's field of its best validation epoch, stacked."""
-    return states.best
-
-
-__all__ = ["Progress", "best_fields", "evaluate", "lane", "sweep"]
+    # A gather would clamp such an index and train on another window in silence.
+    outside = plans.subset[(plans.subset < 0) | (plans.subset >= len(train))]
+    if outside.size:
+        raise ValueError(f"subset holds {outside[0]}, which is no index of the {len(train)} windows of train")

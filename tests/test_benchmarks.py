@@ -12,19 +12,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import environment, training_step
+from benchmarks import environment, rollout, sweep, timing, training_step
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
 
 
-def run(name, *options):
-    command = [sys.executable, "-m", f"benchmarks.{name}", *map(str, options)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-
-
 def smoke(name, folder):
     """The report of the smallest preset, and what was printed."""
-    finished = run(name, "--preset", "smoke", "--out", folder / "report.json")
+    command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", "smoke", "--out", str(folder / "report.json")]
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
     assert finished.returncode == 0, finished.stderr
     report = json.loads((folder / "report.json").read_text())
     assert (report["benchmark"], report["preset"]) == (name, "smoke")
@@ -76,21 +72,28 @@ def test_widths_of_chunks_train_alike(tmp_path):
     assert choice["best_width"] in (1, 2)
 
 
-@pytest.mark.parametrize("name", ["environment", "rollout", "training_step", "sweep"])
-def test_a_result_that_could_not_be_written_is_refused_before_it_is_measured(name, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "complaint"),
+    [
+        (["--out", "file/report.json"], "--out file: cannot be written"),
+        (["--out", "folder"], "--out folder: is a folder"),
+        (["--preset", "huge"], "--preset must be one of full, smoke, got 'huge'"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line_before_anything_is_measured(
+    options, complaint, tmp_path, monkeypatch, capsys
+):
     (tmp_path / "file").write_text("kept")
-    for out in (tmp_path / "file" / "report.json", tmp_path):
-        finished = run(name, "--preset", "smoke", "--out", out)
-        assert (finished.returncode, finished.stdout) == (2, "")
-        (line,) = finished.stderr.splitlines()
-        assert line.startswith(f"{name}: --out {tmp_path}")
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["benchmark", *options])
+    with pytest.raises(SystemExit, match="2"):
+        timing.run("name", "About.", {"full": None, "smoke": None}, lambda preset: pytest.fail("was measured"))
+    printed, complained = capsys.readouterr()
+    (line,) = complained.splitlines()
+    assert printed == ""
+    assert line.startswith(f"name: {complaint}")
     assert (tmp_path / "file").read_text() == "kept"
-
-
-def test_an_unknown_preset_is_one_line():
-    finished = run("rollout", "--preset", "huge")
-    assert finished.returncode == 2
-    assert finished.stderr == "rollout: --preset must be one of full, smoke, got 'huge'\n"
 
 
 def test_results_that_differ_are_not_timed():
@@ -120,6 +123,4 @@ def test_operations_are_counted_in_loops_and_calls():
 
 
 def test_the_preset_that_is_reported_times_each_call_ten_times():
-    from benchmarks import rollout, sweep
-
     assert all(module.PRESETS["full"].turns >= 10 for module in (environment, rollout, sweep, training_step))

@@ -121,8 +121,7 @@ def test_a_flipped_bit_never_gives_another_model(file):
         file.write_bytes(flipped)
         try:
             model = load(file)
-        except ValueError as error:
-            assert "\n" not in str(error)
+        except ValueError:
             continue
         unnoticed += 1
         assert eqx.tree_equal(model.field, FIELDS["hybrid"])
