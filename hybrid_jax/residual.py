@@ -16,7 +16,7 @@ class InputScaling(eqx.Module):
     offset: float = eqx.field(static=True, default=0.0)
     scale: float = eqx.field(static=True, default=1.0)
 
-    def __call__(self, u: Float[Array, "m *b"]) -> Float[Array, "m *b"]:
+    def __call__(self, u: Float[Array, " m *b"]) -> Float[Array, " m *b"]:
         return (u - self.offset) / self.scale
 
 

@@ -32,7 +32,7 @@ class RigidBody(AbstractVectorField):
         """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
         return {name: value * jnp.exp(self.log_ratios[name]) for name, value in nominal(self.vehicle).items()}
 
-    def __call__(self, x: Float[Array, "13 *b"], u: Float[Array, "4 *b"]) -> Float[Array, "13 *b"]:
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
         theta = self.theta()
         thrust, torque = _wrench(self.vehicle, theta["k"], u)
@@ -58,7 +58,7 @@ def nominal(vehicle: Vehicle) -> dict[str, float]:
     return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}
 
 
-def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Float[Array, "4 *b"]):
+def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Float[Array, " 4 *b"]):
     """Total thrust [N] and body torque [N m] of the rotors: thrust × arm, and the reaction torque c_m u²."""
     arms = np.asarray(vehicle.rotor_positions)
     # One small matrix product gives Σu², Σ y u², −Σ x u², Σ s u²; coefficients come after it.
@@ -67,7 +67,7 @@ def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Float[Array, "4 *b"]):
     return k * total, (k * roll, k * pitch, vehicle.torque_coefficient * yaw)
 
 
-def _euler(inertia, torque, omega: Float[Array, "3 *b"]) -> Float[Array, "3 *b"]:
+def _euler(inertia, torque, omega: Float[Array, " 3 *b"]) -> Float[Array, " 3 *b"]:
     """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
     return jnp.stack(

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
 
-Derivative = Callable[[Float[Array, "d *b"], Float[Array, "m *b"]], Float[Array, "d *b"]]
+Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 
 
 class RK4(diffrax.AbstractSolver):
@@ -45,7 +45,7 @@ class RK4(diffrax.AbstractSolver):
 
 def integrate(
     derivative: Derivative,
-    x0: Float[Array, "d *b"],
+    x0: Float[Array, " d *b"],
     u: Float[Array, "t m *b"],
     dt: float,
     solver: diffrax.AbstractSolver,
@@ -53,15 +53,15 @@ def integrate(
 ) -> Float[Array, "t d *b"]:
     """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
-    times = (0.0, dt / substeps)
+    begin, end = 0.0, dt / substeps
     if isinstance(solver, diffrax.AbstractImplicitSolver):
-        times = tuple(jnp.asarray(time) for time in times)  # its root finder accepts no plain numbers
+        begin, end = jnp.asarray(begin), jnp.asarray(end)  # its root finder accepts no plain numbers
 
     def interval(x, held):
         # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
-        state = solver.init(term, *times, x, held)
+        state = solver.init(term, begin, end, x, held)
         for _ in range(substeps):
-            x, _, _, state, _ = solver.step(term, *times, x, held, state, made_jump=False)
+            x, _, _, state, _ = solver.step(term, begin, end, x, held, state, made_jump=False)
         return x, x
 
     return jax.lax.scan(interval, x0, u)[1]

