@@ -55,5 +55,22 @@ def draw(path: str | Path) -> None:
         matplotlib.image.imsave(path, renderer.render())
 
 
+def main(arguments: list[str]) -> int:
+    """The command line: draw, here where MUJOCO_GL says how, otherwise in whichever way works. Exit code 2 and one line
+    if none does."""
+    if len(arguments) != 1:
+        print("render: give one file name, FILE.png", file=sys.stderr)
+        return 2
+    if "MUJOCO_GL" in os.environ:
+        draw(arguments[0])
+        return 0
+    try:
+        picture(arguments[0])
+    except ValueError as error:
+        print(f"render: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
 if __name__ == "__main__":
-    draw(sys.argv[1])
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,96 @@
+"""A sweep is run once, is not lost when interrupted, and is found again only by what it was."""
+
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from pendulum import DAMPING, pendulum, swings
+from rich.console import Console
+
+from experiments.progress import SweepLine
+from experiments.stages import Stages
+from hybrid_jax.archive import named_leaves
+from hybrid_jax.datasets import Dataset
+from hybrid_jax.lanes import stack
+from hybrid_jax.training import Settings, make_plan, start
+
+SETTINGS = Settings(batch_size=10)
+DATA = Dataset({"train": swings(20), "validation": swings(10, seed=1)}, {"config": {}})
+STATES = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.6))])
+PLANS = stack([make_plan(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rate in (0.03, 0.01)])
+
+
+def stages(folder):
+    return Stages(folder, Console(quiet=True))
+
+
+def run(folder, states=STATES, plans=PLANS, settings=SETTINGS, data=DATA):
+    found = stages(folder)
+    return found.run("a sweep", states, plans, settings, data), found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("stages")
+
+
+@pytest.fixture(scope="module")
+def whole(folder):
+    return run(folder)[0]
+
+
+def same(one, other):
+    one, other = named_leaves(one), named_leaves(other)
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_a_finished_sweep_is_found_not_run(folder, whole):
+    again, found = run(folder)
+    assert found.reused == ["a sweep"]
+    assert same(again, whole)
+
+
+def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
+    seen = []
+
+    def interrupt(self, progress):
+        seen.append(progress.epochs)
+        if len(seen) == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SweepLine, "show", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path)
+    assert [path.name.endswith(".begun.npz") for path in tmp_path.iterdir()] == [True]
+    later = []
+    with monkeypatch.context() as patch:
+        patch.setattr(SweepLine, "show", lambda self, progress: later.append(progress.epochs))
+        resumed, found = run(tmp_path)
+    assert later[0] > seen[0]  # it did not start anew
+    assert found.reused == []
+    assert same(resumed, whole)
+    assert not list(tmp_path.glob("*.begun.npz"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"settings": replace(SETTINGS, batch_size=5)},
+        {"plans": stack([make_plan(0.02, np.arange(20), 20, 1, 1, 2, 0.0)] * 2)},
+        {"data": Dataset({"train": swings(20, seed=7), "validation": swings(10, seed=1)}, {"config": {}})},
+        {"states": stack([start(pendulum(length, 2 * DAMPING), jax.random.key(0)) for length in (0.8, 0.6)])},
+    ],
+    ids=["settings", "plans", "data", "what is static in a field"],
+)
+def test_anything_else_is_another_sweep(folder, whole, other):
+    assert run(folder, **other)[1].reused == []
+
+
+def test_a_damaged_file_is_named(tmp_path, whole):
+    run(tmp_path)
+    (path,) = tmp_path.glob("*.npz")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=path.name):
+        run(tmp_path)
