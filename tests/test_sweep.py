@@ -85,8 +85,11 @@ def test_every_lane_comes_to_its_own_end(final):
 
 def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     blocks = []
+    own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
-        swept(starts(), PLANS, width=1, block_seconds=1e-9, on_block=lambda states, progress: blocks.append(progress))
+        for _ in range(2):
+            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, block_seconds=1e-9,
+                  on_block=lambda states, progress: blocks.append(progress))  # fmt: skip
     compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert len(blocks) > 3
     assert sum("run" in message for message in compiled) == 1
@@ -125,12 +128,13 @@ def test_stopped_lanes_cost_no_step(monkeypatch):
 
     handed = []
 
-    class Counting(module.LaneMap):
-        def __call__(self, lanes, shared, costs, active):
-            handed.append(list(active))
-            return super().__call__(lanes, shared, costs, active)
+    run = module.LaneMap.__call__
 
-    monkeypatch.setattr(module, "LaneMap", Counting)
+    def counting(self, lanes, shared, costs, active):
+        handed.append(list(active))
+        return run(self, lanes, shared, costs, active)
+
+    monkeypatch.setattr(module.LaneMap, "__call__", counting)
     swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9)
     assert handed[1] == [0, 1, 2]  # the first call only compiles
     assert handed[2] == [1, 2]
