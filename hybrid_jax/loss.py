@@ -7,6 +7,7 @@ Kalousis 2023; Osaka et al. 2025), and ‖f_d‖² (Yin et al. 2021, APHYNITY).
 
 from collections.abc import Callable
 
+import diffrax
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -17,21 +18,22 @@ from hybrid_jax.vector_field import AbstractVectorField, Hybrid, evaluate_batch
 
 
 class Minibatch(eqx.Module):
-    """b windows of t intervals of dt [s], features first: what the loss works on."""
+    """b windows of t intervals of dt [s], features first, and how they are integrated: what the loss works on."""
 
     x0: Float[Array, "d b"]
     u: Float[Array, "t m b"]
     x: Float[Array, "t d b"]
     dt: float = eqx.field(static=True)
+    solver: diffrax.AbstractSolver = eqx.field(static=True, default_factory=RK4)
 
 
 Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, ""]]
 
 
-def minibatch(windows: Trajectories) -> Minibatch:
+def minibatch(windows: Trajectories, solver: diffrax.AbstractSolver) -> Minibatch:
     """The windows with features first and samples last."""
     last = (jnp.moveaxis(a, 0, -1) for a in (windows.x0, windows.u, windows.x))
-    return Minibatch(*last, dt=windows.dt)
+    return Minibatch(*last, dt=windows.dt, solver=solver)
 
 
 def mse(predicted: Float[Array, "t d *b"], truth: Float[Array, "t d *b"]) -> Float[Array, "*b"]:
@@ -41,7 +43,7 @@ def mse(predicted: Float[Array, "t d *b"], truth: Float[Array, "t d *b"]) -> Flo
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
     """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory of f_p alone (paper, Eq. 7); the mean over trajectories."""
-    physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, RK4())
+    physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, batch.solver)
     a, b = (_unit(y.reshape(-1, y.shape[-1])) for y in (physics, predicted))
     # ½‖a − b‖² = 1 − ⟨a, b⟩ for unit vectors, without the cancellation that eats a small difference in float32.
     return jnp.mean(0.5 * jnp.sum(jnp.square(a - b), axis=0))

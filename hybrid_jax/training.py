@@ -130,11 +130,11 @@ def gradient_step(
     learned = trainable(field)
     parameters, rest = eqx.partition(field, learned)
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
-    batch = jax.lax.optimization_barrier(minibatch(windows))
+    batch = jax.lax.optimization_barrier(minibatch(windows, settings.solver))
 
     def objective(parameters):
         candidate = eqx.combine(parameters, rest)
-        predicted = rollout_minibatch(candidate, batch.x0, batch.u, batch.dt, settings.solver)
+        predicted = rollout_minibatch(candidate, batch.x0, batch.u, batch.dt, batch.solver)
         return loss(candidate, batch, predicted, settings.regulariser, plan.regulariser_weight), predicted
 
     (value, predicted), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)

@@ -44,7 +44,7 @@ def windows():
 
 @pytest.fixture(scope="module")
 def batch(double_precision):
-    return minibatch(windows())
+    return minibatch(windows(), RK4())
 
 
 @eqx.filter_jit
@@ -64,7 +64,7 @@ def network(seed=0):
 
 def test_a_minibatch_has_features_first():
     cut = windows()
-    turned = minibatch(cut)
+    turned = minibatch(cut, RK4())
     assert turned.x.shape == (STEPS, 2, WINDOWS)
     assert turned.dt == DT
     for i in range(WINDOWS):
