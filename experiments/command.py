@@ -29,7 +29,7 @@ def run(
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt:
-        print(f"{name}: interrupted; the same command goes on after the last finished stage", file=sys.stderr)
+        print(f"{name}: interrupted; the same command goes on from here", file=sys.stderr)
         sys.exit(INTERRUPTED)
 
 
