@@ -1,10 +1,11 @@
 """Hybrid models of vehicles: ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d), learned from flight, adapted from seconds of it."""
 
 from hybrid_jax.models import Model, load, save
+from hybrid_jax.objective import Settings
 from hybrid_jax.residual import residual_network
 from hybrid_jax.rigid_body import RigidBody, rigid_body
 from hybrid_jax.rollout import RK4, rollout, rollout_batch
-from hybrid_jax.training import Settings, fit
+from hybrid_jax.training import fit
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 from hybrid_jax.vehicle import IRIS, Vehicle, load_vehicle

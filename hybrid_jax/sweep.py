@@ -17,8 +17,9 @@ from jaxtyping import Array, Bool, Float, PyTree
 from hybrid_jax import training
 from hybrid_jax.lanes import LaneMap, count
 from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.training import FitState, Plan, Settings
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.objective import Settings
+from hybrid_jax.training import FitState, Plan
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
@@ -74,7 +75,9 @@ def sweep(
         ValueError: bad data, or a plan that asks for more windows than `train` has or for less than a minibatch.
     """
     states, plans = jax.device_get((states, plans))
-    _check(plans, train, validation, settings)
+    train = settings.objective.prepare(train, "train")
+    validation = settings.objective.prepare(validation, "validation")
+    _check(plans, train, settings)
     block = _block(settings, width)
     costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
     shared = (train, validation)
@@ -139,9 +142,7 @@ def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
     )
 
 
-def _check(plans: Plan, train: Trajectories, validation: Trajectories, settings: Settings) -> None:
-    check(train, "train")
-    check(validation, "validation")
+def _check(plans: Plan, train: PyTree, settings: Settings) -> None:
     listed = plans.subset.shape[-1]
     for size in np.unique(plans.n_train):
         if not settings.batch_size <= size <= min(listed, len(train)):

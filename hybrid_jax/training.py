@@ -1,34 +1,21 @@
 """One training run as a pure function: minibatches, Adam, validation, the best epoch, early stopping.
 
-What is swept over (rates, data size, patience, …) is an argument, `Plan`; what shapes the program is `Settings`.
+What is swept over (rates, data size, patience, …) is an argument, `Plan`; what shapes the program is `Settings`
+(objective.py).
 """
 
-from dataclasses import dataclass, field
-
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from hybrid_jax.loss import Regulariser, loss, minibatch
-from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.rollout import RK4, along, rollout_minibatch
-from hybrid_jax.trajectories import Trajectories, check
-from hybrid_jax.vector_field import AbstractVectorField, observe, trainable
+from hybrid_jax.objective import Learner, Settings
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField, trainable
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
 STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
-
-
-@dataclass(frozen=True)
-class Settings:
-    """What is the same for all lanes of a sweep and fixed when it is compiled."""
-
-    batch_size: int = 100
-    regulariser: Regulariser | None = None
-    solver: diffrax.AbstractSolver = field(default_factory=RK4)
 
 
 class Plan(eqx.Module):
@@ -59,9 +46,9 @@ class FitState(eqx.Module):
     `best` is the field of the best validation loss so far: the start itself until an epoch has been completed.
     """
 
-    field: AbstractVectorField
+    field: Learner
     adam: PyTree
-    best: AbstractVectorField
+    best: Learner
     best_mse: Float[Array, ""]
     best_epoch: Int[Array, ""]
     epoch: Int[Array, ""]
@@ -70,7 +57,7 @@ class FitState(eqx.Module):
     key: PRNGKeyArray
 
 
-def start(field: AbstractVectorField, key: PRNGKeyArray) -> FitState:
+def start(field: Learner, key: PRNGKeyArray) -> FitState:
     """A run at epoch 0; the key sets the order of minibatches."""
     zero = jnp.zeros((), jnp.int32)
     infinity = jnp.array(jnp.inf)
@@ -83,12 +70,16 @@ def start(field: AbstractVectorField, key: PRNGKeyArray) -> FitState:
 def run(
     state: FitState,
     plan: Plan,
-    train: Trajectories,
-    validation: Trajectories,
+    train: PyTree,
+    validation: PyTree,
     settings: Settings,
     until: Int[Array, ""] | int,
 ) -> FitState:
-    """Go on until the run has stopped or has completed `until` epochs."""
+    """Go on until the run has stopped or has completed `until` epochs.
+
+    Args:
+        train, validation: as the objective has prepared them.
+    """
 
     def going(state: FitState) -> Bool[Array, ""]:
         return (state.status == RUNNING) & (state.epoch < until)
@@ -103,7 +94,7 @@ def run(
     return eqx.combine(arrays, rest)
 
 
-def epoch(state: FitState, plan: Plan, train: Trajectories, validation: Trajectories, settings: Settings) -> FitState:
+def epoch(state: FitState, plan: Plan, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
     """One pass over the lane's training windows in a new order, then a validation."""
     key, order_key = jax.random.split(state.key)
     order = _shuffled(plan, order_key)
@@ -119,29 +110,27 @@ def epoch(state: FitState, plan: Plan, train: Trajectories, validation: Trajecto
 
     arrays, adam, total = jax.lax.fori_loop(0, batches, update, (arrays, state.adam, jnp.zeros(())))
     field = eqx.combine(arrays, rest)
-    error = deployed_mse(field, validation, solver=settings.solver)
+    error = settings.objective.validate(field, validation, settings)
     return _judge(state, plan, field, adam, key, total / batches, error)
 
 
 def gradient_step(
-    field: AbstractVectorField, adam: PyTree, plan: Plan, windows: Trajectories, settings: Settings
-) -> tuple[AbstractVectorField, PyTree, Float[Array, ""]]:
-    """One step of Adam on one minibatch; running statistics move along the predicted trajectories."""
+    field: Learner, adam: PyTree, plan: Plan, picked: PyTree, settings: Settings
+) -> tuple[Learner, PyTree, Float[Array, ""]]:
+    """One step of Adam on one minibatch, and what the field observes in it."""
     learned = trainable(field)
     parameters, rest = eqx.partition(field, learned)
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
-    batch = jax.lax.optimization_barrier(minibatch(windows, settings.solver))
+    batch = jax.lax.optimization_barrier(settings.objective.batch(picked, settings))
 
     def objective(parameters):
         candidate = eqx.combine(parameters, rest)
-        predicted = rollout_minibatch(candidate, batch.x0, batch.u, batch.dt, batch.solver)
-        return loss(candidate, batch, predicted, settings.regulariser, plan.regulariser_weight), predicted
+        return settings.objective.loss(candidate, batch, settings, plan.regulariser_weight)
 
-    (value, predicted), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)
+    (value, seen), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)
     direction, adam = optax.scale_by_adam().update(gradient, adam)
     moved = _descend(plan.rates, parameters, direction)
-    x, u = along(batch.x0, predicted, batch.u)
-    return observe(eqx.combine(moved, rest), x, u), adam, value
+    return settings.objective.observe(eqx.combine(moved, rest), batch, seen), adam, value
 
 
 def fit(
@@ -160,16 +149,15 @@ def fit(
     """Train one field on all windows of `train`; `result.best` is the field of the best validation epoch.
 
     Raises:
-        ValueError: data that do not pass `trajectories.check`, or fewer training windows than a minibatch.
+        ValueError: data that the objective refuses, or fewer training windows than a minibatch.
     """
     settings = Settings() if settings is None else settings
-    check(train, "train")
-    check(validation, "validation")
-    if len(train) < settings.batch_size:
-        raise ValueError(f"train has {len(train)} windows, fewer than batch_size={settings.batch_size}")
-    plan = make_plan(rates, jnp.arange(len(train)), len(train), min_epochs, patience, max_epochs, regulariser_weight)
-    state = start(field, key)
-    return _fit(state, plan, train, validation, settings)
+    data = settings.objective.prepare(train, "train")
+    judged_on = settings.objective.prepare(validation, "validation")
+    if len(data) < settings.batch_size:
+        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
+    plan = make_plan(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, regulariser_weight)
+    return _fit(start(field, key), plan, data, judged_on, settings)
 
 
 def make_plan(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> Plan:
@@ -201,7 +189,7 @@ def _shuffled(plan: Plan, key: PRNGKeyArray) -> Int[Array, " n"]:
     return plan.subset[jnp.argsort(jnp.where(inside, ticket, jnp.inf))]
 
 
-def _descend(rates: PyTree, parameters: AbstractVectorField, direction: PyTree) -> AbstractVectorField:
+def _descend(rates: PyTree, parameters: Learner, direction: PyTree) -> Learner:
     def part(rate, parameters, direction):
         return jax.tree.map(lambda p, d: (p - rate * d).astype(p.dtype), parameters, direction)
 

@@ -13,7 +13,8 @@ from experiments.stages import Stages
 from hybrid_jax.archive import named_leaves
 from hybrid_jax.datasets import Dataset
 from hybrid_jax.lanes import stack
-from hybrid_jax.training import Settings, make_plan, start
+from hybrid_jax.objective import Settings
+from hybrid_jax.training import make_plan, start
 
 SETTINGS = Settings(batch_size=10)
 DATA = Dataset({"train": swings(20), "validation": swings(10, seed=1)}, {"config": {}})

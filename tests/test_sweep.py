@@ -15,8 +15,9 @@ from pendulum import DAMPING, pendulum, swings
 from hybrid_jax import training
 from hybrid_jax.lanes import count, deal, lane, stack
 from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.objective import Settings
 from hybrid_jax.sweep import evaluate, sweep
-from hybrid_jax.training import CAPPED, DIVERGED, RUNNING, STOPPED, Settings, make_plan, start
+from hybrid_jax.training import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, start
 
 BATCH = 10
 SETTINGS = Settings(batch_size=BATCH)
