@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks.subjects import DT
-from hybrid_jax.residual import ResidualNetwork
+from hybrid_jax.residual import BatchNorm, ResidualNetwork
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, Statistics, trainable
 
 SAMPLES = "samples"  # the axis over a minibatch
@@ -41,7 +41,7 @@ def derivative(field: AbstractVectorField, x, u):
     """ẋ of one sample of a minibatch, as in training."""
     if isinstance(field, Hybrid):
         return derivative(field.physics, x, u) + derivative(field.residual, x, u)
-    if not isinstance(field, ResidualNetwork):
+    if not (isinstance(field, ResidualNetwork) and isinstance(field.norm, BatchNorm)):
         return field(x, u)
     hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
     mean, variance = moments(hidden)
@@ -64,7 +64,7 @@ def observed(field: AbstractVectorField, x0, u, predicted):
     """The field with its running statistics moved, written for one sample."""
     if isinstance(field, Hybrid):
         return Hybrid(field.physics, observed(field.residual, x0, u, predicted))
-    if not isinstance(field, ResidualNetwork):
+    if not (isinstance(field, ResidualNetwork) and isinstance(field.norm, BatchNorm)):
         return field
     starts = jnp.concatenate([x0[None], predicted[:-1]])
     mean, variance = moments(field.weight_in @ jnp.concatenate([starts, field.scaling(u)], axis=1).T)

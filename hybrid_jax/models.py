@@ -13,10 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.archive import load_archive, save_archive
-from hybrid_jax.residual import BatchNorm, InputScaling, ResidualNetwork
+from hybrid_jax.features import Accelerations, BodyFrame, Placeless
+from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody
 from hybrid_jax.rollout import rollout, rollout_batch
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid, Statistics
+from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, Statistics
 from hybrid_jax.vehicle import Vehicle
 
 FORMAT = "hybrid_jax model 1"
@@ -32,7 +33,9 @@ def portable(kind: type) -> type:
     return kind
 
 
-for _kind in (BatchNorm, Hybrid, InputScaling, ResidualNetwork, RigidBody, Statistics, Vehicle):
+_FIELDS = (Accelerations, BodyFrame, Frozen, Hybrid, LinearResidual, Placeless, ResidualNetwork, RigidBody)
+_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Vehicle)
+for _kind in _FIELDS + _PARTS:
     portable(_kind)
 
 

@@ -1,5 +1,11 @@
-"""f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1)."""
+"""f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and simpler rivals.
 
+Layer normalisation, or none, stands in for batch normalisation where a network should be the same map in training and
+in deployment; a linear map stands in for the whole network where the data are too few for one.
+"""
+
+from abc import abstractmethod
+from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
@@ -7,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax.vector_field import AbstractVectorField, Statistics, evaluate_batch, observe
+from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, evaluate_batch, observe
 
 
 class InputScaling(eqx.Module):
@@ -20,7 +26,25 @@ class InputScaling(eqx.Module):
         return (u - self.offset) / self.scale
 
 
-class BatchNorm(eqx.Module):
+class Normalisation(eqx.Module):
+    """What is done to the hidden pre-activations h = W z before the ReLU."""
+
+    @abstractmethod
+    def deployed(self, weight: Float[Array, "h m"], z: Float[Array, " m"]) -> Float[Array, " h"]:
+        """The normalised W z of one sample, as in deployment."""
+
+    @abstractmethod
+    def layers(
+        self, weight_in: Float[Array, "h m"], weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], z: Batch
+    ) -> Batch:
+        """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b), as in training."""
+
+    @abstractmethod
+    def observed(self, hidden: Float[Array, "h b"]) -> "Normalisation":
+        """This after it has seen the pre-activations of a training batch."""
+
+
+class BatchNorm(Normalisation):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
     In training by the minibatch's mean and variance, in deployment by running ones, which fold into a map of z.
@@ -37,44 +61,142 @@ class BatchNorm(eqx.Module):
         scale = self.gain * jax.lax.rsqrt(self.running.variance + self.epsilon)
         return weight * scale[:, None], self.shift - scale * self.running.mean
 
-    def observed(self, batch: Statistics) -> "BatchNorm":
+    def deployed(self, weight, z):
+        weight, bias = self.fold(weight)
+        return weight @ z + bias
+
+    def layers(self, weight_in, weight_out, bias_out, z):
+        return _normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
+
+    def observed(self, hidden):
         """The running statistics moved towards the batch's by the momentum."""
+        mean = _row_means(hidden)
+        batch = Statistics(mean, _row_means(jnp.square(hidden - mean[:, None])))
         running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
 
 
-class ResidualNetwork(AbstractVectorField):
-    """ẋ = W₂ relu(BN(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13 in the paper.
+class LayerNorm(Normalisation):
+    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016)."""
 
-    W₁ has no bias: batch normalisation would remove it.
+    gain: Float[Array, " h"]
+    shift: Float[Array, " h"]
+    epsilon: float = eqx.field(static=True, default=1e-5)
+
+    def deployed(self, weight, z):
+        hidden = weight @ z
+        centred = hidden - jnp.mean(hidden, axis=0)
+        normal = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=0) + self.epsilon)
+        return _beside(self.gain, normal) * normal + _beside(self.shift, normal)
+
+    def layers(self, weight_in, weight_out, bias_out, z):
+        return _output(weight_out, bias_out, self.deployed(weight_in, z))
+
+    def observed(self, hidden):
+        return self
+
+
+class Bias(Normalisation):
+    """No normalisation: the pre-activations plus a bias, as in a plain linear layer."""
+
+    shift: Float[Array, " h"]
+
+    def deployed(self, weight, z):
+        hidden = weight @ z
+        return hidden + _beside(self.shift, hidden)
+
+    def layers(self, weight_in, weight_out, bias_out, z):
+        return _output(weight_out, bias_out, self.deployed(weight_in, z))
+
+    def observed(self, hidden):
+        return self
+
+
+class ResidualNetwork(AbstractVectorField):
+    """ẋ = W₂ relu(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13 with batch normalisation in the paper.
+
+    W₁ has no bias: batch normalisation would remove it, and the others have a shift.
     """
 
     weight_in: Float[Array, "h m"]
-    norm: BatchNorm
+    norm: Normalisation
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
     scaling: InputScaling = eqx.field(default_factory=InputScaling)
 
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+    def __call__(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " d"]:
         """Deployment: normalised by the running statistics."""
-        weight, bias = self.norm.fold(self.weight_in)
-        z = jnp.concatenate([x, self.scaling(u)])
-        return self.weight_out @ jax.nn.relu(weight @ z + bias) + self.bias_out
+        return self.weight_out @ self.activations(x, u) + self.bias_out
+
+    def activations(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " h"]:
+        """The hidden units as deployed: what the output layer is linear in."""
+        return jax.nn.relu(self.norm.deployed(self.weight_in, self.inputs(x, u)))
+
+    def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
+        """z = [x, scaled u]."""
+        return jnp.concatenate([x, self.scaling(u)])
+
+
+class LinearResidual(AbstractVectorField):
+    """ẋ = W [x, u] + b: the simplest correction of another field."""
+
+    weight: Float[Array, "d n"]
+    bias: Float[Array, " d"]
+
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        product = self.weight @ jnp.concatenate([x, u])
+        return product + _beside(self.bias, product)
 
 
 def residual_network(
-    state_size: int, input_size: int, key: PRNGKeyArray, *, hidden: int = 64, scaling: InputScaling | None = None
+    state_size: int,
+    input_size: int,
+    key: PRNGKeyArray,
+    *,
+    hidden: int = 64,
+    scaling: InputScaling | None = None,
+    norm: str = "batch",
+    outputs: int | None = None,
 ) -> ResidualNetwork:
-    """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer."""
+    """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
+
+    Args:
+        norm: what normalises the hidden units: "batch", "layer" or "none".
+        outputs: how many numbers it returns, if not one for each of the state.
+
+    Raises:
+        ValueError: another norm.
+    """
+    if norm not in NORMS:
+        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {norm!r}")
     key_in, key_out, key_bias = jax.random.split(key, 3)
-    fan_in = state_size + input_size
+    fan_in, outputs = state_size + input_size, state_size if outputs is None else outputs
     return ResidualNetwork(
         weight_in=_uniform(key_in, (hidden, fan_in), fan_in),
-        norm=BatchNorm(jnp.ones(hidden), jnp.zeros(hidden), Statistics(jnp.zeros(hidden), jnp.ones(hidden))),
-        weight_out=_uniform(key_out, (state_size, hidden), hidden),
-        bias_out=_uniform(key_bias, (state_size,), hidden),
+        norm=NORMS[norm](hidden, fan_in, jax.random.fold_in(key, 3)),
+        weight_out=_uniform(key_out, (outputs, hidden), hidden),
+        bias_out=_uniform(key_bias, (outputs,), hidden),
         scaling=InputScaling() if scaling is None else scaling,
     )
+
+
+def _batch_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> BatchNorm:
+    return BatchNorm(jnp.ones(hidden), jnp.zeros(hidden), Statistics(jnp.zeros(hidden), jnp.ones(hidden)))
+
+
+def _layer_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> LayerNorm:
+    return LayerNorm(jnp.ones(hidden), jnp.zeros(hidden))
+
+
+def _bias(hidden: int, fan_in: int, key: PRNGKeyArray) -> Bias:
+    return Bias(_uniform(key, (hidden,), fan_in))
+
+
+NORMS: dict[str, Callable[[int, int, PRNGKeyArray], Normalisation]] = {
+    "batch": _batch_norm,
+    "layer": _layer_norm,
+    "none": _bias,
+}
 
 
 def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
@@ -83,18 +205,19 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
 
 @evaluate_batch.register
 def _(field: ResidualNetwork, x, u) -> Array:
-    """Training: each evaluation normalises by the statistics of its own minibatch."""
-    norm = field.norm
-    z = jnp.concatenate([x, field.scaling(u)])
-    return _normalised_layer(norm.epsilon, field.weight_in, norm.gain, norm.shift, field.weight_out, field.bias_out, z)
+    """Training: where the norm is the batch's, each evaluation normalises by its own minibatch."""
+    return field.norm.layers(field.weight_in, field.weight_out, field.bias_out, field.inputs(x, u))
 
 
 @observe.register
 def _(field: ResidualNetwork, x, u):
-    hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
-    mean = _row_means(hidden)
-    batch = Statistics(mean, _row_means(jnp.square(hidden - mean[:, None])))
-    return eqx.tree_at(lambda network: network.norm, field, field.norm.observed(batch))
+    hidden = field.weight_in @ field.inputs(x, u)
+    return eqx.tree_at(lambda network: network.norm, field, field.norm.observed(hidden))
+
+
+@evaluate_batch.register
+def _(field: LinearResidual, x, u):
+    return field(x, u)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
@@ -136,3 +259,13 @@ _normalised_layer.defvjp(_forward, _backward)
 
 def _row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
     return rows @ jnp.full(rows.shape[1], 1 / rows.shape[1], rows.dtype)
+
+
+def _output(weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], hidden: Float[Array, "h b"]) -> Batch:
+    active = jax.nn.relu(hidden)
+    return weight_out @ active + _beside(bias_out, active)
+
+
+def _beside(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
+    """The values shaped so that they are the same for each column of rows, or for one sample."""
+    return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))

@@ -53,6 +53,12 @@ def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float 
     return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
 
 
+def guess_off(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
+    """The rigid body with each of θ_p at nominal times or over 1 + off, at random."""
+    signs = jax.random.rademacher(key, (len(LEARNED),), float)
+    return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
+
+
 def nominal(vehicle: Vehicle) -> dict[str, float]:
     """The vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
     return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}

@@ -34,6 +34,24 @@ class Hybrid(AbstractVectorField):
         return self.physics(x, u) + self.residual(x, u)
 
 
+class Frozen(AbstractVectorField):
+    """A field that training leaves as it is: no parameter and no running statistic moves (see `thaw`)."""
+
+    field: AbstractVectorField
+
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        return self.field(x, u)
+
+
+def thaw(field: AbstractVectorField) -> AbstractVectorField:
+    """The field without its `Frozen` wrappers."""
+
+    def frozen(node) -> bool:
+        return isinstance(node, Frozen)
+
+    return jax.tree.map(lambda node: thaw(node.field) if frozen(node) else node, field, is_leaf=frozen)
+
+
 @singledispatch
 def evaluate_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ on a minibatch, as in training: features first, one column a sample."""
@@ -66,7 +84,10 @@ class Statistics(eqx.Module):
 def trainable(field: AbstractVectorField) -> AbstractVectorField:
     """A tree like `field` with True at each leaf that the optimiser may move, for `equinox.partition`."""
 
-    def leaves(node):
-        return False if isinstance(node, Statistics) else eqx.is_inexact_array(node)
+    def fixed(node) -> bool:
+        return isinstance(node, Statistics | Frozen)
 
-    return jax.tree.map(leaves, field, is_leaf=lambda node: isinstance(node, Statistics))
+    def leaves(node):
+        return False if fixed(node) else eqx.is_inexact_array(node)
+
+    return jax.tree.map(leaves, field, is_leaf=fixed)

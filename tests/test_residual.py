@@ -1,4 +1,4 @@
-"""Laws of the network f_d and its batch normalisation."""
+"""Laws of the network f_d and its normalisations."""
 
 import equinox as eqx
 import jax
@@ -6,7 +6,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.residual import BatchNorm, InputScaling, ResidualNetwork, residual_network
+from hybrid_jax import load, save
+from hybrid_jax.residual import (
+    BatchNorm,
+    Bias,
+    InputScaling,
+    LayerNorm,
+    LinearResidual,
+    ResidualNetwork,
+    residual_network,
+)
 from hybrid_jax.vector_field import Hybrid, Statistics, evaluate_batch, observe, trainable
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
@@ -137,3 +146,82 @@ def test_lanes_of_networks_are_the_networks_one_by_one():
         np.testing.assert_allclose(values[i], value, rtol=1e-5)  # float32 round-off in another order of sums
         for one, other in zip(jax.tree.leaves(slopes), jax.tree.leaves(slope), strict=True):
             np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-5 * max(1, jnp.abs(other).max()))
+
+
+def unbatched(norm, seed=0):
+    """A network with layer normalisation, or none, whose gain and shift are not those of a fresh one."""
+    field = network(seed)
+    kind = {"layer": LayerNorm(field.norm.gain, field.norm.shift), "none": Bias(field.norm.shift)}[norm]
+    return eqx.tree_at(lambda field: field.norm, field, kind)
+
+
+def plain_one(field, x, u):
+    """One sample as Ba et al. (2016), Eq. 3 and 4, write it, or without normalisation."""
+    hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
+    if isinstance(field.norm, LayerNorm):
+        mean = jnp.sum(hidden) / HIDDEN
+        deviation = jnp.sqrt(jnp.sum((hidden - mean) ** 2) / HIDDEN + field.norm.epsilon)
+        hidden = field.norm.gain * (hidden - mean) / deviation
+    return field.weight_out @ jnp.maximum(hidden + field.norm.shift, 0) + field.bias_out
+
+
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_formula(norm):
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched(norm), batch()
+        expected = jnp.stack([plain_one(field, x[:, i], u[:, i]) for i in range(COLUMNS)], axis=1)
+        np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        # A sample's result does not depend on its neighbours, and nothing is remembered of them.
+        np.testing.assert_allclose(evaluate_batch(field, x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
+        assert eqx.tree_equal(observe(field, x, u), field)
+
+
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched(norm), batch()
+
+        def one_by_one(field):
+            return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
+
+        found = jax.grad(lambda field: jnp.sum(evaluate_batch(field, x[:, :3], u[:, :3]) ** 2))(field)
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.grad(one_by_one)(field)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
+        assert all(jax.tree.leaves(trainable(field)))
+
+
+def test_layer_normalisation_does_not_see_the_size_of_its_inputs():
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched("layer"), batch()
+        field = eqx.tree_at(lambda field: field.scaling, field, InputScaling())
+        # But for ε = 1e-5 beside variances of 1 and more.
+        np.testing.assert_allclose(evaluate_batch(field, 10 * x, 10 * u), evaluate_batch(field, x, u), atol=1e-3)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_every_norm_survives_a_file_and_starts_from_the_same_weights(norm, tmp_path):
+    field = residual_network(STATES, INPUTS, jax.random.key(0), hidden=HIDDEN, norm=norm)
+    save(tmp_path / "model.npz", field)
+    assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)
+    paper = residual_network(STATES, INPUTS, jax.random.key(0), hidden=HIDDEN)
+    assert eqx.tree_equal(eqx.tree_at(lambda field: field.norm, field, paper.norm), paper)
+
+
+def test_without_normalisation_the_bias_starts_as_a_linear_layer_s():
+    shift = residual_network(13, 4, jax.random.key(0), norm="none").norm.shift
+    assert 0.85 / 17**0.5 < jnp.abs(shift).max() <= 1 / 17**0.5  # 64 draws of a fixed seed
+
+
+def test_an_unknown_norm_is_refused():
+    with pytest.raises(ValueError, match="norm must be one of batch, layer, none, got 'group'"):
+        residual_network(13, 4, jax.random.key(0), norm="group")
+
+
+def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        field, (x, u) = LinearResidual(jnp.asarray(rng.normal(size=(5, 7))), jnp.asarray(rng.normal(size=5))), batch()
+        expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
+        np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)

@@ -1,0 +1,166 @@
+"""Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
+
+import itertools
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybrid_jax import Hybrid, features, load, residual_network, rigid_body, rotation, save
+from hybrid_jax.features import BodyFrame, restricted
+from hybrid_jax.residual import InputScaling
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vector_field import AbstractVectorField, Statistics, evaluate_batch, observe, trainable
+from hybrid_jax.vehicle import IRIS
+
+KEY = jax.random.key(0)
+HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
+VIEWS = list(itertools.product(features.INPUTS, features.OUTPUTS))
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    """So that every law here holds to round-off, 1e-12."""
+    with jax.enable_x64(True):
+        yield
+
+
+def view(inputs="all", outputs="all", **options):
+    return restricted(KEY, inputs=inputs, outputs=outputs, **({"hidden": 9, "scaling": HOVER} | options))
+
+
+def samples(count=7, seed=0):
+    """States and inputs as columns."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(13, count)) * 2
+    x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
+    return jnp.asarray(x), jnp.asarray(rng.uniform(500, 800, (4, count)))
+
+
+def deployed(field, x, u):
+    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+
+
+def turned(x, yaw):
+    """States, or derivatives of states, turned about the world's vertical."""
+    turn = jnp.broadcast_to(rotation.from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(yaw))[:, None], (4, 1))
+    return jnp.concatenate(
+        [
+            rotation.rotate(turn, x[POSITION]),
+            rotation.multiply(turn, x[QUATERNION]),
+            rotation.rotate(turn, x[VELOCITY]),
+            x[BODY_RATES],
+        ]
+    )
+
+
+def network_of(field):
+    return field if not isinstance(field, features.View) else network_of(field.field)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_by_default_the_network_is_the_paper_s(norm):
+    plain = residual_network(13, 4, KEY, hidden=20, scaling=HOVER, norm=norm)
+    assert eqx.tree_equal(restricted(KEY, hidden=20, scaling=HOVER, norm=norm), plain)
+    assert eqx.tree_equal(restricted(KEY), residual_network(13, 4, KEY))
+
+
+@pytest.mark.parametrize("options", [{"inputs": "world"}, {"outputs": "v"}, {"norm": "group"}], ids=str)
+def test_an_unknown_name_is_refused(options):
+    (name, value), *_ = options.items()
+    with pytest.raises(ValueError, match=rf"{name} must be one of .*'{value}'"):
+        restricted(KEY, **options)
+
+
+@pytest.mark.parametrize("outputs", features.OUTPUTS)
+@pytest.mark.parametrize("inputs", ["no_xy", "body"])
+def test_where_the_vehicle_is_does_not_matter_and_how_high_does(inputs, outputs):
+    field, (x, u) = view(inputs, outputs), samples()
+    here = deployed(field, x, u)
+    np.testing.assert_array_equal(deployed(field, x.at[:2].add(100.0), u), here)
+    assert (jnp.abs(deployed(field, x.at[2].add(1.0), u) - here).max(0) > 1e-3).all()
+
+
+@pytest.mark.parametrize("outputs", features.OUTPUTS)
+def test_seen_from_the_body_a_turned_vehicle_has_the_turned_derivative(outputs):
+    field, (x, u) = view("body", outputs), samples()
+    for yaw in (0.3, 2.0, -3.0):
+        np.testing.assert_allclose(deployed(field, turned(x, yaw), u), turned(deployed(field, x, u), yaw), atol=1e-12)
+    tilt = rotation.from_axis_angle(jnp.array([1.0, 0.0, 0.0]), jnp.asarray(0.3))
+    tilted = x.at[QUATERNION].set(rotation.multiply(jnp.broadcast_to(tilt[:, None], (4, 7)), x[QUATERNION]))
+    # Gravity has moved in the body, so this is another situation.
+    assert (jnp.abs(deployed(field, tilted, u) - deployed(field, x, u))[BODY_RATES].max(0) > 1e-3).all()
+
+
+def test_a_world_frame_network_does_see_yaw():
+    """The test above would pass for a network that sees nothing."""
+    field, (x, u) = view("no_xy"), samples()
+    assert (jnp.abs(deployed(field, turned(x, 1.0), u) - deployed(field, x, u))[BODY_RATES].max(0) > 1e-3).all()
+
+
+def test_the_body_s_view_of_a_state():
+    """Nose down by a right angle about y: the world's down is the body's forward, the world's x the body's up."""
+    q = rotation.from_axis_angle(jnp.array([0.0, 1.0, 0.0]), jnp.asarray(np.pi / 2))
+    x = jnp.concatenate([jnp.array([5.0, 6.0, 7.0]), q, jnp.array([2.0, 3.0, 0.0]), jnp.array([0.1, 0.2, 0.3])])
+    expected = [7, 1, 0, 0, 0, 3, 2, 0.1, 0.2, 0.3]
+    np.testing.assert_allclose(BodyFrame(rigid_body(IRIS)).read(x), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("inputs", features.INPUTS)
+def test_accelerations_leave_kinematics_to_physics(inputs):
+    field, (x, u) = view(inputs, "accelerations"), samples()
+    for evaluate in (deployed, evaluate_batch):
+        derivative = evaluate(field, x, u)
+        assert (derivative[:7] == 0).all()
+        assert (jnp.abs(derivative[7:]).max(1) > 1e-3).all()
+    assert network_of(field).weight_out.shape == (6, 9)
+
+
+class Kinetic(AbstractVectorField):
+    """v̇ = −C v, the same in every frame."""
+
+    drag: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.concatenate([jnp.zeros(7), -self.drag * x[4:7], jnp.zeros(3)])
+
+
+def test_isotropic_drag_is_the_same_seen_from_the_body():
+    """A map that reads the body-frame velocity and writes a body-frame v̇ is the drag of the world."""
+    field, (x, u) = BodyFrame(Kinetic(jnp.asarray(0.4))), samples()
+    derivative = deployed(field, x, u)
+    np.testing.assert_allclose(derivative[VELOCITY], -0.4 * x[VELOCITY], atol=1e-12)
+    assert (derivative[:7] == 0).all()
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
+    """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
+    field, (x, u) = view(inputs, outputs), samples(20)
+    trained = evaluate_batch(field, x, u)
+    assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
+
+    def seen(node):
+        return node.read(x) if isinstance(node, features.View) else x
+
+    network = network_of(field)
+    hidden = network.weight_in @ jnp.concatenate([seen(field), network.scaling(u)])
+    here = Statistics(hidden.mean(1), hidden.var(1))
+    exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
+    np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
+    running = network_of(observe(field, x, u)).norm.running
+    np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
+    np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
+    field, (x, u) = Hybrid(rigid_body(IRIS), view(inputs, outputs)), samples()
+    save(tmp_path / "model.npz", field)
+    loaded = load(tmp_path / "model.npz").field
+    assert eqx.tree_equal(loaded, field)
+    np.testing.assert_array_equal(deployed(loaded, x, u), deployed(field, x, u))
+    # θ_p (3), the network's weights, gain, shift and bias (5); not its running statistics.
+    assert sum(jax.tree.leaves(trainable(field))) == 8
