@@ -1,0 +1,278 @@
+"""Are the intervals of θ_p honest? Repeated flights of known truth, and how often the truth is inside.
+
+python -m experiments.coverage --help
+"""
+
+import math
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from rich.console import Console
+from rich.table import Table
+
+from experiments.command import BAD_INPUT, check_folder
+from experiments.sensors import Noise, measure
+from hybrid_jax import rotation
+from hybrid_jax.files import json_text, write_whole
+from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.rigid_body import LEARNED, RigidBody, nominal, rigid_body
+from hybrid_jax.rollout import rollout_batch
+from hybrid_jax.state import VELOCITY
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.uncertainty import Kind, intervals, physics_covariance
+from hybrid_jax.vector_field import AbstractVectorField
+from hybrid_jax.vehicle import IRIS
+
+NAME = "coverage"
+DT = 0.01  # s
+TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's parameter shift
+NoiseOn = Literal["targets", "all"]
+
+
+@dataclass(frozen=True)
+class Flight:
+    """How the windows are flown: a vehicle near hover that leans into its velocity; standard deviations."""
+
+    speed: float = 2.0
+    """[m/s], along each axis, a third of it vertically."""
+    tilt: float = 0.1
+    """[rad], about each axis, beside the lean that balances the drag in steady flight."""
+    body_rates: float = 1.0
+    """[rad/s], along each axis."""
+    rotor_speed: float = 40.0
+    """[rad/s], of each rotor about hover, drawn anew in each interval."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Fly known rigid bodies, add noise, fit θ_p by least squares, count how often its interval contains the truth.
+
+    Twice: a truth that is the model itself, and one with linear drag that the model does not know. The first says
+    whether the intervals are honest, the second how far they mislead when the physics is wrong.
+    """
+
+    repeats: int = 100
+    """Independent recordings, each with its own fit."""
+    n_train: int = 100
+    """Windows in a recording."""
+    steps: int = 10
+    """Intervals of 0.01 s in a window."""
+    level: float = 0.95
+    """Of the intervals: what the coverage should be."""
+    kind: Kind = "sandwich"
+    """sandwich: windows are independent, nothing else is assumed. homoscedastic: all errors white and of one size,
+    which those of a vehicle's sensors are not."""
+    noise_on: tuple[NoiseOn, ...] = ("targets", "all")
+    """targets: the start of each window is known exactly, as the fit takes it to be. all: it is measured as well."""
+    noise: Noise = field(default_factory=Noise)
+    flight: Flight = Flight()
+    drag: float = 0.4
+    """[kg/s] of the truth that the model does not know: v̇ −= drag v / m."""
+    seed: int = 0
+    """Everything random follows from it; the same flights and noise in every case."""
+    batch: int = 1
+    """Repeats that are computed side by side: one on a CPU, many on a GPU."""
+    out: Path = Path("runs")
+    """Folder for the results; a folder `coverage` is made in it."""
+
+
+@dataclass(frozen=True)
+class CoverageRow:
+    """One parameter in one case.
+
+    Attributes:
+        case: "exact physics" or "unknown drag".
+        noise_on: "targets" or "all".
+        parameter: of θ_p.
+        coverage: share of the repeats whose interval contains the truth.
+        standard_error: of the coverage, binomial.
+        bias: mean of θ̂ − θ [% of θ].
+        half_width: mean of half the interval's length [% of θ].
+        converged: share of the repeats whose fit converged; the others count as misses.
+    """
+
+    case: str
+    noise_on: str
+    parameter: str
+    coverage: float
+    standard_error: float
+    bias: float
+    half_width: float
+    converged: float
+
+
+class Dragged(AbstractVectorField):
+    """A rigid body with linear drag: v̇ −= c v / m."""
+
+    body: RigidBody
+    drag: Float[Array, ""]  # kg/s
+
+    def __call__(self, x, u):
+        return self.body(x, u).at[VELOCITY].add(-self.drag / self.body.vehicle.mass * x[VELOCITY])
+
+
+class Repeat(NamedTuple):
+    """What one recording gave, each entry of θ_p in the order of `LEARNED`, in shares of the truth."""
+
+    inside: Bool[Array, " p"]
+    error: Float[Array, " p"]
+    half_width: Float[Array, " p"]
+    converged: Bool[Array, ""]
+
+
+def coverage(config: Config) -> list[CoverageRow]:
+    """The rows of every case: exact physics and unknown drag, with noise on what was asked for.
+
+    Raises:
+        ValueError: an option that makes no sense, by its name on the command line.
+    """
+    check(config)
+    cases = {"exact physics": 0.0, "unknown drag": config.drag}
+    return [
+        row
+        for case, drag in cases.items()
+        for noise_on in config.noise_on
+        for row in _rows(case, noise_on, jax.device_get(_repeats(config, noise_on == "all", drag)))
+    ]
+
+
+def check(config: Config) -> None:
+    """Refuse options that make no sense.
+
+    Raises:
+        ValueError: which, and what was expected.
+    """
+    if config.n_train <= len(LEARNED):
+        raise ValueError(f"--n-train must be more than the {len(LEARNED)} parameters, got {config.n_train}")
+    for name in ("repeats", "steps", "batch"):
+        if getattr(config, name) < 1:
+            raise ValueError(f"--{name} must be at least 1, got {getattr(config, name)}")
+    if not 0 < config.level < 1:
+        raise ValueError(f"--level must be between 0 and 1, got {config.level}")
+    if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
+        raise ValueError(f"--noise-on must be targets, all or both, got {' '.join(config.noise_on) or 'nothing'}")
+    sizes = {"drag": config.drag} | {
+        f"{group}.{name}": size
+        for group in ("noise", "flight")
+        for name, size in asdict(getattr(config, group)).items()
+    }
+    for name, size in sizes.items():
+        if not 0 <= size < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')} must be a finite number of at least 0, got {size}")
+
+
+def recording(
+    config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray
+) -> Trajectories:
+    """Windows of the true vehicle as they would be measured."""
+    start_key, input_key, x0_key, x_key = jax.random.split(key, 4)
+    x0 = starts(config, start_key)
+    jitter = jax.random.normal(input_key, (config.n_train, config.steps, 4))
+    u = IRIS.hover_speed + config.flight.rotor_speed * jitter
+    x = rollout_batch(Dragged(truth(), drag), x0, u, DT)
+    start = jnp.where(start_is_measured, measure(x0, config.noise, x0_key), x0)
+    return Trajectories(start, u, measure(x, config.noise, x_key), DT)
+
+
+def truth() -> RigidBody:
+    """The vehicle that is flown."""
+    return RigidBody({name: jnp.log(TRUTH[name] / value) for name, value in nominal(IRIS).items()}, IRIS)
+
+
+def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
+    """Random states near hover.
+
+    In steady flight a vehicle leans into its velocity until thrust balances drag, by c v / (m g) [rad] horizontally.
+    Without this link between attitude and velocity the drag that the model does not know would be as often up as down
+    the thrust, and would average out.
+    """
+    flight = config.flight
+    velocity_key, tilt_key, rates_key = jax.random.split(key, 3)
+    v = flight.speed * jax.random.normal(velocity_key, (config.n_train, 3)) * jnp.array([1.0, 1.0, 1 / 3])
+    lean = config.drag / (IRIS.mass * IRIS.gravity) * jnp.stack([-v[:, 1], v[:, 0]], axis=1)
+    half = (lean + flight.tilt * jax.random.normal(tilt_key, lean.shape)) / 2
+    q = rotation.normalise(jnp.pad(half, ((0, 0), (1, 1)), constant_values=((0, 0), (1.0, 0.0))))
+    omega = flight.body_rates * jax.random.normal(rates_key, v.shape)
+    return jnp.concatenate([jnp.zeros_like(v), q, v, omega], axis=1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""]) -> Repeat:
+    """All repeats, stacked: one program, compiled once for all cases."""
+
+    def one(key: PRNGKeyArray) -> Repeat:
+        windows = recording(config, start_is_measured, drag, key)
+        found = fit_physics(rigid_body(IRIS), windows)
+        around = intervals(found.field, physics_covariance(found.field, windows, config.kind), config.level)
+        value, low, high = (jnp.stack(side) for side in zip(*(around[name] for name in LEARNED), strict=True))
+        true = jnp.array([TRUTH[name] for name in LEARNED])
+        inside = (low <= true) & (true <= high) & found.converged
+        return Repeat(inside, value / true - 1, (high - low) / (2 * true), found.converged)
+
+    keys = jax.random.split(jax.random.key(config.seed), config.repeats)
+    return jax.lax.map(one, keys, batch_size=min(config.batch, config.repeats))
+
+
+def _rows(case: str, noise_on: str, repeats: Repeat) -> list[CoverageRow]:
+    share = repeats.inside.mean(axis=0)
+    spread = np.sqrt(share * (1 - share) / len(repeats.inside))
+    bias, half_width = (100 * column.mean(axis=0) for column in (repeats.error, repeats.half_width))
+    converged = float(repeats.converged.mean())
+    return [
+        CoverageRow(
+            case=case,
+            noise_on=noise_on,
+            parameter=name,
+            coverage=float(share[i]),
+            standard_error=float(spread[i]),
+            bias=float(bias[i]),
+            half_width=float(half_width[i]),
+            converged=converged,
+        )
+        for i, name in enumerate(LEARNED)
+    ]
+
+
+def table(rows: Sequence[CoverageRow], level: float) -> Table:
+    """The rows for a terminal."""
+    titles = ("truth", "noise on", "θ_p", "coverage [%]", "bias [%]", "half-width [%]", "converged [%]")
+    shown = Table(*titles, title=f"Does the {100 * level:g} % interval contain the truth?")
+    for row in rows:
+        numbers = (f"{row.bias:+.2f}", f"{row.half_width:.2f}", f"{100 * row.converged:.0f}")
+        share = f"{100 * row.coverage:.1f} ± {100 * row.standard_error:.1f}"
+        shown.add_row(row.case, row.noise_on, row.parameter, share, *numbers)
+    return shown
+
+
+def experiment(config: Config, console: Console) -> list[CoverageRow]:
+    """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
+    folder = config.out / NAME
+    check_folder("--out", folder)
+    rows = coverage(config)
+    content = {"config": asdict(config), "rows": [asdict(row) for row in rows]}
+    write_whole(folder / "coverage.json", json_text(content))
+    console.print(table(rows, config.level))
+    return rows
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line. Bad input ends in one line on stderr and exit code 2."""
+    try:
+        config = tyro.cli(Config, prog=f"python -m experiments.{NAME}", description=Config.__doc__, args=arguments)
+        experiment(config, Console())
+    except (ValueError, OSError) as error:
+        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,120 @@
+"""How well flight pins down θ_p: a covariance of the physics' parameters from the Gauss–Newton matrix of L_MSE.
+
+θ̂_p minimises Σ_i ‖r_i‖² over windows i, r_i = x − x̂ and J_i = ∂x̂/∂θ_p of one window, all its states in one vector. With
+H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2) the covariance of θ̂_p is
+
+- sandwich: H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Windows are the clusters: only they must be
+  independent, while the errors within a window may be correlated and of any size and unit (Huber 1967; White 1980; for
+  clusters Liang and Zeger 1986; the factor is MacKinnon and White's HC1, 1985).
+- homoscedastic: σ² H⁻¹, right only if every entry of every r_i is white noise of one variance.
+
+**Both are conditional on θ_d**: the network of a hybrid is taken as given, as if it had not been learned from the same
+windows, so they are too small by what θ_d may trade with θ_p. Neither contains bias: what the model cannot express
+(drag that it does not know) moves θ̂_p by an amount that no interval shows; `experiments/coverage.py` measures both.
+"""
+
+from typing import Literal, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax.least_squares import parametrise, physics_of, residual
+from hybrid_jax.rigid_body import RigidBody
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
+
+Kind = Literal["sandwich", "homoscedastic"]
+
+
+class Interval(NamedTuple):
+    """An estimate and the interval around it, in the same unit."""
+
+    value: Float[Array, "*lanes"]
+    low: Float[Array, "*lanes"]
+    high: Float[Array, "*lanes"]
+
+
+@eqx.filter_jit
+def physics_covariance(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    kind: Kind = "sandwich",
+    solver: diffrax.AbstractSolver | None = None,
+    chunk: int = 250,
+) -> Float[Array, "p p"]:
+    """The covariance of θ_p at a field fitted to the windows, given θ_d, in the physics' own parametrisation.
+
+    Rows are in the order of `least_squares.parametrise`; for a `RigidBody`: log Ix, log Iy, log k. Pure, so it compiles
+    and maps over stacked fields. It is not finite where the windows do not tell the parameters apart.
+
+    Args:
+        field: at, or near, the minimum of L_MSE over θ_p.
+        chunk: windows that are held in memory at a time.
+
+    Raises:
+        ValueError: no more windows than parameters, or an unknown kind.
+    """
+    theta, rebuild = parametrise(field)
+    n, p = len(windows), theta.size
+    if n <= p:
+        raise ValueError(f"windows: {n} are too few for a covariance of {p} parameters, at least {p + 1} are needed")
+    if kind not in Kind.__args__:
+        raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
+
+    def one(window: Trajectories):
+        def error(theta):
+            r = residual(rebuild(theta), window, solver).ravel()
+            return r, r
+
+        jacobian, r = jax.jacfwd(error, has_aux=True)(theta)
+        return jacobian.T @ jacobian, jacobian.T @ r, r @ r
+
+    gram, score, square = jax.lax.map(one, windows, batch_size=min(chunk, n))
+    bread = _inverse(jnp.sum(gram, axis=0))
+    if kind == "homoscedastic":
+        return jnp.sum(square) / (n * windows.x[0].size - p) * bread
+    half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
+    return n / (n - p) * half.T @ half
+
+
+def standard_errors(field: AbstractVectorField, covariance: Float[Array, "p p"]) -> AbstractVectorField:
+    """A tree like the physics with the standard error of each parameter in its place."""
+    _, rebuild = parametrise(physics_of(field))
+    return rebuild(jnp.sqrt(jnp.diagonal(covariance)))
+
+
+def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
+    """θ_p of a rigid body in SI units, as `RigidBody.theta`, each with an interval.
+
+    θ_p is held as a logarithm, whose error is taken as normal: the interval is value · exp(±z s).
+
+    Raises:
+        ValueError: a level that is not between 0 and 1, or physics that is no `RigidBody`.
+    """
+    if not 0 < level < 1:
+        raise ValueError(f"level must be between 0 and 1, got {level!r}")
+    errors = standard_errors(field, covariance)
+    if not isinstance(errors, RigidBody):
+        raise ValueError(f"field: its physics must be a RigidBody, got {type(errors).__name__}; see standard_errors")
+    z = jax.scipy.special.ndtri((1 + level) / 2)
+
+    def interval(value, error) -> Interval:
+        return Interval(value, value * jnp.exp(-z * error), value * jnp.exp(z * error))
+
+    return {name: interval(value, errors.log_ratios[name]) for name, value in _theta(field).items()}
+
+
+def _theta(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
+    physics = physics_of(field)
+    assert isinstance(physics, RigidBody)
+    return physics.theta()
+
+
+def _inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+    """Of a positive definite matrix, scaled to a unit diagonal first: parameters may be of very different effect."""
+    scale = jnp.sqrt(jnp.diagonal(matrix))
+    scales = scale[:, None] * scale
+    return jnp.linalg.inv(matrix / scales) / scales
