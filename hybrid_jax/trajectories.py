@@ -59,6 +59,19 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     return trajectories
 
 
+def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
+    """The first `at` intervals of each window, and the rest of it, which starts where they end.
+
+    Raises:
+        ValueError: a part would be empty.
+    """
+    if not 0 < at < trajectories.horizon:
+        raise ValueError(f"at must lie between 0 and the horizon {trajectories.horizon}, got {at}")
+    x0, u, x, dt = trajectories.x0, trajectories.u, trajectories.x, trajectories.dt
+    head = Trajectories(x0, u[..., :at, :], x[..., :at, :], dt)
+    return head, Trajectories(x[..., at - 1, :], u[..., at:, :], x[..., at:, :], dt)
+
+
 def windows_of(
     states: Float[np.ndarray, "t+1 d"],
     inputs: Float[np.ndarray, "t m"],

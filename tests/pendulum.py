@@ -35,9 +35,9 @@ def pendulum(length=LENGTH, damping=0.0):
 
 
 @cache
-def swings(count, steps=8, seed=0, dt=0.05, damping=DAMPING):
-    """Windows of the true pendulum from random starts under random torques."""
+def swings(count, steps=8, seed=0, dt=0.05, damping=DAMPING, length=LENGTH):
+    """Windows of the true pendulum, or of another, from random starts under random torques."""
     rng = np.random.default_rng(seed)
     x0 = jnp.asarray(rng.uniform(-1, 1, (count, 2)) * [2.0, 4.0], np.float32)
     u = jnp.asarray(rng.normal(size=(count, steps, 1)) * 3, np.float32)
-    return Trajectories(x0, u, jax.jit(rollout_batch)(pendulum(damping=damping), x0, u, dt), dt)
+    return Trajectories(x0, u, jax.jit(rollout_batch)(pendulum(length, damping), x0, u, dt), dt)
