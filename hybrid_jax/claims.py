@@ -1,17 +1,18 @@
-"""The paper's claims (Sec. 4.4 to 4.6), each judged on the rows by a definition that its own text states."""
+"""The paper's claims (Sec. 4.4 to 4.7), each judged on the rows by a definition that its own text states."""
 
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from itertools import pairwise
 from typing import Any, NamedTuple
 
-from hybrid_jax.rows import Row, check_unique
+from hybrid_jax.rows import DOMAIN_OF, DOMAINS, NAMES, Row, check_unique
 from hybrid_jax.summary import Cell, Spread, Summary, grouped, spread, summarise
 
-EXPERIMENTS = ("param_shift", "external_force")
+COMPARISON = "comparison"  # the experiment on both domains (Table 2)
+EXPERIMENTS = (*DOMAIN_OF, COMPARISON)
 CLEARLY = 1.5  # C7, C8: a ratio of mean errors from which one is clearly worse than the other
 EQUAL_FROM = 500  # C7: the paper's "500 or more"
-FEW, MANY = 100, 1000  # C8: ten seconds of flight and a hundred
+FEW, MANY = 100, 1000  # C8, C9: ten seconds of flight and a hundred
 THETA_TOLERANCE = 0.05  # C10
 
 
@@ -38,7 +39,9 @@ class _NotJudged(Exception):
 
 @dataclass(frozen=True)
 class _Evidence:
-    experiment: str
+    """The rows of one domain."""
+
+    domain: str
     rows: list[Row]
     summaries: Mapping[Cell, Summary]
     truth: Mapping[str, float] | None
@@ -62,11 +65,14 @@ class _Rule(NamedTuple):
     id: str
     text: str
     judge: Callable[[_Evidence], tuple[bool, str]]
-    experiments: tuple[str, ...] = EXPERIMENTS
+    experiments: tuple[str, ...] = tuple(DOMAIN_OF)
 
 
 def claims(rows: Iterable[Row], experiment: str, truth_theta: Mapping[str, float] | None) -> list[Claim]:
-    """Judge C1 to C8 and, on the parameter shift, C10. An error that was not finite counts as infinite.
+    """Judge the claims about an experiment. An error that was not finite counts as infinite.
+
+    C1 to C8 are about an experiment on one domain, of which they see the rows, C10 about the parameter shift, and C9
+    about the comparison on both domains.
 
     Args:
         truth_theta: the target vehicle's Ix, Iy [kg m²] and k [N/(rad/s)²].
@@ -77,16 +83,28 @@ def claims(rows: Iterable[Row], experiment: str, truth_theta: Mapping[str, float
     if experiment not in EXPERIMENTS:
         raise ValueError(f"experiment must be one of {', '.join(EXPERIMENTS)}, got {experiment!r}")
     rows = check_unique(rows)
-    evidence = _Evidence(experiment, rows, summarise(rows), truth_theta)
+    domains = DOMAINS if experiment == COMPARISON else (DOMAIN_OF[experiment],)
+    evidence = [_evidence(domain, rows, truth_theta) for domain in domains]
     return [_judged(rule, evidence) for rule in _RULES if experiment in rule.experiments]
 
 
-def _judged(rule: _Rule, evidence: _Evidence) -> Claim:
-    try:
-        holds, measured = rule.judge(evidence)
-    except _NotJudged as why:
-        return Claim(rule.id, rule.text, None, str(why))
-    return Claim(rule.id, rule.text, bool(holds), measured)
+def _evidence(domain: str, rows: list[Row], truth: Mapping[str, float] | None) -> _Evidence:
+    own = [row for row in rows if row.domain == domain]
+    return _Evidence(domain, own, summarise(own), truth)
+
+
+def _judged(rule: _Rule, evidence: list[_Evidence]) -> Claim:
+    """On several domains a claim must hold in each, and is not judged if it cannot be in one."""
+    verdicts, words = [], []
+    for part in evidence:
+        place = f"{NAMES[part.domain]}: " if len(evidence) > 1 else ""
+        try:
+            holds, measured = rule.judge(part)
+        except _NotJudged as why:
+            return Claim(rule.id, rule.text, None, f"{place}{why}")
+        verdicts.append(bool(holds))
+        words.append(f"{place}{measured}")
+    return Claim(rule.id, rule.text, all(verdicts), "; ".join(words))
 
 
 def _hybrid_against_no_physics(
@@ -117,7 +135,7 @@ def _only_hybrid_adapts(evidence: _Evidence) -> tuple[bool, str]:
     hybrid, plain = evidence.cell("hybrid", n), evidence.cell("no_physics", n)
     group = [row for row in evidence.rows if (row.model, row.mode, row.n_train) == ("no_physics", "fine_tuned", n)]
     failed = sum(row.status == "diverged" or row.test_mse is None for row in group)
-    fails = plain.rho.mean < 0 or (evidence.experiment == "external_force" and 2 * failed >= len(group))
+    fails = plain.rho.mean < 0 or (evidence.domain == "external_force" and 2 * failed >= len(group))
     words = f"N = {n}: mean ρ of hybrid {hybrid.rho.mean:.3g}, of no-physics {plain.rho.mean:.3g}"
     return fails and hybrid.rho.mean > 0, f"{words} ({failed} of its {len(group)} seeds diverged or not finite)"
 
@@ -172,6 +190,14 @@ def _ratio(above: Spread, below: Spread) -> float:
     return above.mean / below.mean
 
 
+def _leads_the_rivals(evidence: _Evidence) -> tuple[bool, str]:
+    hybrid = evidence.cell("hybrid", FEW).mse.mean
+    expert = evidence.cell("expert_augmentation", 0, "source_only").mse.smallest
+    physics = evidence.cell("physics_only", FEW).mse.smallest
+    words = f"mean of hybrid {hybrid:.3g}, smallest of Expert Augmentation {expert:.3g}, of physics-only {physics:.3g}"
+    return hybrid < expert < physics, words
+
+
 def _theta_recovered(evidence: _Evidence) -> tuple[bool, str]:
     if evidence.truth is None:
         raise _NotJudged("the true θ_p is not given")
@@ -224,6 +250,13 @@ _RULES = (
         "C8",
         f"The mean error of the hybrid fine-tuned with N = {FEW} is at most {CLEARLY} times that with N = {MANY}.",
         _few_are_enough,
+    ),
+    _Rule(
+        "C9",
+        f"In both experiments: mean error of the hybrid fine-tuned at N = {FEW} < smallest error over seeds of Expert "
+        f"Augmentation < smallest error over seeds of physics-only fine-tuned at N = {FEW}.",
+        _leads_the_rivals,
+        (COMPARISON,),
     ),
     _Rule(
         "C10",

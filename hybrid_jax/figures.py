@@ -29,6 +29,7 @@ STYLE: dict[Any, Any] = {
 }
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLOURS = {"hybrid": "#0072B2", "no_physics": "#D55E00", "physics_only": "#009E73"}
+OTHERS = "0.4"  # models that are in no figure of the paper
 DASHES = {"fine_tuned": "-", "target_only": "--", "source_only": ":"}
 MARKERS = {"fine_tuned": "o", "target_only": "s", "source_only": ""}
 # What lies beyond these is marked at the edge of its panel, so that one failed run does not flatten the rest.
@@ -116,6 +117,11 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     return paths
 
 
+def colour(model: str) -> str:
+    """The colour that a model has in every figure."""
+    return COLOURS.get(model, OTHERS)
+
+
 def _curves(rows: Sequence[Row], value: Callable[[Row], float]) -> _Curves:
     points: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     for (model, mode, n), group in grouped(rows).items():
@@ -144,8 +150,8 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     _draw_curves(axes, trained, min(limits[0], floor / 2) if floor > 1 / DRAWABLE else limits[0], limits[1])
     for (model, mode), curve in curves.items():
         if mode == "source_only" and np.isfinite(curve.mean[0]):
-            axes.axhspan(curve.low[0], curve.high[0], color=COLOURS[model], alpha=0.12, linewidth=0)
-            axes.axhline(curve.mean[0], color=COLOURS[model], linestyle=":", label=f"{NAMES[model]}, source-only")
+            axes.axhspan(curve.low[0], curve.high[0], color=colour(model), alpha=0.12, linewidth=0)
+            axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=f"{NAMES[model]}, source-only")
     if floor > 1 / DRAWABLE:
         axes.axhline(floor, color="0.4", linestyle="-.", label="floor: what no model here can see")
 
@@ -177,12 +183,12 @@ def _draw_curves(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at
         x = curve.n + 0.012 * span * (index - (len(curves) - 1) / 2)
         inside = (curve.mean >= bottom) & (curve.mean <= top)
         mean, low, high = (np.where(inside, np.clip(part, bottom, top), np.nan) for part in curve[1:4])
-        style = {"color": COLOURS[model], "linestyle": DASHES[mode], "marker": MARKERS[mode], "markersize": 5}
+        style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markersize": 5}
         whiskers = np.stack([mean - low, high - mean])
         axes.errorbar(x, mean, whiskers, capsize=3, label=f"{NAMES[model]}, {NAMES[mode]}", **style)
         lost = top if lost_at_top else bottom
         for index, at in enumerate(x):
-            _mark_failure(axes, at, [part[index] for part in curve], lost, COLOURS[model])
+            _mark_failure(axes, at, [part[index] for part in curve], lost, colour(model))
 
 
 def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, colour: str) -> None:

@@ -11,14 +11,16 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from hybrid_jax.claims import Claim
+from hybrid_jax.claims import COMPARISON, Claim
 from hybrid_jax.files import json_text, json_value, read_json, write_whole
 from hybrid_jax.report_page import page
 from hybrid_jax.report_tables import Table, headline, lane_notes, parameters, verdicts
-from hybrid_jax.rows import THETA, Row, check_unique, row_from, to_csv
+from hybrid_jax.rows import DOMAIN_OF, DOMAINS, THETA, Row, check_unique, row_from, to_csv
+from hybrid_jax.standings import standings
 
 JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
 FLOOR = "wind_sine_mse"  # key of `extra`: the share of L^T_MSE that is the wind's sine
+HEADLINES = {COMPARISON: standings}  # of the experiments that have others than `headline`
 _REQUIRED = {"experiment": str, "config": dict, "environment": dict, "rows": list, "claims": list}
 _OPTIONAL = {"not_judged": list, "truth_theta": dict | None, "figures": dict, "notes": list}
 
@@ -28,12 +30,12 @@ class Report:
     """One experiment's outcome.
 
     Attributes:
-        experiment: "param_shift", "external_force", or a name of one's own.
+        experiment: "param_shift", "external_force", "comparison", or a name of one's own.
         config: the configuration as JSON values.
         environment: see `hybrid_jax.environment.environment`.
         rows: one per trained model.
         claims: see `hybrid_jax.claims.claims`.
-        truth_theta: the target vehicle's Ix, Iy [kg m²], k [N/(rad/s)²], if known.
+        truth_theta: the target vehicle's Ix, Iy [kg m²], k [N/(rad/s)²], if known; by domain where there are several.
         figures: path of a picture relative to the report → its caption.
         notes: further sentences for the page.
         extra: further keys of report.json, JSON values; the one called FLOOR makes a note as well.
@@ -44,7 +46,7 @@ class Report:
     environment: Mapping[str, Any]
     rows: Sequence[Row]
     claims: Sequence[Claim]
-    truth_theta: Mapping[str, float] | None = None
+    truth_theta: Mapping[str, Any] | None = None
     figures: Mapping[str, str] = field(default_factory=dict)
     notes: Sequence[str] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
@@ -117,7 +119,7 @@ def from_record(record: Any) -> Report:
             raise ValueError(f"{name} is missing")
         if name in record and not isinstance(record[name], kind):
             raise ValueError(f"{name} must not be a {type(record[name]).__name__}")
-    rows = check_unique(_each("rows", record["rows"], row_from))
+    rows = check_unique(_each("rows", record["rows"], lambda item: row_from(_placed(item, record["experiment"]))))
     judged = _each("claims", record["claims"], _claim)
     apart = _each("not_judged", record.get("not_judged", []), lambda item: _claim(_as_claim(item)))
     optional = {name: record[name] for name in ("figures", "notes", "truth_theta") if name in record}
@@ -130,14 +132,20 @@ def from_record(record: Any) -> Report:
 
 def report_tables(report: Report) -> list[Table]:
     """The headline tables, the claims and, where there are any, the parameters."""
-    tables = [*headline(report.rows), verdicts(report.claims)]
-    theta = parameters(report.rows, report.truth_theta)
-    return tables if theta is None else [*tables, theta]
+    tables = HEADLINES.get(report.experiment, headline)
+    return [*tables(report.rows), verdicts(report.claims), *parameters(report.rows, report.truth_theta)]
 
 
 def print_report(console: Console, report: Report) -> None:
     """Print the headline tables, the claims and what went wrong."""
-    for table in report_tables(report):
+    print_tables(console, report_tables(report))
+    for note in _notes(report):
+        console.print(Text(note))
+
+
+def print_tables(console: Console, tables: Sequence[Table]) -> None:
+    """Print tables as a terminal shows them best."""
+    for table in tables:
         # As Text, or the brackets of a unit would be read as markup.
         printed = RichTable(title=Text(table.title), title_justify="left")
         for name in table.header:
@@ -145,8 +153,6 @@ def print_report(console: Console, report: Report) -> None:
         for line in table.lines:
             printed.add_row(*(_coloured(cell) for cell in line))
         console.print(printed)
-    for note in _notes(report):
-        console.print(Text(note))
 
 
 def _coloured(cell: str) -> Text:
@@ -168,7 +174,7 @@ def _notes(report: Report) -> list[str]:
     floor = report.extra.get(FLOOR)
     notes = [*lane_notes(report.rows), *report.notes]
     if _is_number(floor):
-        notes.append(f"About {floor:.2e} of a test error is the wind's sine, which a model without a clock cannot see.")
+        notes.append(f"About {floor:.2e} of a test error in the wind is its sine: no model without a clock sees it.")
     return notes
 
 
@@ -180,6 +186,12 @@ def _each(name: str, items: list, read) -> list:
         except ValueError as error:
             raise ValueError(f"{name}[{index}]: {error}") from error
     return found
+
+
+def _placed(item: Any, experiment: str) -> Any:
+    """A row of the time when a report had only the one domain of its experiment, with this domain."""
+    domain = DOMAIN_OF.get(experiment)
+    return item if domain is None or not isinstance(item, dict) else {"domain": domain} | item
 
 
 def _claim(item: Any) -> Claim:
@@ -205,11 +217,18 @@ def _check_optional(report: Report) -> Report:
     if not all(isinstance(text, str) for text in [*report.figures.values(), *report.notes]):
         raise ValueError("figures and notes must hold text")
     truth = report.truth_theta
-    if truth is not None and set(truth) != set(THETA):
-        raise ValueError(f"truth_theta must hold exactly {', '.join(THETA)}")
-    if truth is not None and not all(_is_number(value) for value in truth.values()):
-        raise ValueError("truth_theta must hold numbers other than 0")
+    if truth is not None:
+        several = bool(truth) and set(truth) <= set(DOMAINS)
+        for theta in truth.values() if several else [truth]:
+            _check_truth(theta)
     return report
+
+
+def _check_truth(theta: Any) -> None:
+    if not isinstance(theta, dict) or set(theta) != set(THETA):
+        raise ValueError(f"truth_theta must hold exactly {', '.join(THETA)}, or these by domain")
+    if not all(_is_number(value) for value in theta.values()):
+        raise ValueError("truth_theta must hold numbers other than 0")
 
 
 def _is_number(value: Any) -> bool:

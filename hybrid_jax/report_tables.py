@@ -3,11 +3,11 @@
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from hybrid_jax.claims import Claim
 from hybrid_jax.rows import MODELS, MODES, NAMES, THETA, Row
-from hybrid_jax.summary import Spread, Summary, grouped, spread, summarise
+from hybrid_jax.summary import Spread, Summary, by_domain, grouped, spread, summarise
 
 
 class Table(NamedTuple):
@@ -19,13 +19,8 @@ class Table(NamedTuple):
 
 
 def headline(rows: Sequence[Row]) -> list[Table]:
-    """L^T_MSE and ρ, mean ± std over seeds: a line per N, a column per model and mode."""
-    seeds, trained = len({row.seed for row in rows}), [row for row in rows if row.mode != "source_only"]
-    of = f"mean ± std over {seeds} seeds" if seeds > 1 else "one seed"
-    return [
-        _by_size(rows, f"Test error L^T_MSE ({of}; less is better)", lambda cell: error_text(cell.mse)),
-        _by_size(trained, f"Improvement ρ over source-only ({of}; 1 is perfect)", lambda cell: rho_text(cell.rho)),
-    ]
+    """L^T_MSE and ρ of each domain, mean ± std over seeds: a line per N, a column per model and mode."""
+    return [table for place, group in _places(rows) for table in _headline(group, place)]
 
 
 def verdicts(claims: Sequence[Claim]) -> Table:
@@ -35,21 +30,23 @@ def verdicts(claims: Sequence[Claim]) -> Table:
     return Table("Claims of the paper", ("", "claim", "verdict", "measured"), lines)
 
 
-def parameters(rows: Sequence[Row], truth: Mapping[str, float] | None) -> Table | None:
-    """Ix, Iy, k of each cell that has them, mean ± std over seeds, and the truth; None where no row has any."""
-    lines = []
-    for (model, mode, n), group in grouped(rows).items():
-        thetas = [row.theta for row in group if row.theta is not None]
-        if thetas:
-            values = ([math.inf if theta[name] is None else theta[name] for theta in thetas] for name in THETA)
-            cells = [_theta_text(spread([value or 0.0 for value in column])) for column in values]
-            lines.append((NAMES[model], NAMES[mode], str(n) if n else "–", *cells))
-    if not lines:
-        return None
-    if truth is not None:
-        lines.append(("truth", "", "", *(f"{truth[name]:.5g}" for name in THETA)))
-    units = ("Ix [kg m²]", "Iy [kg m²]", "k [N/(rad/s)²]")
-    return Table("Recovered physical parameters θ_p", ("model", "mode", "N", *units), lines)
+def parameters(rows: Sequence[Row], truth: Mapping[str, Any] | None) -> list[Table]:
+    """Ix, Iy, k of each cell that has them, mean ± std over seeds, and the truth: a table for each domain that has any.
+
+    Args:
+        truth: Ix, Iy, k, or these by domain.
+    """
+    tables = []
+    for place, group in _places(rows):
+        known = [row for row in group if row.theta is not None]
+        if known:
+            tables.append(_parameters(known, place, truth_in(truth, known[0].domain)))
+    return tables
+
+
+def truth_in(truth: Mapping[str, Any] | None, domain: str) -> Mapping[str, float] | None:
+    """The true Ix, Iy, k in a domain, of these or of these by domain."""
+    return truth if truth is None or set(truth) == set(THETA) else truth.get(domain)
 
 
 def lane_notes(rows: Sequence[Row]) -> list[str]:
@@ -60,6 +57,12 @@ def lane_notes(rows: Sequence[Row]) -> list[str]:
         ("have a test error that is not finite; it counts as infinite (∞)", lambda row: row.test_mse is None),
     )
     return [_tally(rows, words, chosen) for words, chosen in kinds]
+
+
+def over_seeds(rows: Sequence[Row]) -> str:
+    """How many seeds the numbers of these rows are over."""
+    seeds = len({row.seed for row in rows})
+    return f"{seeds} seeds" if seeds > 1 else "one seed"
 
 
 def error_text(values: Spread) -> str:
@@ -82,10 +85,53 @@ def _infinite(sign: str, values: Spread, median: str) -> str:
     return f"{sign} ({values.non_finite} of {values.count} seeds not finite, median {median})"
 
 
-def _theta_text(values: Spread) -> str:
+def _theta_text(rows: Sequence[Row], name: str) -> str:
+    """0.0398 ± 0.0004, 95 % ± 0.0006: the spread over seeds, then the seeds' own intervals where they have any."""
+    given = [row.theta[name] for row in rows if row.theta is not None]
+    values = spread([math.inf if value is None else value for value in given])
     if values.non_finite:
         return f"not finite in {values.non_finite} of {values.count} seeds"
-    return f"{values.mean:.4g}" + ("" if math.isnan(values.std) else f" ± {values.std:.2g}")
+    text = f"{values.mean:.4g}" + ("" if math.isnan(values.std) else f" ± {values.std:.2g}")
+    intervals = [row.theta_interval[name] for row in rows if row.theta_interval is not None]
+    return f"{text}, {_interval_text(intervals)}" if intervals else text
+
+
+def _interval_text(intervals: Sequence[Any]) -> str:
+    halves = [(high - low) / 2 for low, high in filter(None, intervals)]
+    if not halves:
+        return "95 % interval not finite"
+    some = "" if len(halves) == len(intervals) else f" in {len(halves)} of {len(intervals)} seeds"
+    return f"95 % ± {spread(halves).mean:.2g}{some}"
+
+
+def _places(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
+    """The rows of each domain, with what a title says of it: nothing where there is only one."""
+    groups = by_domain(rows)
+    return [(f", {NAMES[domain]}" if len(groups) > 1 else "", group) for domain, group in groups.items()]
+
+
+def _headline(rows: Sequence[Row], place: str) -> list[Table]:
+    trained = [row for row in rows if row.mode != "source_only"]
+    seeds = over_seeds(rows)
+    of = seeds if seeds == "one seed" else f"mean ± std over {seeds}"
+    error, gain = f"Test error L^T_MSE{place} ({of}; less is better)", f"Improvement ρ over source-only{place} ({of}; "
+    return [
+        _by_size(rows, error, lambda cell: error_text(cell.mse)),
+        _by_size(trained, f"{gain}1 is perfect)", lambda cell: rho_text(cell.rho)),
+    ]
+
+
+def _parameters(rows: Sequence[Row], place: str, truth: Mapping[str, float] | None) -> Table:
+    lines = [
+        (NAMES[model], NAMES[mode], str(n) if n else "–", *(_theta_text(group, name) for name in THETA))
+        for (model, mode, n), group in grouped(rows).items()
+    ]
+    if truth is not None:
+        lines.append(("truth", "", "", *(f"{truth[name]:.5g}" for name in THETA)))
+    units = ("Ix [kg m²]", "Iy [kg m²]", "k [N/(rad/s)²]")
+    given = any(row.theta_interval is not None for row in rows)
+    of = f" ({over_seeds(rows)}; 95 %: mean half-width of a seed's own interval)" if given else ""
+    return Table(f"Recovered physical parameters θ_p{place}{of}", ("model", "mode", "N", *units), lines)
 
 
 def _by_size(rows: Sequence[Row], title: str, text: Callable[[Summary], str]) -> Table:
@@ -104,7 +150,14 @@ def _by_size(rows: Sequence[Row], title: str, text: Callable[[Summary], str]) ->
 
 
 def _tally(rows: Sequence[Row], words: str, chosen: Callable[[Row], bool]) -> str:
-    found = Counter((row.model, row.mode, row.n_train) for row in rows if chosen(row))
-    places = [f"{NAMES[m]} {NAMES[mode]}, N = {n}: {times}" for (m, mode, n), times in found.items()]
+    found = [
+        (place, Counter((row.model, row.mode, row.n_train) for row in group if chosen(row)))
+        for place, group in _places(rows)
+    ]
+    places = [
+        f"{NAMES[m]} {NAMES[mode]}, N = {n}{place}: {times}"
+        for place, cells in found
+        for (m, mode, n), times in cells.items()
+    ]
     listed = f" ({'; '.join(places)})" if places else ""
-    return f"{found.total()} of {len(rows)} runs {words}{listed}."
+    return f"{sum(cells.total() for _, cells in found)} of {len(rows)} runs {words}{listed}."

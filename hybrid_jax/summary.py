@@ -1,4 +1,4 @@
-"""What the rows of a cell (model, mode, N) say together."""
+"""What the rows of a cell (model, mode, N) of one domain say together."""
 
 import math
 from collections import defaultdict
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hybrid_jax.rows import MODELS, MODES, Row
+from hybrid_jax.rows import DOMAINS, MODELS, MODES, NAMES, RIVALS, Row
 
 
 @dataclass(frozen=True)
@@ -17,6 +17,7 @@ class Spread:
     mean: float
     std: float
     median: float
+    smallest: float
     count: int
     non_finite: int
 
@@ -32,12 +33,43 @@ class Summary:
 Cell = tuple[str, str, int]  # model, mode, n_train
 
 
+def by_domain(rows: Iterable[Row]) -> dict[str, list[Row]]:
+    """The rows of each domain that has any, in the order of DOMAINS."""
+    rows = list(rows)
+    split = {domain: [row for row in rows if row.domain == domain] for domain in DOMAINS}
+    return {domain: group for domain, group in split.items() if group}
+
+
 def grouped(rows: Iterable[Row]) -> dict[Cell, list[Row]]:
-    """The rows of each cell, in the order of MODELS, MODES and n_train."""
-    groups = defaultdict(list)
+    """The rows of each cell, in the order of MODELS, MODES and n_train.
+
+    Raises:
+        ValueError: rows of several domains, which have no mean together.
+    """
+    rows, groups = list(rows), defaultdict(list)
+    domains = sorted({row.domain for row in rows})
+    if len(domains) > 1:
+        raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
     for row in rows:
         groups[row.model, row.mode, row.n_train].append(row)
     return dict(sorted(groups.items(), key=lambda item: _order(item[0])))
+
+
+def ranked(rows: Iterable[Row]) -> dict[Cell, list[Row]]:
+    """`grouped`, the cell of the smallest mean error first; among infinite means that of the smallest error."""
+
+    def error(item: tuple[Cell, list[Row]]) -> tuple[float, float]:
+        values = spread([row.error for row in item[1]])
+        return values.mean, values.smallest
+
+    return dict(sorted(grouped(rows).items(), key=error))
+
+
+def method(cell: Cell) -> str:
+    """A cell as a method for people, without its N: fine-tuning needs no word, nor does a rival that never adapts."""
+    model, mode, _ = cell
+    unsaid = mode == "fine_tuned" or (mode == "source_only" and model in RIVALS)
+    return NAMES[model] if unsaid else f"{NAMES[model]}, {NAMES[mode]}"
 
 
 def summarise(rows: Iterable[Row]) -> dict[Cell, Summary]:
@@ -55,7 +87,7 @@ def spread(values: Sequence[float]) -> Spread:
     with np.errstate(all="ignore"):
         mean, median = float(np.mean(array)), float(np.median(array))
         std = math.nan if len(array) < 2 else math.inf if non_finite else float(np.std(array, ddof=1))
-    return Spread(mean, std, median, len(array), non_finite)
+    return Spread(mean, std, median, float(np.min(array)), len(array), non_finite)
 
 
 def _order(cell: Cell) -> tuple[int, int, int]:

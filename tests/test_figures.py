@@ -9,7 +9,9 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from test_report import ODD_ROWS, SIZES, TRUTH, changed, make_rows
+from test_standings import compared_rows, spoilt
 
+from hybrid_jax.comparison_figures import REACH, standings
 from hybrid_jax.figures import COLOURS, save_figure, scores, theta
 from hybrid_jax.flight_figures import example_flight, predictions, tilt
 
@@ -30,6 +32,7 @@ def hovering_inputs(steps=10):
 FIGURES = {
     "scores": lambda: scores(make_rows(), "Scores", floor=0.01),
     "theta": lambda: theta(make_rows(), TRUTH),
+    "standings": lambda: standings(compared_rows(), "Standings", {"external_force": 2e-3}),
     "predictions": lambda: predictions(straight_flight(), {100: {"hybrid": straight_flight() * 1.01}}, "Paths"),
     "example_flight": lambda: example_flight(straight_flight(), hovering_inputs(), 0.1),
 }
@@ -80,6 +83,38 @@ def test_a_failed_seed_is_marked_and_the_axes_stay_readable():
         assert "e+09" in words
 
 
+def methods_of(axes):
+    return [tick.get_text() for tick in axes.get_yticklabels()]
+
+
+def test_standings_have_a_line_for_every_method_of_each_domain_the_smallest_mean_on_top():
+    shift, force = standings(compared_rows(), "Standings").axes
+    assert methods_of(shift)[:3] == ["hybrid", "Expert Augmentation", "physics-only"]
+    assert methods_of(shift)[-1] == "hybrid, source-only"
+    assert set(methods_of(force)) == set(methods_of(shift))
+    assert shift.yaxis_inverted()
+    assert (shift.get_xscale(), shift.get_title(), force.get_title()) == ("log", "Parameter shift", "External force")
+    dots = [line for line in shift.lines if line.get_marker() == "o"]
+    assert [len(line.get_xdata()) for line in dots] == [3] * len(methods_of(shift))
+    assert dots[0].get_xdata() == pytest.approx([3.26e-3 * factor for factor in (0.99, 1, 1.01)])
+
+
+def test_standings_name_n_where_there_are_several():
+    (axes,) = standings(make_rows(), "Standings").axes
+    assert {"hybrid, N = 100", "hybrid, N = 1000", "hybrid, source-only"} < set(methods_of(axes))
+
+
+def test_a_method_that_failed_is_told_at_the_edge_of_the_standings_and_flattens_nothing():
+    rows = spoilt(compared_rows(), "last_layer", lambda row: math.nan)
+    rows = spoilt(rows, "theta_d_only", lambda row: math.inf if row.seed else row.error)
+    rows = spoilt(rows, "linear_residual", lambda row: 1e9 * row.error)
+    axes = standings(rows, "Standings").axes[0]
+    assert axes.get_xlim()[1] < 3.26e-3 * REACH * 1.2
+    assert methods_of(axes)[-3:] == ["source + linear residual", "θ_d only", "last layer (ridge)"]
+    words = [text.get_text() for text in axes.texts]
+    assert words == ["3 of 3 beyond, mean 5e+06", "2 of 3 not finite", "3 of 3 not finite"]
+
+
 def test_theta_is_relative_to_the_truth_in_percent():
     rows = make_rows(theta={"Ix": 0.0404, "Iy": 0.0196, "k": 8.5e-6})
     for axes, bias in zip(theta(rows, TRUTH).axes, (1.0, -2.0, 0.0), strict=True):
@@ -110,6 +145,10 @@ def test_tilt_is_the_angle_of_roll_and_pitch_alone():
 def test_what_cannot_be_drawn_is_refused():
     with pytest.raises(ValueError, match="rows must not be empty"):
         scores([], "Scores")
+    with pytest.raises(ValueError, match="rows must not be empty"):
+        standings([], "Standings")
+    with pytest.raises(ValueError, match="one domain"):
+        scores(compared_rows(), "Scores")
     with pytest.raises(ValueError, match="theta"):
         theta([row for row in make_rows() if row.model == "no_physics"], TRUTH)
     with pytest.raises(ValueError, match="predicted must not be empty"):
@@ -123,8 +162,14 @@ def test_what_cannot_be_drawn_is_refused():
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(rows=ODD_ROWS, floor=st.floats(0, 1e6))
 def test_any_rows_with_something_to_draw_are_drawn(rows, floor):
+    compared = rows
+    rows = [row for row in rows if row.domain == "parameter_shift"]
     known = [row for row in rows if row.theta and row.mode != "source_only"]
-    drawn = ((rows, lambda: scores(rows, "Scores", floor)), (known, lambda: theta(rows, TRUTH)))
+    drawn = (
+        (rows, lambda: scores(rows, "Scores", floor)),
+        (known, lambda: theta(rows, TRUTH)),
+        (compared, lambda: standings(compared, "Standings", {"external_force": floor})),
+    )
     for enough, draw in drawn:
         if enough:
             draw().savefig(io.BytesIO(), format="png", dpi=30)

@@ -11,11 +11,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from rich.console import Console
 
-from hybrid_jax.claims import claims
+from hybrid_jax.claims import EXPERIMENTS, claims
 from hybrid_jax.environment import PACKAGES, environment
 from hybrid_jax.report import FLOOR, Report, load_report, print_report, write_report
-from hybrid_jax.rows import MODELS, MODES, STATUSES, THETA, Row, from_csv, row_from, to_csv, with_rho
-from hybrid_jax.summary import spread, summarise
+from hybrid_jax.report_tables import parameters
+from hybrid_jax.rows import (
+    DOMAIN_OF,
+    DOMAINS,
+    MODELS,
+    MODES,
+    RIVALS,
+    STATUSES,
+    THETA,
+    Row,
+    from_csv,
+    row_from,
+    to_csv,
+    with_rho,
+)
+from hybrid_jax.summary import grouped, spread, summarise
 
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": 8.5e-6}
 SIZES = (100, 500, 1000)
@@ -30,10 +44,22 @@ ERRORS = {
 }
 
 
-def make_rows(seeds=3, sizes=SIZES, errors=ERRORS, theta=TRUTH):
+def make_rows(seeds=3, sizes=SIZES, errors=ERRORS, theta=TRUTH, domain="parameter_shift"):
     """The seeds' errors lie 2 % apart around the mean."""
     return with_rho(
-        Row(model, mode, n, seed, mean * (1 + 0.02 * (seed - (seeds - 1) / 2)), None, mean / 100, 150, "ok", known)
+        Row(
+            domain,
+            model,
+            mode,
+            n,
+            seed,
+            mean * (1 + 0.02 * (seed - (seeds - 1) / 2)),
+            None,
+            mean / 100,
+            150,
+            "ok",
+            known,
+        )
         for (model, mode), means in errors.items()
         for n, mean in means.items()
         for seed in range(seeds)
@@ -56,10 +82,10 @@ def verdicts(rows, experiment="param_shift", truth=TRUTH):
     return {claim.id: claim.holds for claim in claims(rows, experiment, truth)}
 
 
-def make_report(rows, **fields):
-    judged = claims(rows, "param_shift", TRUTH)
+def make_report(rows, experiment="param_shift", truth=TRUTH, **fields):
+    judged = claims(rows, experiment, truth)
     surroundings = environment({"training": 12.5})
-    return Report("param_shift", {"preset": "quick", "sizes": [100]}, surroundings, rows, judged, TRUTH, **fields)
+    return Report(experiment, {"preset": "quick", "sizes": [100]}, surroundings, rows, judged, truth, **fields)
 
 
 def test_rho_is_eq_9_of_the_seeds_own_source_only_error():
@@ -74,6 +100,49 @@ def test_rho_needs_a_source_only_row_with_an_error():
         with_rho(row for row in rows if row.mode != "source_only")
     with pytest.raises(ValueError, match="test_mse 0"):
         changed(rows, "hybrid", "source_only", 0, test_mse=0.0)
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+def test_rho_of_a_rival_is_its_gain_over_the_hybrid_of_the_same_seed_and_domain(rival):
+    here, there = make_rows(), [replace(row, test_mse=row.error / 2) for row in make_rows(domain="external_force")]
+    mode, n = ("source_only", 0) if rival == "expert_augmentation" else ("fine_tuned", 100)
+    added = [replace(here[0], domain=domain, model=rival, mode=mode, n_train=n, test_mse=0.65) for domain in DOMAINS]
+    assert added[0].seed == 0
+    gains = [row.rho for row in with_rho([*here, *there, *added]) if row.model == rival]
+    source = 2.6 * 0.98
+    assert gains == pytest.approx([(source - 0.65) / source, (source / 2 - 0.65) / (source / 2)])
+
+
+def test_rows_of_two_domains_stand_apart_and_have_no_mean_together():
+    both = [*make_rows(), *make_rows(domain="external_force")]
+    assert with_rho(both) == both
+    with pytest.raises(ValueError, match="one domain, got external_force, parameter_shift"):
+        grouped(both)
+
+
+@pytest.mark.parametrize(
+    ("interval", "kept"),
+    [([0.039, 0.041], (0.039, 0.041)), ((0.04, 0.04), (0.04, 0.04)), ([math.nan, 1.0], None), (None, None)],
+)
+def test_an_interval_is_two_finite_ends_or_none(interval, kept):
+    row = replace(make_rows()[0], theta_interval=dict.fromkeys(THETA, (0, 1)) | {"Ix": interval})
+    assert row.theta_interval == {"Ix": kept, "Iy": (0, 1), "k": (0, 1)}
+    assert from_csv(to_csv([row])) == [row] == [row_from(json.loads(json.dumps(asdict(row))))]
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"theta_interval": dict.fromkeys(THETA, (2, 1))}, "low <= high"),
+        ({"theta_interval": dict.fromkeys(THETA, (1, 2, 3))}, r"theta_interval\.Ix must be \[low, high\]"),
+        ({"theta_interval": {"Ix": [1, 2]}}, "exactly Ix, Iy, k"),
+        ({"theta_interval": dict.fromkeys(THETA), "theta": None}, "null where theta is"),
+        ({"domain": "source"}, "domain must be one of parameter_shift, external_force"),
+    ],
+)
+def test_a_row_refuses_intervals_and_domains_that_are_none(fields, words):
+    with pytest.raises(ValueError, match=words):
+        replace(make_rows()[0], **fields)
 
 
 def test_a_row_that_is_not_finite_counts_as_infinitely_bad():
@@ -121,10 +190,21 @@ def test_a_claim_fails_when_the_rows_say_so(fails, change):
 
 
 def test_diverging_counts_as_failing_under_the_external_force_only():
-    rows = changed(make_rows(), "no_physics", "fine_tuned", 100, factor=0.7, status="diverged")
+    both = [row for domain in DOMAINS for row in make_rows(domain=domain)]
+    rows = changed(both, "no_physics", "fine_tuned", 100, factor=0.7, status="diverged")
     assert verdicts(rows)["C3"] is False
     assert verdicts(rows, "external_force")["C3"] is True
     assert "C10" not in verdicts(rows, "external_force")
+
+
+@pytest.mark.parametrize("experiment", DOMAIN_OF)
+def test_a_claim_about_one_domain_does_not_see_the_others_rows(experiment):
+    own, other = (
+        make_rows(domain=domain) for domain in sorted(DOMAINS, key=lambda name: name != DOMAIN_OF[experiment])
+    )
+    spoilt = changed(other, "hybrid", "fine_tuned", 100, factor=1e6)
+    assert claims([*own, *spoilt], experiment, TRUTH) == claims(own, experiment, TRUTH)
+    assert "C9" not in verdicts(own, experiment)
 
 
 def test_what_the_rows_cannot_judge_is_said_and_not_judged():
@@ -150,7 +230,7 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert {"experiment", "config", "environment", "rows", "claims", "not_judged"} <= set(record)
     assert set(record["environment"]) >= {"versions", "hardware", "seconds"}
     assert set(PACKAGES) < set(record["environment"]["versions"])
-    fields = "model mode n_train seed test_mse rho val_mse epochs status theta"
+    fields = "domain model mode n_train seed test_mse rho val_mse epochs status theta theta_interval"
     assert all(list(row) == fields.split() for row in record["rows"])
     assert any(row["test_mse"] is None and row["rho"] is None for row in record["rows"])
     assert all(set(claim) == {"id", "text", "holds", "measured"} for claim in record["claims"])
@@ -165,6 +245,47 @@ def test_loading_gives_back_what_was_written(tmp_path):
     write_report(tmp_path, report)
     assert load_report(tmp_path) == report == load_report(tmp_path / "report.json")
     assert from_csv((tmp_path / "rows.csv").read_text()) == report.rows
+
+
+def test_a_report_of_before_rows_had_domains_and_intervals_reads_as_of_its_experiments_domain(tmp_path):
+    report = make_report(make_rows())
+    write_report(tmp_path, report)
+    record = json.loads((tmp_path / "report.json").read_text())
+    new = ("domain", "theta_interval")
+    record["rows"] = [{name: row[name] for name in row if name not in new} for row in record["rows"]]
+    (tmp_path / "old.json").write_text(json.dumps(record))
+    assert load_report(tmp_path / "old.json").rows == report.rows
+    (tmp_path / "other.json").write_text(json.dumps(record | {"experiment": "mine"}))
+    with pytest.raises(ValueError, match=r"rows\[0\].*domain"):
+        load_report(tmp_path / "other.json")
+
+
+def test_parameters_stand_with_the_spread_over_seeds_and_the_width_of_their_intervals():
+    offsets = (-4e-4, 0.0, 4e-4)
+    thetas = [TRUTH | {"Ix": 0.0398 + offset} for offset in offsets]
+    rows = [
+        replace(row, theta=thetas[row.seed], theta_interval={"Ix": [0.039, 0.0402], "Iy": None, "k": None})
+        for row in make_rows()
+        if row.model == "hybrid" and row.n_train == 100 and row.mode == "fine_tuned"
+    ]
+    some = [replace(rows[0], theta_interval=dict.fromkeys(THETA)), *rows[1:]]
+    for some_rows, cell in (
+        (rows, "0.0398 ± 0.0004, 95 % ± 0.0006"),
+        (some, "0.0398 ± 0.0004, 95 % ± 0.0006 in 2 of 3 seeds"),
+    ):
+        (table,) = parameters(some_rows, TRUTH)
+        assert table.lines[0][3] == cell
+        assert table.lines[0][4] == "0.02 ± 0, 95 % interval not finite"
+        assert table.lines[-1][:1] + table.lines[-1][3:] == ("truth", "0.04", "0.02", "8.5e-06")
+
+
+def test_parameters_of_two_domains_stand_beside_the_truth_of_each():
+    both = [row for domain in DOMAINS for row in make_rows(domain=domain)]
+    truth = {"parameter_shift": TRUTH, "external_force": TRUTH | {"Ix": 0.029}}
+    shift, force = parameters(both, truth)
+    assert (shift.lines[-1][3], force.lines[-1][3]) == ("0.04", "0.029")
+    assert "parameter shift" in shift.title
+    assert "external force" in force.title
 
 
 def test_the_page_says_everything_once(tmp_path):
@@ -213,6 +334,9 @@ def test_nothing_is_written_when_a_value_cannot_be(tmp_path):
         lambda text: text.replace('"mode": "source_only"', '"mode": "fine_tuned"', 1),
         lambda text: text.replace('"holds": true', '"holds": "yes"', 1),
         lambda text: text.replace('"k": 8.5e-06', '"k": NaN', 1),
+        lambda text: text.replace('"truth_theta": {', '"truth_theta": {"external_force": null,'),
+        lambda text: text.replace('"domain": "parameter_shift"', '"domain": "source"', 1),
+        lambda text: text.replace('"theta_interval": null', '"theta_interval": [1, 2]', 1),
         lambda text: text.replace('"seed": 0', '"seed": 1', 1),
         lambda text: text.replace('"val_mse": 0.', '"val_mse": -0.', 1),
     ],
@@ -233,12 +357,18 @@ def test_a_missing_file_is_named(tmp_path):
 
 NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([math.nan, math.inf, np.float32(0.1)])
 THETAS = st.none() | st.fixed_dictionaries({name: st.none() | st.floats() for name in THETA})
+PAIRS = st.lists(st.floats(allow_nan=False), min_size=2, max_size=2).map(sorted) | st.sampled_from(
+    [None, [0.0, math.nan]]
+)
+INTERVALS = st.none() | st.fixed_dictionaries(dict.fromkeys(THETA, PAIRS))
 
 
 @st.composite
 def odd_rows(draw):
     mode = draw(st.sampled_from(MODES))
+    theta = draw(THETAS)
     return Row(
+        domain=draw(st.sampled_from(DOMAINS)),
         model=draw(st.sampled_from(MODELS)),
         mode=mode,
         n_train=0 if mode == "source_only" else draw(st.sampled_from([1, 100, 500, 1000])),
@@ -248,18 +378,24 @@ def odd_rows(draw):
         val_mse=draw(NUMBERS),
         epochs=draw(st.integers(0, 10**6)),
         status=draw(st.sampled_from(STATUSES)),
-        theta=draw(THETAS),
+        theta=theta,
+        theta_interval=draw(INTERVALS) if theta else None,
     )
 
 
-ODD_ROWS = st.lists(odd_rows(), max_size=12, unique_by=lambda row: (row.model, row.mode, row.n_train, row.seed))
+def identity(row):
+    """No two rows of a report share it."""
+    return row.domain, row.model, row.mode, row.n_train, row.seed
+
+
+ODD_ROWS = st.lists(odd_rows(), max_size=12, unique_by=identity)
 
 
 @settings(max_examples=40, deadline=None)
-@given(ODD_ROWS)
-def test_any_rows_make_a_report_that_reads_back(tmp_path_factory, rows):
+@given(ODD_ROWS, st.sampled_from(EXPERIMENTS))
+def test_any_rows_make_a_report_that_reads_back(tmp_path_factory, rows, experiment):
     out = tmp_path_factory.mktemp("report")
-    write_report(out, make_report(rows))
+    write_report(out, make_report(rows, experiment))
     assert load_report(out).rows == rows == from_csv((out / "rows.csv").read_text())
 
 
