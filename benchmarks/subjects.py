@@ -6,7 +6,7 @@ import jax
 import numpy as np
 
 from experiments.conditions import fresh_fields
-from experiments.protocol import PAPER, Config, Model
+from experiments.protocol import PAPER, AdaptationConfig, Model
 from hybrid_jax.lanes import lane
 from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.rollout import rollout_batch
@@ -17,7 +17,7 @@ from hybrid_jax.vehicle import IRIS
 DT = 0.01  # s
 
 
-def protocol(lanes: int, windows: int) -> Config:
+def protocol(lanes: int, windows: int) -> AdaptationConfig:
     """The paper's protocol with so many seeds, and so many windows to pre-train on."""
     return replace(PAPER, seeds=lanes, source_train=windows)
 

@@ -3,8 +3,9 @@
 import contextlib
 import io
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import tyro
 from rich.console import Console
@@ -16,12 +17,20 @@ BAD_INPUT, INTERRUPTED = 2, 130
 
 
 def run(
-    name: str, about: str, experiment: Callable[[Config, Console], None], arguments: Sequence[str] | None = None
+    name: str,
+    about: str,
+    experiment: Callable[[Any, Console], None],
+    arguments: Sequence[str] | None = None,
+    presets: Mapping[str, Config] = PRESETS,
 ) -> None:
-    """Read the command line and run an experiment. Bad input ends in one line on stderr and exit code 2."""
+    """Read the command line and run an experiment. Bad input ends in one line on stderr and exit code 2.
+
+    Args:
+        presets: by name what --preset chooses from, all of the class that `experiment` takes; "paper" is the default.
+    """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        config = read(name, about, arguments)
+        config = read(name, about, arguments, presets)
         check_folder("--out", config.out)
         configure(config.cache)
         experiment(config, Console(stderr=True))
@@ -33,19 +42,20 @@ def run(
         sys.exit(INTERRUPTED)
 
 
-def read(name: str, about: str, arguments: list[str]) -> Config:
+def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Config] = PRESETS) -> Config:
     """The configuration of a command line: the preset, and what the other options change of it.
 
     Raises:
         ValueError: an unknown preset, or options that do not fit together.
     """
-    preset = PRESETS[_preset(arguments)]
-    description = f"{about}\n\n{Config.__doc__}"
+    preset = presets[_preset(arguments)]
+    kind = type(preset)
+    description = "\n\n".join((about, kind.__doc__ or "", Config.__doc__ or ""))
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
             return tyro.cli(
-                Config, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
+                kind, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
             )
     except SystemExit as stop:
         if not stop.code:

@@ -7,19 +7,22 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from experiments.protocol import Config, Stopping, column
+from experiments.protocol import Config, Encoding, Stopping, column
 from hybrid_jax import training
+from hybrid_jax.expert_augmentation import expert_augmented
+from hybrid_jax.features import restricted
 from hybrid_jax.lanes import count, lane, stack
 from hybrid_jax.loss import REGULARISERS
-from hybrid_jax.residual import InputScaling, ResidualNetwork, residual_network
-from hybrid_jax.rigid_body import guess
+from hybrid_jax.objective import Settings
+from hybrid_jax.residual import InputScaling
+from hybrid_jax.rigid_body import RigidBody, guess, guess_off
 from hybrid_jax.rollout import SOLVERS
-from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
-from hybrid_jax.training import FitState, Plan, Settings, make_plan
+from hybrid_jax.training import FitState, Plan, make_plan
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 from hybrid_jax.vehicle import Vehicle
 
-PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION = range(5)  # what the keys of a seed are for
+PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
 
 
 def settings(config: Config) -> Settings:
@@ -31,7 +34,7 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
     """The untrained models of all seeds, stacked. A seed gives the hybrid and its rivals the same parts."""
 
     def build(seed):
-        physics = guess(vehicle, _key(seed, PHYSICS), low=config.guess[0], high=config.guess[1])
+        physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
         network = _network(vehicle, config, _key(seed, NETWORK))
         return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
 
@@ -49,8 +52,7 @@ def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState,
 
 def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, Plan]:
     """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
-    pool = max(config.sizes)
-    subsets = [np.asarray(jax.random.permutation(_key(seed, SUBSET), pool)) for seed in range(config.seeds)]
+    subsets = [drawn(seed, config) for seed in range(config.seeds)]
     plans = [
         _plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size)
         for size in config.sizes
@@ -60,11 +62,51 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
     return _starts(lane(fields, seeds), seeds, ADAPTATION), stack(plans)
 
 
-def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> ResidualNetwork:
+def augmentation(
+    experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
+) -> tuple[FitState, Plan]:
+    """One lane a seed: the encoder of Expert Augmentation, on source flights as flown and as the expert flies them.
+
+    Args:
+        experts: the pre-trained hybrids of all seeds.
+        past: the heads of the source windows, which the encoder will read.
+    """
+
+    def build(expert, seed):
+        key = _key(seed, ENCODER)
+        return expert_augmented(expert, past, key, box=encoding.box, hidden=encoding.hidden)
+
+    seeds, size = np.arange(config.seeds), 2 * config.source_train
+    learners = jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(experts, seeds))
+    rule = encoding.stopping
+    plan = make_plan(
+        encoding.rate, np.arange(size), size, rule.minimum, rule.patience, config.max_epochs, encoding.weight
+    )
+    return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
+
+
+def drawn(seed: int, config: Config) -> np.ndarray:
+    """The order in which a seed takes its target trajectories from the pool."""
+    return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
+
+
+def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
+    if config.guess_off is None:
+        return guess(vehicle, key, low=config.guess[0], high=config.guess[1])
+    return guess_off(vehicle, key, config.guess_off)
+
+
+def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
     # Around hover, in tenths of it: then rotor speeds are of the size of the other inputs.
     hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
-    scaling = {"hover": hover, "raw": InputScaling()}[config.inputs]
-    return residual_network(STATE_SIZE, INPUT_SIZE, key, hidden=config.hidden, scaling=scaling)
+    return restricted(
+        key,
+        inputs=config.residual_inputs,
+        outputs=config.residual_outputs,
+        hidden=config.hidden,
+        norm=config.norm,
+        scaling={"hover": hover, "raw": InputScaling()}[config.inputs],
+    )
 
 
 def _pretraining_rule(model: str, config: Config) -> tuple[float, Stopping]:

@@ -8,7 +8,7 @@ from rich.console import Console
 
 from experiments import command
 from experiments.outcome import write_outcome
-from experiments.protocol import Config
+from experiments.protocol import AdaptationConfig
 from experiments.study import EVERY, study
 from hybrid_jax.sim.domain import EXTERNAL_FORCE
 from hybrid_jax.sim.flight import DT
@@ -18,7 +18,7 @@ from hybrid_jax.vehicle import IRIS
 NAME, TITLE = "external_force", "External force"
 
 
-def experiment(config: Config, console: Console) -> None:
+def experiment(config: AdaptationConfig, console: Console) -> None:
     """Run the protocol in the wind and write what came of it, beside the error that the wind's sine alone makes."""
     found = study(EXTERNAL_FORCE, IRIS, config, console)
     times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)

@@ -8,8 +8,9 @@ import numpy as np
 from rich.console import Console
 
 import hybrid_jax
-from experiments.protocol import Config
-from experiments.study import EVERY, Lanes, Study
+from experiments.protocol import AdaptationConfig
+from experiments.results import Lanes, save_models
+from experiments.study import EVERY, Study
 from hybrid_jax.claims import claims
 from hybrid_jax.environment import environment
 from hybrid_jax.figures import save_figure, scores, theta
@@ -23,7 +24,13 @@ PLACES = ("out", "cache")  # where files lie is not what was run
 
 
 def write_outcome(
-    experiment: str, title: str, domain: Domain, config: Config, found: Study, console: Console, floor: float = 0.0
+    experiment: str,
+    title: str,
+    domain: Domain,
+    config: AdaptationConfig,
+    found: Study,
+    console: Console,
+    floor: float = 0.0,
 ) -> Report:
     """Write figures, models and, last, the report; print its tables.
 
@@ -33,7 +40,7 @@ def write_outcome(
     out = config.out / experiment
     truth = hybrid_jax.rigid_body(domain.vehicle)
     truth_theta = {name: float(value) for name, value in truth.theta().items()}
-    save_models(out / "models", found)
+    save_models(out / "models", found.lanes, found.rows)
     report = Report(
         experiment=experiment,
         config={name: value for name, value in asdict(config).items() if name not in PLACES},
@@ -42,9 +49,7 @@ def write_outcome(
         claims=claims(found.rows, experiment, truth_theta),
         truth_theta=truth_theta,
         figures=draw(out, title, domain, config, found, truth_theta, floor),
-        notes=[f"Taken from the cache, with the seconds that they took when they ran: {', '.join(found.reused)}."]
-        if found.reused
-        else [],
+        notes=found.notes,
         extra={"flights": {"source": found.source.metadata, "target": found.target.metadata}}
         | ({FLOOR: floor} if floor else {}),
     )
@@ -53,20 +58,8 @@ def write_outcome(
     return report
 
 
-def save_models(folder: Path, found: Study) -> None:
-    """Every trained model, by name."""
-    by_key = {(row.model, row.mode, row.n_train, row.seed): row for row in found.rows}
-    for lanes in found.lanes:
-        for i, (size, seed) in enumerate(zip(lanes.sizes, lanes.seeds, strict=True)):
-            row = by_key[lanes.model, lanes.mode, size, seed]
-            about = {"model": row.model, "mode": row.mode, "n_train": row.n_train, "seed": row.seed}
-            about |= {"test_mse": row.test_mse, "val_mse": row.val_mse, "dt": DT}
-            name = f"{row.model}-{row.mode}-{row.n_train}-seed{row.seed}.npz"
-            hybrid_jax.save(folder / name, lanes.field(i), about)
-
-
 def draw(
-    out: Path, title: str, domain: Domain, config: Config, found: Study, truth: dict[str, float], floor: float
+    out: Path, title: str, domain: Domain, config: AdaptationConfig, found: Study, truth: dict[str, float], floor: float
 ) -> dict[str, str]:
     """Figs. 2/4, 3/5, 7 and the recovered parameters, as PNG and SVG; file → caption."""
     states, inputs = example(domain, config.data_seed)

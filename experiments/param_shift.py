@@ -7,7 +7,7 @@ from rich.console import Console
 
 from experiments import command
 from experiments.outcome import write_outcome
-from experiments.protocol import Config
+from experiments.protocol import AdaptationConfig
 from experiments.study import study
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.vehicle import IRIS
@@ -15,7 +15,7 @@ from hybrid_jax.vehicle import IRIS
 NAME, TITLE = "param_shift", "Parameter shift"
 
 
-def experiment(config: Config, console: Console) -> None:
+def experiment(config: AdaptationConfig, console: Console) -> None:
     """Run the protocol on the shifted vehicle and write what came of it."""
     found = study(PARAMETER_SHIFT, IRIS, config, console)
     write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())

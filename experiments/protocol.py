@@ -1,5 +1,6 @@
 """The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
@@ -50,11 +51,25 @@ class Patience:
 
 
 @dataclass(frozen=True)
-class Config:
-    """Pre-train on source flight, adapt to the target with N short trajectories, test; every seed and size one sweep.
+class Encoding:
+    """How Expert Augmentation learns to read θ_p off the past; the paper says no more than that it does."""
 
-    Without options this is the paper's full protocol. Results are written to --out; flights and finished stages are
-    kept in --cache and reused by any run that needs the same ones.
+    box: tuple[float, float] = (0.5, 2.0)
+    """θ_p of augmented flights: the source model's times a factor in this range, even in its logarithm."""
+    hidden: int = 128
+    """Units in each of the encoder's two hidden layers."""
+    rate: float = 1e-3
+    """Adam's learning rate."""
+    weight: float = 1.0
+    """Of the mean squared error of log θ̂_p beside the error of the prediction."""
+    stopping: Stopping = Stopping(50, 20)
+    """Early stopping, by the error of the prediction on source and augmented validation flights."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """What all experiments share. Without options this is the paper's full protocol. Results are written to --out;
+    flights and finished stages are kept in --cache and reused by any run that needs the same ones.
     """
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
@@ -67,26 +82,32 @@ class Config:
     """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
     sizes: tuple[int, ...] = TABLE_SIZES
     """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
-    models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
-    """Which models to compare."""
+    pool: int | None = None
+    """Target trajectories from which a seed draws its N; by default as many as the largest N."""
     source_train: int = 10_000
     """Source trajectories for pre-training."""
     validation: int = 1000
     """Validation trajectories, in the source and in the target."""
     test: int = 1000
-    """Target test trajectories of 1 s."""
+    """Target test trajectories."""
     data_seed: int = 0
     """Seed of all flights."""
-    source_flights: Path | None = None
-    """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
-    target_flights: Path | None = None
-    """The same for the target, with the splits train, validation and test."""
     hidden: int = 64
     """Hidden units of f_d."""
     inputs: Literal["hover", "raw"] = "hover"
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
+    norm: Literal["batch", "layer", "none"] = "batch"
+    """Normalisation of f_d's hidden layer."""
+    residual_inputs: Literal["all", "no_xy", "body"] = "all"
+    """What f_d sees of the state: all; all but p_x, p_y; or altitude and what the body feels, no yaw."""
+    residual_outputs: Literal["all", "accelerations"] = "all"
+    """What f_d adds to: all 13 derivatives, or v̇ and ω̇ alone."""
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
+    guess_off: float | None = None
+    """Instead: at nominal times or over 1 + this, each of θ_p at random."""
+    noise: float = 0.0
+    """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
     regulariser: RegulariserName = "trajectory_correlation"
     """What keeps f_d from overwriting f_p."""
     regulariser_weight: float = 1e-3
@@ -108,8 +129,12 @@ class Config:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least --batch-size {self.batch_size}, got {self.source_train}")
-        if len(set(self.sizes)) < len(self.sizes) or not self.models or len(set(self.models)) < len(self.models):
-            raise ValueError(f"--sizes and --models must each be different, got {self.sizes} and {self.models}")
+        if len(set(self.sizes)) < len(self.sizes):
+            raise ValueError(f"--sizes must be different, got {self.sizes}")
+        if self.pool is not None and self.pool < max(self.sizes):
+            raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
+        if self.noise < 0 or (self.guess_off is not None and self.guess_off <= 0):
+            raise ValueError(f"--noise must be >= 0, --guess-off > 0, got {self.noise} and {self.guess_off}")
         if not 0 < self.guess[0] < self.guess[1]:
             raise ValueError(f"--guess must be two factors, low < high, above 0, got {self.guess}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
@@ -117,13 +142,45 @@ class Config:
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
+    def pooled(self) -> int:
+        """The number of target trajectories from which a seed draws."""
+        return max(self.sizes) if self.pool is None else self.pool
+
+
+@dataclass(frozen=True)
+class AdaptationConfig(Config):
+    """Pre-train on source flight, adapt to the target with N short trajectories, test; all lanes are one sweep."""
+
+    models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
+    """Which models to compare."""
+    source_flights: Path | None = None
+    """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
+    target_flights: Path | None = None
+    """The same for the target, with the splits train, validation and test."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--models", self.models)
+        if "no_physics" in self.models and self.residual_outputs != "all":
+            raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
+
+
+def distinct(option: str, names: Sequence[str]) -> None:
+    """Check an option that lists names.
+
+    Raises:
+        ValueError: no names, or one twice.
+    """
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
 
 def column(size: int) -> int:
     """The column of the paper's table that is nearest to a size, by ratio."""
     return min(range(len(TABLE_SIZES)), key=lambda i: max(size / TABLE_SIZES[i], TABLE_SIZES[i] / size))
 
 
-PAPER = Config()
+PAPER = AdaptationConfig()
 QUICK = replace(
     PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=("hybrid", "no_physics"), source_train=3000,
     validation=300, test=300, max_epochs=400,

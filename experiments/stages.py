@@ -3,8 +3,9 @@
 import time
 from collections.abc import Callable
 from contextlib import AbstractContextManager
+from dataclasses import asdict
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from rich.console import Console
 
@@ -12,8 +13,9 @@ from experiments.progress import SweepLine, clock
 from hybrid_jax.archive import digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.datasets import Dataset, content_hash, versions
 from hybrid_jax.models import describe
+from hybrid_jax.objective import Prediction, Settings
 from hybrid_jax.sweep import Progress, sweep
-from hybrid_jax.training import FitState, Plan, Settings
+from hybrid_jax.training import FitState, Plan
 
 FORMAT = "hybrid_jax sweep 1"
 RECIPE = 1  # raise it when the same start, plan and data no longer give the same result
@@ -67,6 +69,11 @@ class Stages:
         self.seconds[name] = time.perf_counter() - began
         return result
 
+    def notes(self) -> list[str]:
+        """What a reader of the seconds must know."""
+        found = ", ".join(self.reused)
+        return [f"Taken from the cache, with the seconds that they took when they ran: {found}."] if found else []
+
     def _sweep(self, name, states, plans, settings, data: Dataset, keeper: "_Keeper") -> tuple[FitState, float]:
         with SweepLine(name, self._console) as line, keeper:
 
@@ -119,8 +126,13 @@ def _identity(states: FitState, plans: Plan, settings: Settings, data: Dataset) 
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
     shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
     # Leaves say nothing of what is static in a field: the vehicle, how inputs are scaled.
-    fixed = [RECIPE, *shared, describe(states.field), content_hash(data)]
+    fixed = [RECIPE, *shared, *_described(settings.objective), describe(states.field), content_hash(data)]
     return digest(fixed, named_leaves({"start": states, "plan": plans}))
+
+
+def _described(objective: Any) -> list[Any]:
+    """An objective of another kind than the default one, as JSON values."""
+    return [] if isinstance(objective, Prediction) else [type(objective).__name__, asdict(objective)]
 
 
 def _save(path: Path, name: str, states: FitState, seconds: float) -> None:

@@ -4,21 +4,20 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
 from rich.console import Console
 
 from experiments.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.make_flights import chosen_flights, flights
-from experiments.protocol import Config
+from experiments.protocol import AdaptationConfig, Config
+from experiments.results import Lanes, rows_of, trained
+from experiments.sensors import measured
 from experiments.stages import Stages
 from hybrid_jax.datasets import Dataset
-from hybrid_jax.lanes import lane
 from hybrid_jax.rows import Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import evaluate
-from hybrid_jax.training import STATUS_NAMES, STOPPED, FitState
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid
+from hybrid_jax.training import FitState
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
@@ -26,40 +25,18 @@ TESTED = ("source_only", "fine_tuned", "target_only")
 
 
 @dataclass(frozen=True)
-class Lanes:
-    """The trained lanes of one model in one mode.
-
-    Attributes:
-        sizes, seeds: of each lane.
-        final: stacked final states; `final.best` are the models.
-        errors: L^T_MSE of each lane on the test flights.
-    """
-
-    model: str
-    mode: str
-    sizes: Sequence[int]
-    seeds: Sequence[int]
-    final: FitState
-    errors: np.ndarray
-
-    def field(self, index: int) -> AbstractVectorField:
-        """The model of one lane."""
-        return lane(self.final.best, index)
-
-
-@dataclass(frozen=True)
 class Study:
-    """What an experiment found: the flights, every trained lane, the rows, seconds by stage."""
+    """What an experiment found: the flights, every trained lane, the rows, seconds by stage, and notes on these."""
 
     source: Dataset
     target: Dataset
     lanes: list[Lanes]
     rows: list[Row]
     seconds: dict[str, float] = field(default_factory=dict)
-    reused: list[str] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
 
 
-def study(domain: Domain, vehicle: Vehicle, config: Config, console: Console) -> Study:
+def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
     """Run the protocol on a target domain; finished stages come from the cache.
 
     Args:
@@ -69,16 +46,22 @@ def study(domain: Domain, vehicle: Vehicle, config: Config, console: Console) ->
 
     def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
         if file is not None:
-            return chosen_flights(file, of, splits)
-        return stages.timed(f"flights {of.name}", lambda: flights(of, splits, config.data_seed, config.cache))
+            return measured(chosen_flights(file, of, splits), config.noise, config.data_seed)
+        return flown(of, splits, config, stages)
 
     source = get(config.source_flights, SOURCE, source_splits(config))
     target = get(config.target_flights, domain, target_splits(config))
     lanes: list[Lanes] = []
     for model in config.models:
         lanes += _model_lanes(model, vehicle, config, stages, source, target)
-    rows = with_rho([row for group in lanes for row in rows_of(group)])
-    return Study(source, target, lanes, rows, stages.seconds, stages.reused)
+    rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
+    return Study(source, target, lanes, rows, stages.seconds, stages.notes())
+
+
+def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
+    """The flights of a domain, from the cache or the simulator, as sensors of the configured noise see them."""
+    found = stages.timed(f"flights {domain.name}", lambda: flights(domain, splits, config.data_seed, config.cache))
+    return measured(found, config.noise, config.data_seed)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
@@ -88,11 +71,12 @@ def source_splits(config: Config) -> dict[str, SplitSpec]:
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
     """What is flown in the target; the train split is the pool from which every seed draws."""
-    return {
-        "train": SplitSpec(max(config.sizes), 10),
-        "validation": SplitSpec(config.validation, 10),
-        "test": SplitSpec(config.test, 100),
-    }
+    return adaptation_splits(config) | {"test": SplitSpec(config.test, 100)}
+
+
+def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
+    """What is flown in the target to adapt to."""
+    return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
 def _model_lanes(
@@ -111,41 +95,17 @@ def _model_lanes(
 
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    sizes = (0,) if mode == "source_only" else config.sizes
     errors = stages.timed(
         f"test {mode} {model}", lambda: evaluate(final.best, target.splits["test"], EVERY, settings(config))
     )
-    seeds = range(config.seeds)
-    return Lanes(model, mode, [n for n in sizes for _ in seeds], [s for _ in sizes for s in seeds], final, errors)
+    return trained(model, mode, *places((0,) if mode == "source_only" else config.sizes, config), final, errors)
+
+
+def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:
+    """The size and the seed of each lane, in the order in which `conditions` makes them."""
+    return [n for n in sizes for _ in range(config.seeds)], [*range(config.seeds)] * len(sizes)
 
 
 def domain_name(dataset: Dataset) -> str:
     """Where a dataset was flown."""
     return str(dataset.config["domain"])
-
-
-def rows_of(lanes: Lanes) -> list[Row]:
-    """A row for each lane, ρ still open."""
-    final = lanes.final
-    return [
-        Row(
-            model=lanes.model,
-            mode=lanes.mode,
-            n_train=int(size),
-            seed=int(seed),
-            test_mse=float(lanes.errors[i]),
-            rho=None,
-            val_mse=float(final.best_mse[i]),
-            epochs=int(final.epoch[i]),
-            status=STATUS_NAMES.get(int(final.status[i]), STATUS_NAMES[STOPPED]),
-            theta=theta_of(lanes.field(i)),
-        )
-        for i, (size, seed) in enumerate(zip(lanes.sizes, lanes.seeds, strict=True))
-    ]
-
-
-def theta_of(field: AbstractVectorField) -> dict[str, float] | None:
-    """θ_p of a model that has physics."""
-    physics = field.physics if isinstance(field, Hybrid) else field
-    theta = getattr(physics, "theta", None)
-    return None if theta is None else {name: float(value) for name, value in theta().items()}

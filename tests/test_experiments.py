@@ -17,8 +17,8 @@ from hybrid_jax.report import load_report
 ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ("param_shift", "external_force")
 ROW = {
-    "model": str, "mode": str, "n_train": int, "seed": int, "test_mse": float, "rho": float, "val_mse": float,
-    "epochs": int, "status": str, "theta": dict | None,
+    "domain": str, "model": str, "mode": str, "n_train": int, "seed": int, "test_mse": float, "rho": float,
+    "val_mse": float, "epochs": int, "status": str, "theta": dict | None, "theta_interval": dict | None,
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from experiments.conditions import adaptation, fresh_fields, pretraining
-from experiments.protocol import PAPER, PRESETS, SMOKE, Config, column
+from experiments.protocol import PAPER, PRESETS, SMOKE, AdaptationConfig, column
 from hybrid_jax.lanes import lane
 from hybrid_jax.vector_field import Hybrid
 from hybrid_jax.vehicle import IRIS
@@ -40,7 +40,7 @@ def test_the_paper_preset_is_the_paper():
     assert (paper.source_train, paper.validation, paper.test) == (10_000, 1000, 1000)
     assert (paper.regulariser, paper.regulariser_weight, paper.solver) == ("trajectory_correlation", 1e-3, "rk4")
     assert paper.guess == (0.8, 1.25)
-    assert paper == Config()  # no preset means the paper
+    assert paper == AdaptationConfig()  # no preset means the paper
     assert all(preset.preset == name for name, preset in PRESETS.items())
 
 

@@ -1,0 +1,163 @@
+"""Table 2 and more (paper, Sec. 4.7): every method adapts the same source model, in both experiments.
+
+python -m experiments.comparison --help
+"""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, replace
+from typing import Any, get_args
+
+import numpy as np
+from rich.console import Console
+
+from experiments import command
+from experiments.conditions import augmentation, pretraining, settings
+from experiments.coverage import Config as CoverageConfig
+from experiments.coverage import CoverageRow, coverage
+from experiments.external_force import sine_floor
+from experiments.outcome import PLACES
+from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, distinct
+from experiments.results import Lanes, rows_of, save_models
+from experiments.rivals import METHODS, PAST, Case, Method, source_only
+from experiments.stages import Stages
+from experiments.study import adaptation_splits, flown, source_splits
+from hybrid_jax.claims import COMPARISON, claims
+from hybrid_jax.comparison_figures import standings
+from hybrid_jax.datasets import Dataset
+from hybrid_jax.environment import environment
+from hybrid_jax.expert_augmentation import Augmentation
+from hybrid_jax.figures import save_figure
+from hybrid_jax.report import FLOOR, Report, print_report, write_report
+from hybrid_jax.rigid_body import nominal
+from hybrid_jax.rows import SOURCE_OF, Row, with_rho
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.flight import DT
+from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.training import FitState
+from hybrid_jax.trajectories import split
+from hybrid_jax.vehicle import IRIS
+
+NAME, TITLE = COMPARISON, "Adapting with 100 trajectories, tested over 0.1 s"
+DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+
+
+@dataclass(frozen=True)
+class ComparisonConfig(Config):
+    """Adapt one pre-trained model by every method with N trajectories; test on 10 steps of 0.01 s after 10 of past."""
+
+    sizes: tuple[int, ...] = (100,)
+    """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
+    pool: int | None = 1000
+    """Target trajectories from which a seed draws its N."""
+    methods: tuple[Method, ...] = get_args(Method)
+    """Which methods to compare."""
+    encoding: Encoding = field(default_factory=Encoding)
+    repeats: int = 100
+    """Recordings of the simulation that checks the intervals of θ_p; see `python -m experiments.coverage`."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--methods", self.methods)
+
+
+def preset(like: Config, **changes: Any) -> ComparisonConfig:
+    """The preset of the other experiments, for this one."""
+    shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
+    return ComparisonConfig(**shared | changes)
+
+
+PRESETS = {
+    "paper": ComparisonConfig(),
+    "quick": preset(QUICK, encoding=Encoding(stopping=Stopping(20, 10))),
+    "smoke": preset(SMOKE, sizes=(20,), pool=20, encoding=Encoding(hidden=8), repeats=4),
+}
+
+
+def experiment(config: ComparisonConfig, console: Console) -> None:
+    """Run all methods in both domains and write what came of it."""
+    stages = Stages(config.cache / "sweeps", console)
+    pretrained, experts = source_models(config, stages)
+    out, rows, datasets = config.out / NAME, list[Row](), dict[str, Any]()
+    for domain in DOMAINS:
+        target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
+        lanes = compared(Case(config, stages, pretrained, experts, target), config.methods)
+        found = with_rho([row for group in lanes for row in rows_of(group, domain.name)])
+        save_models(out / "models" / domain.name, lanes, found)
+        rows, datasets = rows + found, datasets | {domain.name: target.metadata}
+    covered = stages.timed(
+        "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]))
+    )
+    write(config, rows, stages, datasets, covered)
+
+
+def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, FitState], FitState | None]:
+    """What is pre-trained on the source: a model for each method that starts from one, and the experts."""
+    source = flown(SOURCE, source_splits(config), config, stages)
+    models = dict.fromkeys(["hybrid", *(SOURCE_OF.get(method, method) for method in config.methods)])
+    pretrained = {
+        model: stages.run(f"pre-training {model}", *pretraining(model, IRIS, config), settings(config), source)
+        for model in models
+    }
+    if "expert_augmentation" not in config.methods:
+        return pretrained, None
+    with_past = past_splits(train=config.source_train, validation=config.validation)
+    longer = flown(SOURCE, with_past, config, stages)
+    renamed = Dataset({name.removesuffix("_with_past"): longer.splits[name] for name in with_past}, longer.metadata)
+    past, _ = split(renamed.splits["train"], PAST)
+    learning = replace(settings(config), objective=Augmentation(PAST))
+    lanes = augmentation(pretrained["hybrid"].best, past, config.encoding, config)
+    return pretrained, stages.run("expert augmentation", *lanes, learning, renamed)
+
+
+def past_splits(**windows: int) -> dict[str, SplitSpec]:
+    """Splits whose windows begin with the past that an encoder reads: `train=1000` makes `train_with_past`."""
+    return {f"{name}_with_past": SplitSpec(count, 2 * PAST) for name, count in windows.items()}
+
+
+def compared(case: Case, methods: Sequence[Method]) -> list[Lanes]:
+    """Every source model as it is, then every method, tested in one domain."""
+    return [source_only(model)(case) for model in case.pretrained] + [METHODS[name](case, name) for name in methods]
+
+
+def write(
+    config: ComparisonConfig, rows: list[Row], stages: Stages, flights: dict[str, Any], covered: list[CoverageRow]
+) -> None:
+    """The figure, the report and, in the terminal, its tables."""
+    out = config.out / NAME
+    seen = DT * np.arange(1, PAST + 1)
+    floor = sine_floor(IRIS.mass, seen)
+    save_figure(standings(rows, TITLE, {EXTERNAL_FORCE.name: floor}), out / "standings")
+    report = Report(
+        experiment=NAME,
+        config={name: value for name, value in asdict(config).items() if name not in PLACES},
+        environment=environment(stages.seconds),
+        rows=rows,
+        claims=claims(rows, NAME, None),
+        truth_theta={domain.name: nominal(domain.vehicle) for domain in DOMAINS},
+        figures={"standings.png": "Test errors of all seeds of every method (paper, Table 2)"},
+        notes=[*stages.notes(), *coverage_notes(covered)],
+        extra={"flights": flights, "coverage": [asdict(row) for row in covered], FLOOR: floor},
+    )
+    write_report(out, report)
+    print_report(Console(), report)
+
+
+def coverage_notes(covered: Sequence[CoverageRow]) -> list[str]:
+    """How often the 95 % intervals of θ_p held the truth in simulation."""
+    by_case: dict[tuple[str, str], list[str]] = {}
+    for row in covered:
+        by_case.setdefault((row.case, row.noise_on), []).append(f"{row.parameter} {row.coverage:.0%}")
+    return [
+        f"95 % intervals of θ_p held the truth, {case}, noise on {where}: {', '.join(words)}."
+        for (case, where), words in by_case.items()
+    ]
+
+
+def main() -> None:
+    """The command line."""
+    about = "Nine ways to adapt to ten seconds of flight, in both experiments (Table 2)."
+    command.run(NAME, about, experiment, presets=PRESETS)
+
+
+if __name__ == "__main__":
+    main()

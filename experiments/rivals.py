@@ -1,0 +1,196 @@
+"""The methods of Table 2 and more, each a function from what it may use to its trained and tested lanes."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.conditions import adaptation, drawn, settings
+from experiments.protocol import Config
+from experiments.results import Lanes, theta_of, trained
+from experiments.stages import Stages
+from experiments.study import domain_name, places
+from hybrid_jax import linear_adaptation
+from hybrid_jax.datasets import Dataset
+from hybrid_jax.expert_augmentation import prediction_mse
+from hybrid_jax.lanes import lane, stack
+from hybrid_jax.least_squares import fit_physics, physics_of
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.rigid_body import RigidBody
+from hybrid_jax.sweep import evaluate
+from hybrid_jax.training import CAPPED, DIVERGED, STOPPED, FitState
+from hybrid_jax.trajectories import Trajectories, split
+from hybrid_jax.uncertainty import intervals, physics_covariance
+from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid
+
+PAST = 10  # intervals of a test window before the ones to predict
+Method = Literal[
+    "hybrid", "no_physics", "physics_only", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer",
+    "least_squares", "linear_residual",
+]  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Case:
+    """What a method may use in one target domain.
+
+    Attributes:
+        pretrained: by model, the final states of its pre-training, one lane a seed.
+        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation takes part.
+        target: splits train (the pool), validation and test_with_past.
+    """
+
+    config: Config
+    stages: Stages
+    pretrained: Mapping[str, FitState]
+    experts: FitState | None
+    target: Dataset
+
+    @property
+    def name(self) -> str:
+        """The target domain."""
+        return domain_name(self.target)
+
+    def tested(self, name: str, fields: Any) -> np.ndarray:
+        """L^T_MSE of stacked fields on the steps after the past."""
+        _, future = split(self.target.splits["test_with_past"], PAST)
+        return self.stages.timed(f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)))
+
+
+def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field: field) -> Callable[[Case, str], Lanes]:
+    """Fine-tuning by Adam of what `mark` does not freeze of a pre-trained model."""
+
+    def method(case: Case, name: str) -> Lanes:
+        config = case.config
+        starts, plans = adaptation(model, "fine_tuned", mark(case.pretrained[model].best), config)
+        final = case.stages.run(f"fine_tuned {name} {case.name}", starts, plans, settings(config), case.target)
+        lanes = trained(name, "fine_tuned", *places(config.sizes, config), final, np.zeros(0))
+        return with_intervals(case, replace(lanes, errors=case.tested(name, lanes.fields)))
+
+    return method
+
+
+class Solved:
+    """Adaptation in closed form, or nearly: `solve(field, train, validation, settings) → (field, steps, status)`."""
+
+    def __init__(self, solve: Callable[..., tuple[AbstractVectorField, Any, Any]]):
+        self._solve = solve
+
+    def __call__(self, case: Case, name: str) -> Lanes:
+        config, shared = case.config, settings(case.config)
+
+        def one(lane, pool: Trajectories, validation: Trajectories):
+            field, subset = lane
+            field, steps, status = self._solve(field, pool[subset], validation, shared)
+            return field, deployed_mse(field, validation, solver=shared.solver), jnp.asarray(steps), jnp.asarray(status)
+
+        def solve(size: int):
+            lanes = (case.pretrained["hybrid"].best, _subsets(size, config))
+            return by_lane(one, lanes, case.target.splits["train"], case.target.splits["validation"])
+
+        def work():
+            return jax.tree.map(lambda *parts: np.concatenate(parts), *map(solve, config.sizes))
+
+        fields, val_mse, steps, status = case.stages.timed(f"fine_tuned {name} {case.name}", work)
+        found = (case.tested(name, fields), val_mse, steps, status, theta_of(physics_in(fields)))
+        return with_intervals(case, Lanes(name, "fine_tuned", *places(config.sizes, config), fields, *found))
+
+
+def source_only(model: str) -> Callable[[Case], Lanes]:
+    """The pre-trained model as it is."""
+
+    def method(case: Case) -> Lanes:
+        final = case.pretrained[model]
+        errors = case.tested(f"source_only {model}", final.best)
+        return trained(model, "source_only", *places((0,), case.config), final, errors)
+
+    return method
+
+
+def augmented(case: Case, name: str) -> Lanes:
+    """Expert Augmentation: θ_p of each test window is read off its past; no target data are learned from."""
+    assert case.experts is not None
+    solver = settings(case.config).solver
+    windows = case.target.splits["test_with_past"]
+
+    def one(model, windows: Trajectories):
+        past, _ = split(windows, PAST)
+        typical = jnp.mean(jax.lax.map(model.estimate, past, batch_size=min(250, len(past))), axis=0)
+        return prediction_mse(model, windows, PAST, solver), physics_of(model.flying(typical))
+
+    experts = case.experts
+    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: by_lane(one, experts.best, windows))
+    lanes = trained(name, "source_only", *places((0,), case.config), experts, errors)
+    return replace(lanes, theta=theta_of(physics))
+
+
+def with_intervals(case: Case, lanes: Lanes) -> Lanes:
+    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p was adapted."""
+    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in ("theta_d_only", *CLOSED_FORM):
+        return lanes
+    solver = settings(case.config).solver
+
+    def one(lane, pool: Trajectories):
+        field, subset = lane
+        found = intervals(field, physics_covariance(field, pool[subset], solver=solver))
+        return {name: jnp.stack([interval.low, interval.high]) for name, interval in found.items()}
+
+    def of_size(index: int, size: int):
+        seeds = case.config.seeds
+        fields = lane(lanes.fields, np.arange(index * seeds, (index + 1) * seeds))
+        return by_lane(one, (fields, _subsets(size, case.config)), case.target.splits["train"])
+
+    parts = case.stages.timed(
+        f"intervals {lanes.model} {case.name}",
+        lambda: [of_size(index, size) for index, size in enumerate(case.config.sizes)],
+    )
+    return replace(lanes, intervals=jax.tree.map(lambda *ends: np.concatenate(ends), *parts))
+
+
+def physics_in(field: Any) -> Any:
+    """The physics inside a field, hybrids of hybrids included."""
+    return physics_in(field.physics) if isinstance(field, Hybrid) else field
+
+
+def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
+    """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
+    # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
+    run = eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
+    return jax.device_get(run(lanes, shared))
+
+
+def _subsets(size: int, config: Config) -> np.ndarray:
+    return stack([drawn(seed, config)[:size] for seed in range(config.seeds)])
+
+
+def _ridge(method) -> Solved:
+    def solve(field, train, validation, shared):
+        return linear_adaptation.adapted(method, field, train, validation, solver=shared.solver).field, 0, STOPPED
+
+    return Solved(solve)
+
+
+def _least_squares(field, train, validation, shared):
+    found = fit_physics(field, train, shared.solver)
+    status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
+    return found.field, found.steps, status
+
+
+CLOSED_FORM = {
+    "last_layer": _ridge(linear_adaptation.last_layer),
+    "linear_residual": _ridge(linear_adaptation.linear_residual),
+}
+METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
+    "hybrid": tuned("hybrid"),
+    "no_physics": tuned("no_physics"),
+    "physics_only": tuned("physics_only"),
+    "expert_augmentation": augmented,
+    "theta_p_only": tuned("hybrid", lambda field: Hybrid(field.physics, Frozen(field.residual))),
+    "theta_d_only": tuned("hybrid", lambda field: Hybrid(Frozen(field.physics), field.residual)),
+    "least_squares": Solved(_least_squares),
+    **CLOSED_FORM,
+}
