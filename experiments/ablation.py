@@ -1,0 +1,183 @@
+"""What the method rests on: one choice at a time is changed, everything else stays, ten seeds each.
+
+python -m experiments.ablation --help
+"""
+
+import json
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal, get_args
+
+import numpy as np
+from rich.console import Console
+
+from experiments import command
+from experiments.conditions import adaptation, pretraining, settings
+from experiments.external_force import sine_floor
+from experiments.outcome import PLACES
+from experiments.protocol import QUICK, SMOKE, Config, distinct
+from experiments.results import Lanes, rows_of, trained
+from experiments.stages import Stages
+from experiments.study import EVERY, flown, places, source_splits, target_splits
+from hybrid_jax.ablations import Trial, by_choice, figure, records, tables, to_csv
+from hybrid_jax.environment import environment
+from hybrid_jax.figures import save_figure
+from hybrid_jax.files import json_text, json_value, write_whole
+from hybrid_jax.loss import REGULARISERS
+from hybrid_jax.report import print_tables
+from hybrid_jax.report_page import sections
+from hybrid_jax.rigid_body import nominal
+from hybrid_jax.rows import Row, with_rho
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.flight import DT
+from hybrid_jax.sweep import evaluate
+from hybrid_jax.training import FitState
+from hybrid_jax.vehicle import IRIS
+
+NAME = "ablation"
+DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
+
+
+@dataclass(frozen=True)
+class AblationConfig(Config):
+    """Change one choice of the hybrid at a time; pre-train, fine-tune, test in both experiments.
+
+    Without options: 3000 source trajectories, a third of the paper's, at most 400 epochs, and N = 100.
+    """
+
+    over: tuple[Choice, ...] = get_args(Choice)
+    """Which choices to change. residual: what f_d sees and adds to. weight: λ. form: of the regulariser. norm: of f_d.
+    start: θ_p off by 20, 50, 100 %. source: amount of source flight. noise: of the sensors. solver: the integrator."""
+    sizes: tuple[int, ...] = (100,)
+    """N, target trajectories to adapt to."""
+    pool: int | None = 1000
+    """Target trajectories from which a seed draws its N."""
+    source_train: int = 3000
+    """Source trajectories for pre-training."""
+    max_epochs: int = 400
+    """Cap, in pre-training and in fine-tuning."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--over", self.over)
+
+
+def preset(like: Config, **changes: Any) -> AblationConfig:
+    """The preset of the other experiments, for this one."""
+    kept = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
+    return AblationConfig(**kept | changes)
+
+
+PRESETS = {
+    "paper": AblationConfig(),
+    "quick": preset(QUICK, over=("residual",)),
+    "smoke": preset(SMOKE, over=("weight", "noise"), sizes=(20,), pool=20),
+}
+
+
+def variations(choice: str, config: Config) -> dict[str, dict[str, Any]]:
+    """Name of each value of a choice → the options that differ from the configuration; none for the default."""
+    match choice:
+        case "residual":
+            seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
+            added = {"all": "all 13", "accelerations": "v̇, ω̇"}
+            return {
+                f"{seen[i]} → {added[o]}": {"residual_inputs": i, "residual_outputs": o} for o in added for i in seen
+            }
+        case "weight":
+            return {f"λ = {weight:g}": {"regulariser_weight": weight} for weight in (0.0, 1e-4, 1e-3, 1e-2, 1e-1)}
+        case "form":
+            return {form.replace("_", " "): {"regulariser": form} for form in (*REGULARISERS, "none")}
+        case "norm":
+            return {norm: {"norm": norm} for norm in ("batch", "layer", "none")}
+        case "start":
+            factors = f"random in {config.guess[0]:g} to {config.guess[1]:g}"
+            return {factors: {}} | {f"off by {off:.0%}": {"guess_off": off} for off in (0.2, 0.5, 1.0)}
+        case "source":
+            sizes = [n for n in (300, 1000, 3000, 10_000) if n <= config.source_train]
+            return {f"{n} trajectories": {"source_train": n} for n in sizes}
+        case "noise":
+            return {f"{level:g} × typical": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)}
+        case _:
+            return {solver: {"solver": solver} for solver in ("rk4", "heun", "tsit5")}
+
+
+def experiment(config: AblationConfig, console: Console) -> None:
+    """Run every value of every choice and write what came of it, after each choice."""
+    stages = Stages(config.cache / "sweeps", console)
+    trials: list[Trial] = []
+    for choice in config.over:
+        for value, changes in variations(choice, config).items():
+            console.print(f"{choice}: {value}", style="bold", highlight=False)
+            trials.append(tried(choice, value, replace(config, **changes), config, stages))
+        write(config, trials, stages)
+    print_tables(Console(), tables(trials, truth()))
+
+
+def tried(choice: str, value: str, config: AblationConfig, default: AblationConfig, stages: Stages) -> Trial:
+    """The hybrid, pre-trained and fine-tuned under a changed configuration."""
+    source = flown(SOURCE, source_splits(config), config, stages)
+    shared = settings(config)
+    pretrained = stages.run("pre-training hybrid", *pretraining("hybrid", IRIS, config), shared, source)
+    rows: list[Row] = []
+    for domain in DOMAINS:
+        target = flown(domain, target_splits(config), config, stages)
+        starts = adaptation("hybrid", "fine_tuned", pretrained.best, config)
+        final = stages.run(f"fine_tuned hybrid {domain.name}", *starts, shared, target)
+
+        def lanes(mode: str, sizes, found: FitState, target=target) -> Lanes:
+            errors = evaluate(found.best, target.splits["test"], EVERY, shared)
+            return trained("hybrid", mode, *places(sizes, config), found, errors)
+
+        both = (lanes("source_only", (0,), pretrained), lanes("fine_tuned", config.sizes, final))
+        rows += with_rho([row for group in both for row in rows_of(group, domain.name)])
+    return Trial(choice, value, config == default, [float(mse) for mse in pretrained.best_mse], rows)
+
+
+def truth() -> dict[str, dict[str, float]]:
+    """The true θ_p of each domain."""
+    return {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
+
+
+def write(config: AblationConfig, trials: list[Trial], stages: Stages) -> None:
+    """All that is known so far: the figure of each choice, report.json, rows.csv, report.md."""
+    out = config.out / NAME
+    floors = {EXTERNAL_FORCE.name: sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))}
+    captions = {}
+    for choice, group in by_choice(trials).items():
+        save_figure(
+            figure(group, f"{choice.capitalize()}: test error over 1 s after fine-tuning", floors), out / choice
+        )
+        captions[f"{choice}.png"] = f"Test errors of all seeds, by {choice}"
+    used = {name: value for name, value in asdict(config).items() if name not in PLACES}
+    where = environment(stages.seconds)
+    record = {
+        "experiment": NAME,
+        "config": used,
+        "environment": where,
+        "rows": records(trials),
+        "claims": [],
+        "figures": captions,
+        "notes": stages.notes(),
+    }
+    page = sections(
+        f"# {NAME}",
+        tables(trials, truth()),
+        captions,
+        stages.notes(),
+        json_value(where),
+        json.dumps(json_value(used), indent=1, ensure_ascii=False),
+    )
+    contents = {"rows.csv": to_csv(trials), "report.md": page, "report.json": json_text(json_value(record))}
+    for name, content in contents.items():
+        write_whole(out / name, content.encode())
+
+
+def main() -> None:
+    """The command line."""
+    about = "What matters, what does not, and where the method breaks."
+    command.run(NAME, about, experiment, presets=PRESETS)
+
+
+if __name__ == "__main__":
+    main()
