@@ -99,23 +99,24 @@ def to_csv(trials: Sequence[Trial]) -> str:
 
 
 def _table(choice: str, trials: Sequence[Trial], truth: Mapping[str, Mapping[str, float]]) -> Table:
-    domains = list(by_domain(trials[0].rows))
-    columns = [(domain, n) for domain in domains for n in sorted({row.n_train for row in trials[0].rows})]
-    header = [choice, "source, validation"]
-    for domain, n in columns:
-        header += [f"{NAMES[domain]}, N = {n}" if n else f"{NAMES[domain]}, source-only"]
-        header += ["off in Ix, Iy, k [%]"] if n else []
-    lines = [_line_of(trial, columns, truth) for trial in trials]
+    """A line for each value, domain and N."""
+    groups = by_domain(trials[0].rows).items()
+    cells = [(domain, n) for domain, group in groups for n in sorted({row.n_train for row in group} - {0})]
+    lines = [_line_of(trial, *cell, truth[cell[0]]) for cell in cells for trial in trials]
+    header = ("target, N", choice, "source, validation", "source-only", "fine-tuned", "off in Ix, Iy, k [%]")
     return Table(f"{choice.capitalize()} (L_MSE, {over_seeds(trials[0].rows)}; less is better)", header, lines)
 
 
-def _line_of(trial: Trial, columns, truth: Mapping[str, Mapping[str, float]]) -> list[str]:
-    cells = [trial.name, error_text(spread(trial.source_mse))]
-    for domain, n in columns:
-        group = [row for row in trial.rows if (row.domain, row.n_train) == (domain, n)]
-        cells += [error_text(spread([row.error for row in group]))]
-        cells += [", ".join(_bias(group, name, value) for name, value in truth[domain].items())] if n else []
-    return cells
+def _line_of(trial: Trial, domain: str, n: int, truth: Mapping[str, float]) -> list[str]:
+    tuned, untuned = ([row for row in trial.rows if (row.domain, row.n_train) == (domain, size)] for size in (n, 0))
+    return [
+        f"{NAMES[domain]}, {n}",
+        trial.name,
+        error_text(spread(trial.source_mse)),
+        error_text(spread([row.error for row in untuned])),
+        error_text(spread([row.error for row in tuned])),
+        ", ".join(_bias(tuned, name, value) for name, value in truth.items()),
+    ]
 
 
 def _bias(rows: Sequence[Row], name: str, truth: float) -> str:

@@ -85,23 +85,26 @@ def _infinite(sign: str, values: Spread, median: str) -> str:
     return f"{sign} ({values.non_finite} of {values.count} seeds not finite, median {median})"
 
 
-def _theta_text(rows: Sequence[Row], name: str) -> str:
-    """0.0398 ± 0.0004, 95 % ± 0.0006: the spread over seeds, then the seeds' own intervals where they have any."""
+def _theta_text(rows: Sequence[Row], name: str, truth: float | None) -> str:
+    """0.0398 ± 0.0004, 95 % ± 0.0006 (7 of 10 true): the spread over seeds, then the seeds' own intervals if any."""
     given = [row.theta[name] for row in rows if row.theta is not None]
     values = spread([math.inf if value is None else value for value in given])
     if values.non_finite:
         return f"not finite in {values.non_finite} of {values.count} seeds"
     text = f"{values.mean:.4g}" + ("" if math.isnan(values.std) else f" ± {values.std:.2g}")
     intervals = [row.theta_interval[name] for row in rows if row.theta_interval is not None]
-    return f"{text}, {_interval_text(intervals)}" if intervals else text
+    return f"{text}, {_interval_text(intervals, truth)}" if intervals else text
 
 
-def _interval_text(intervals: Sequence[Any]) -> str:
-    halves = [(high - low) / 2 for low, high in filter(None, intervals)]
-    if not halves:
+def _interval_text(intervals: Sequence[Any], truth: float | None) -> str:
+    finite = [interval for interval in intervals if interval]
+    if not finite:
         return "95 % interval not finite"
-    some = "" if len(halves) == len(intervals) else f" in {len(halves)} of {len(intervals)} seeds"
-    return f"95 % ± {spread(halves).mean:.2g}{some}"
+    some = "" if len(finite) == len(intervals) else f" in {len(finite)} of {len(intervals)} seeds"
+    text = f"95 % ± {spread([(high - low) / 2 for low, high in finite]).mean:.2g}{some}"
+    if truth is None:
+        return text
+    return f"{text} ({sum(low <= truth <= high for low, high in finite)} of {len(intervals)} true)"
 
 
 def _places(rows: Sequence[Row]) -> list[tuple[str, list[Row]]]:
@@ -123,14 +126,17 @@ def _headline(rows: Sequence[Row], place: str) -> list[Table]:
 
 def _parameters(rows: Sequence[Row], place: str, truth: Mapping[str, float] | None) -> Table:
     lines = [
-        (NAMES[model], NAMES[mode], str(n) if n else "–", *(_theta_text(group, name) for name in THETA))
+        (
+            *(NAMES[model], NAMES[mode], str(n) if n else "–"),
+            *(_theta_text(group, name, None if truth is None else truth[name]) for name in THETA),
+        )
         for (model, mode, n), group in grouped(rows).items()
     ]
     if truth is not None:
         lines.append(("truth", "", "", *(f"{truth[name]:.5g}" for name in THETA)))
     units = ("Ix [kg m²]", "Iy [kg m²]", "k [N/(rad/s)²]")
     given = any(row.theta_interval is not None for row in rows)
-    of = f" ({over_seeds(rows)}; 95 %: mean half-width of a seed's own interval)" if given else ""
+    of = f" ({over_seeds(rows)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
     return Table(f"Recovered physical parameters θ_p{place}{of}", ("model", "mode", "N", *units), lines)
 
 

@@ -11,7 +11,8 @@ from hypothesis import strategies as st
 from test_report import ODD_ROWS, SIZES, TRUTH, changed, make_rows
 from test_standings import compared_rows, spoilt
 
-from hybrid_jax.comparison_figures import REACH, standings
+from hybrid_jax.comparison_figures import standings
+from hybrid_jax.error_panels import REACH
 from hybrid_jax.figures import COLOURS, save_figure, scores, theta
 from hybrid_jax.flight_figures import example_flight, predictions, tilt
 

@@ -270,12 +270,14 @@ def test_parameters_stand_with_the_spread_over_seeds_and_the_width_of_their_inte
     ]
     some = [replace(rows[0], theta_interval=dict.fromkeys(THETA)), *rows[1:]]
     for some_rows, cell in (
-        (rows, "0.0398 ± 0.0004, 95 % ± 0.0006"),
-        (some, "0.0398 ± 0.0004, 95 % ± 0.0006 in 2 of 3 seeds"),
+        (rows, "0.0398 ± 0.0004, 95 % ± 0.0006 (3 of 3 true)"),
+        (some, "0.0398 ± 0.0004, 95 % ± 0.0006 in 2 of 3 seeds (2 of 3 true)"),
     ):
         (table,) = parameters(some_rows, TRUTH)
         assert table.lines[0][3] == cell
         assert table.lines[0][4] == "0.02 ± 0, 95 % interval not finite"
+        (untold,) = parameters(some_rows, None)
+        assert untold.lines[0][3] == cell.partition(" (")[0]
         assert table.lines[-1][:1] + table.lines[-1][3:] == ("truth", "0.04", "0.02", "8.5e-06")
 
 

@@ -1,0 +1,73 @@
+"""The comparison from its command line, in the smallest preset: what each method leaves alone, and the report."""
+
+import json
+
+import equinox as eqx
+import numpy as np
+import pytest
+from test_experiments import ROW, command, refused
+
+import hybrid_jax
+from hybrid_jax.report import load_report
+
+METHODS = ("hybrid", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares")
+DOMAINS = ("parameter_shift", "external_force")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Left by one run of the methods that share the pre-trained hybrid."""
+    folder = tmp_path_factory.mktemp("comparison")
+    run = command("comparison", "--methods", *METHODS, "--repeats", "2", folder=folder)
+    assert run.returncode == 0, run.stderr
+    assert "Table" not in run.stderr
+    assert "Expert Augmentation" in run.stdout
+    return folder / "out" / "comparison"
+
+
+def field(folder, domain, model, mode="fine_tuned", n=20):
+    return hybrid_jax.load(folder / "models" / domain / f"{model}-{mode}-{n}-seed0.npz").field
+
+
+def test_the_report_keeps_its_contract(folder):
+    report = json.loads((folder / "report.json").read_text())
+    assert {(row["domain"], row["model"], row["mode"]) for row in report["rows"]} == {
+        (domain, model, "source_only" if model == "expert_augmentation" else "fine_tuned")
+        for domain in DOMAINS
+        for model in METHODS
+    } | {(domain, "hybrid", "source_only") for domain in DOMAINS}
+    for row in report["rows"]:
+        assert set(row) == set(ROW)
+        assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
+    assert [claim["id"] for claim in report["claims"] + report["not_judged"]] == ["C9"]
+    assert len(report["coverage"]) == 12  # two truths, noise on two sets of states, three parameters
+    assert (folder / "standings.png").read_bytes().startswith(b"\x89PNG")
+    load_report(folder)
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
+    source = field(folder, domain, "hybrid", "source_only", 0)
+    for model in ("theta_p_only", "least_squares"):
+        adapted = field(folder, domain, model)
+        assert eqx.tree_equal(adapted.residual, source.residual)
+        assert not eqx.tree_equal(adapted.physics, source.physics)
+    only_network, last = (field(folder, domain, model) for model in ("theta_d_only", "last_layer"))
+    for adapted in (only_network, last):
+        assert eqx.tree_equal(adapted.physics, source.physics)
+        assert not eqx.tree_equal(adapted.residual, source.residual)
+    np.testing.assert_array_equal(last.residual.weight_in, source.residual.weight_in)
+    assert eqx.tree_equal(field(folder, domain, "expert_augmentation", "source_only", 0).expert.field, source)
+
+
+def test_intervals_stand_around_what_was_fitted(folder):
+    for row in json.loads((folder / "report.json").read_text())["rows"]:
+        adapted = row["mode"] == "fine_tuned" and row["model"] not in ("theta_d_only", "last_layer")
+        assert (row["theta_interval"] is not None) == adapted
+        for name, (low, high) in (row["theta_interval"] or {}).items():
+            assert low < row["theta"][name] < high
+
+
+def test_a_method_twice_is_refused(tmp_path):
+    run = command("comparison", "--methods", "hybrid", "hybrid", folder=tmp_path)
+    assert "--methods must be at least one, each different" in refused(run, "comparison")
