@@ -78,10 +78,8 @@ def augmentation(
 
     seeds, size = np.arange(config.seeds), 2 * config.source_train
     learners = jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(experts, seeds))
-    rule = encoding.stopping
-    plan = make_plan(
-        encoding.rate, np.arange(size), size, rule.minimum, rule.patience, config.max_epochs, encoding.weight
-    )
+    rule, cap = encoding.stopping, min(encoding.max_epochs, config.max_epochs)
+    plan = make_plan(encoding.rate, np.arange(size), size, rule.minimum, rule.patience, cap, encoding.weight)
     return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
 
 

@@ -62,8 +62,10 @@ class Encoding:
     """Adam's learning rate."""
     weight: float = 1.0
     """Of the mean squared error of log θ̂_p beside the error of the prediction."""
-    stopping: Stopping = Stopping(50, 20)
+    stopping: Stopping = Stopping(100, 60)
     """Early stopping, by the error of the prediction on source and augmented validation flights."""
+    max_epochs: int = 400
+    """Cap on the encoder's epochs."""
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from hybrid_jax.lanes import lane
 from hybrid_jax.rows import Row
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.training import STATUS_NAMES, STOPPED, FitState
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid, thaw
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 
 
 @dataclass(frozen=True)
@@ -50,9 +50,8 @@ def trained(
     model: str, mode: str, sizes: Sequence[int], seeds: Sequence[int], final: FitState, errors: np.ndarray
 ) -> Lanes:
     """The lanes of a sweep, tested as the best of their final states."""
-    best = thaw(final.best)
     fit = (np.asarray(leaf) for leaf in (final.best_mse, final.epoch, final.status))
-    return Lanes(model, mode, sizes, seeds, best, errors, *fit, theta=theta_of(best))
+    return Lanes(model, mode, sizes, seeds, final.best, errors, *fit, theta=theta_of(final.best))
 
 
 def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray] | None:

@@ -25,7 +25,7 @@ from hybrid_jax.sweep import evaluate
 from hybrid_jax.training import CAPPED, DIVERGED, STOPPED, FitState
 from hybrid_jax.trajectories import Trajectories, split
 from hybrid_jax.uncertainty import intervals, physics_covariance
-from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid
+from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, thaw
 
 PAST = 10  # intervals of a test window before the ones to predict
 Method = Literal[
@@ -68,8 +68,9 @@ def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field:
         config = case.config
         starts, plans = adaptation(model, "fine_tuned", mark(case.pretrained[model].best), config)
         final = case.stages.run(f"fine_tuned {name} {case.name}", starts, plans, settings(config), case.target)
-        lanes = trained(name, "fine_tuned", *places(config.sizes, config), final, np.zeros(0))
-        return with_intervals(case, replace(lanes, errors=case.tested(name, lanes.fields)))
+        whole = eqx.tree_at(lambda state: state.best, final, thaw(final.best))
+        errors = case.tested(name, whole.best)
+        return with_intervals(case, trained(name, "fine_tuned", *places(config.sizes, config), whole, errors))
 
     return method
 

@@ -1,4 +1,16 @@
-"""Hybrid models of vehicles: ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d), learned from flight, adapted from seconds of it."""
+"""Hybrid models of vehicles: ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d), learned from flight, adapted from seconds of it.
+
+Imports point down; simulator and learning meet in `experiments` only. From the bottom:
+
+- state, rotation, vehicle, trajectories: what flies, and its windows.
+- vector_field, rigid_body, residual, features: ẋ = f(x, u).
+- rollout, loss, metrics, objective, training: one training run as a pure function.
+- least_squares, uncertainty, linear_adaptation, expert_augmentation: other ways to adapt, and how sure θ_p is.
+- lanes, sweep: every seed, size and rate a lane of one compiled program, on all devices.
+- models, datasets, archive, files: what is kept.
+- rows, summary, claims, report, standings, ablations and the figures: what is told.
+- sim: the MuJoCo MJX quadrotor, its forces and its pilot.
+"""
 
 from hybrid_jax.models import Model, load, save
 from hybrid_jax.objective import Settings

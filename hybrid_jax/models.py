@@ -57,8 +57,12 @@ class Model:
         """The states after each of t intervals of dt [s] with the inputs held over them; one window or n.
 
         Raises:
-            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive.
+            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive, or a model that
+                is no vector field.
         """
+        if not callable(self.field):
+            name = type(self.field).__name__
+            raise ValueError(f"the model is a {name}, which needs more than x0 and u; use the methods of its `field`")
         x0, u = jnp.asarray(x0, float), jnp.asarray(u, float)
         if x0.ndim not in (1, 2) or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
             raise ValueError(f"x0 (d,) and u (t, m), or (n, d) and (n, t, m), expected; got {x0.shape} and {u.shape}")

@@ -94,7 +94,10 @@ def test_every_window_is_learned_from_as_flown_and_as_the_expert_flies_it():
 def test_the_expert_stays_as_it_is_and_the_whole_survives_a_file(trained, tmp_path):
     assert eqx.tree_equal(trained.expert, expert().expert)
     save(tmp_path / "model.npz", trained)
-    assert eqx.tree_equal(load(tmp_path / "model.npz").field, trained)
+    model = load(tmp_path / "model.npz")
+    assert eqx.tree_equal(model.field, trained)
+    with pytest.raises(ValueError, match="the model is a ExpertAugmented, which needs more than x0 and u"):
+        model.predict(WINDOWS.x0, WINDOWS.u, WINDOWS.dt)
 
 
 def test_bad_input_is_refused():
