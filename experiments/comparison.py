@@ -62,6 +62,10 @@ class ComparisonConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
+        if "no_physics" in self.methods and self.residual_outputs != "all":
+            raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
+        if "last_layer" in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
+            raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")
 
 
 def preset(like: Config, **changes: Any) -> ComparisonConfig:

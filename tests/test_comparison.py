@@ -68,6 +68,15 @@ def test_intervals_stand_around_what_was_fitted(folder):
             assert low < row["theta"][name] < high
 
 
-def test_a_method_twice_is_refused(tmp_path):
-    run = command("comparison", "--methods", "hybrid", "hybrid", folder=tmp_path)
-    assert "--methods must be at least one, each different" in refused(run, "comparison")
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
+        (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
+        (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
+    ],
+    ids=["twice", "last layer of a view", "no physics without velocities"],
+)
+def test_methods_that_do_not_fit_are_refused_before_anything_is_flown(options, named, tmp_path):
+    assert named in refused(command("comparison", *options, folder=tmp_path), "comparison")
+    assert not list(tmp_path.iterdir())
