@@ -166,14 +166,19 @@ def _end(name: str, error: Exception, code: int):
 def _print(findings: Findings, console: Console) -> None:
     for table in findings.tables:
         console.print(table)
+    if findings.ratios:
+        console.print(ratio_table(findings.ratios))
+
+
+def ratio_table(ratios: Sequence[Ratio]) -> Table:
+    """What is reached and what is not."""
     table = Table("ratio", "", "reach", "", title=f"on {cores()} cores")
-    for ratio in findings.ratios:
+    for ratio in ratios:
         bounds = (("≤", ratio.at_most), ("≥", ratio.at_least))
         reach = ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
         verdict = {None: "", True: "reached", False: "not reached"}[ratio.holds]
         table.add_row(ratio.what, f"{ratio.value:.3g}", reach, verdict)
-    if findings.ratios:
-        console.print(table)
+    return table
 
 
 def _report(name: str, preset: str, findings: Findings, seconds: float) -> dict[str, Any]:

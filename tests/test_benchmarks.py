@@ -30,6 +30,18 @@ def smoke(name, folder):
     return report, finished.stdout
 
 
+def test_one_command_gathers_the_ratios_of_all(tmp_path):
+    out = tmp_path / "all.json"
+    command = [sys.executable, "-m", "benchmarks", "--preset", "smoke", "--only", "training_step", "--out", str(out)]
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
+    assert finished.returncode == 0, finished.stderr
+    (report,) = json.loads(out.read_text())["benchmarks"]
+    assert report["benchmark"] == "training_step"
+    for ratio in report["ratios"]:
+        assert f"training_step: {ratio['what']}" in finished.stdout
+    assert "GFLOP/s" in finished.stderr  # the benchmark's own tables are beside the result, not in it
+
+
 def test_the_environment_agrees_with_c_mujoco(tmp_path):
     report, printed = smoke("environment", tmp_path)
     assert "C MuJoCo" in printed

@@ -1,0 +1,74 @@
+"""Every benchmark, and one table of the ratios that matter: python -m benchmarks --help"""
+
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any, Literal
+
+import tyro
+from rich.console import Console
+
+from benchmarks.timing import Ratio, ratio_table
+from experiments.command import BAD_INPUT, check_folder
+from hybrid_jax.files import json_text, read_json, write_whole
+
+Benchmark = Literal["training_step", "rollout", "sweep", "environment"]
+
+
+@dataclass(frozen=True)
+class Options:
+    """Run every benchmark, each in a process of its own, and print one table of ratios: about five minutes on two quiet
+    cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
+    """
+
+    preset: Literal["full", "smoke"] = "full"
+    """full: what is reported. smoke: does it work; its numbers say nothing."""
+    out: Path | None = None
+    """Also write the numbers of all benchmarks to this file as JSON."""
+    only: tuple[Benchmark, ...] = ("training_step", "rollout", "sweep", "environment")
+    """Which benchmarks to run."""
+
+
+def measured(name: str, preset: str) -> dict[str, Any]:
+    """The report of one benchmark; its tables are shown on stderr when it is done.
+
+    Raises:
+        RuntimeError: it failed, for instance because two programs do not compute the same.
+    """
+    with TemporaryDirectory() as folder:
+        report = Path(folder) / f"{name}.json"
+        command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]
+        if subprocess.run(command, stdout=sys.stderr, check=False).returncode:
+            raise RuntimeError(f"benchmark {name} failed; what it says stands above")
+        return read_json(report)
+
+
+def ratios_of(reports: Sequence[dict[str, Any]]) -> list[Ratio]:
+    """The ratios of all reports, each with the name of its benchmark."""
+    return [
+        Ratio(f"{report['benchmark']}: {ratio['what']}", ratio["value"], ratio["at_most"], ratio["at_least"])
+        for report in reports
+        for ratio in report["ratios"]
+    ]
+
+
+def main() -> None:
+    """The command line. Bad input ends in one line on stderr and exit code 2, a benchmark that fails in 1."""
+    options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
+    try:
+        if options.out is not None:
+            check_folder("--out", options.out.parent)
+        reports = [measured(name, options.preset) for name in options.only]
+    except (ValueError, RuntimeError) as error:
+        print(f"benchmarks: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT if isinstance(error, ValueError) else 1)
+    Console().print(ratio_table(ratios_of(reports)))
+    if options.out is not None:
+        write_whole(options.out, json_text({"benchmarks": reports}))
+
+
+if __name__ == "__main__":
+    main()
