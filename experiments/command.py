@@ -2,18 +2,24 @@
 
 import contextlib
 import io
+import signal
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import tyro
+from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.protocol import PRESETS, Config
 from hybrid_jax.runtime import configure
 
-BAD_INPUT, INTERRUPTED = 2, 130
+BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
+
+
+class Terminated(KeyboardInterrupt):
+    """Told to stop by SIGTERM: all that an interrupt does, with an exit code of its own."""
 
 
 def run(
@@ -33,13 +39,38 @@ def run(
         config = read(name, about, arguments, presets)
         check_folder("--out", config.out)
         configure(config.cache)
-        experiment(config, Console(stderr=True))
+        signal.signal(signal.SIGTERM, _terminate)
+        with alone(config.out / name):
+            experiment(config, Console(stderr=True))
     except (ValueError, OSError) as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as stop:
         print(f"{name}: interrupted; the same command goes on from here", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+        sys.exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED)
+
+
+@contextlib.contextmanager
+def alone(folder: Path) -> Iterator[None]:
+    """Be the only run that writes into a folder; the lock goes with the process, however that ends.
+
+    Raises:
+        ValueError: another run writes there now.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    lock = FileLock(folder / ".lock", timeout=0)
+    try:
+        lock.acquire()
+    except Timeout:
+        raise ValueError(f"--out: another run is writing to {folder}; wait for it, or choose another folder") from None
+    try:
+        yield
+    finally:
+        lock.release()
+
+
+def _terminate(signal_number, frame) -> None:
+    raise Terminated
 
 
 def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Config] = PRESETS) -> Config:

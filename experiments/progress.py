@@ -9,7 +9,7 @@ from rich.text import Text
 
 from hybrid_jax.sweep import Progress
 
-QUIET = 30.0  # s between two lines in a file
+FIRST, QUIET = 5.0, 30.0  # s before the first line in a file, and between two
 
 
 class SweepLine(AbstractContextManager):
@@ -18,7 +18,7 @@ class SweepLine(AbstractContextManager):
     def __init__(self, name: str, console: Console):
         self._name, self._console = name, console
         self._live = Live(Text(f"{name}: compiling"), console=console, transient=True) if console.is_terminal else None
-        self._printed = time.perf_counter()
+        self._due = time.perf_counter() + FIRST
 
     def __enter__(self) -> "SweepLine":
         if self._live is not None:
@@ -34,8 +34,8 @@ class SweepLine(AbstractContextManager):
         line = f"{self._name}: {describe(progress)}"
         if self._live is not None:
             self._live.update(Text(line))
-        elif time.perf_counter() - self._printed > QUIET:
-            self._printed = time.perf_counter()
+        elif time.perf_counter() > self._due:
+            self._due = time.perf_counter() + QUIET
             self._console.print(line, highlight=False, soft_wrap=True)
 
 

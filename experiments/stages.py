@@ -97,7 +97,7 @@ class _Keeper(AbstractContextManager):
         self._latest: FitState | None = None
 
     def __exit__(self, kind, error, trace) -> None:
-        if kind is KeyboardInterrupt:
+        if kind is not None and issubclass(kind, KeyboardInterrupt):
             self._save()
 
     def seconds(self) -> float:

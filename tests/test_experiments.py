@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import signal
 import subprocess
 import sys
 from pathlib import Path
@@ -138,6 +139,26 @@ def test_physics_alone_is_an_experiment_too(folder, finished):
     run = command("param_shift", "--models", "physics_only", folder=folder, out=folder / "physics")
     assert run.returncode == 0, run.stderr
     assert len(record(folder, "param_shift", "physics")["rows"]) == 3
+
+
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
+def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent, code, folder, finished):
+    forever = ["--patience.hybrid-pretraining.minimum", "10000000", "--max-epochs", "10000000"]
+    options = ["--preset", "smoke", "--models", "physics_only", *forever, "--cache", str(folder / "cache")]
+    run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
+    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            assert any("lanes active" in line for line in process.stderr)  # said after a few seconds of training
+            second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
+            assert "another run is writing" in refused(second, "param_shift")
+            process.send_signal(sent)
+            rest = process.stderr.read()
+            assert process.wait(timeout=60) == code
+        finally:
+            process.kill()
+    assert "the same command goes on from here" in rest
+    (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun.npz")
+    begun.unlink()
 
 
 def refused(run, name):
