@@ -71,8 +71,11 @@ def figure(trials: Sequence[Trial], title: str, floors: Mapping[str, float]) -> 
     panels = {domain: _lines(trials, domain) for domain in by_domain(trials[0].rows)}
     count = max(len(lines) for lines in panels.values())
     drawn = Figure(figsize=(11, 1.9 + 0.32 * count), layout="constrained")
-    for axes, (domain, lines) in zip(drawn.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True):
+    row = drawn.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (domain, lines) in zip(row, panels.items(), strict=True):
         draw_panel(axes, lines, NAMES[domain].capitalize(), floors.get(domain, 0.0))
+    for axes in row[1:]:
+        axes.tick_params(labelleft=False)  # the lines are those of the first panel
     drawn.suptitle(title, fontsize=12)
     add_legend(drawn, any(row.test_mse is None for trial in trials for row in trial.rows))
     return drawn
