@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from test_report import ODD_ROWS, SIZES, TRUTH, changed, make_rows
+from reports import ODD_ROWS, SIZES, TRUTH, changed, make_rows
 from test_standings import compared_rows, spoilt
 
 from hybrid_jax.comparison_figures import standings

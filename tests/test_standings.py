@@ -5,8 +5,8 @@ import math
 from dataclasses import replace
 
 import pytest
+from reports import TRUTH, make_report
 from rich.console import Console
-from test_report import TRUTH, make_report
 
 from hybrid_jax.claims import claims
 from hybrid_jax.report import load_report, print_report, write_report
