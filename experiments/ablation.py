@@ -4,7 +4,7 @@ python -m experiments.ablation --help
 """
 
 import json
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -13,8 +13,7 @@ from rich.console import Console
 from experiments import command
 from experiments.conditions import adaptation, pretraining, settings
 from experiments.external_force import sine_floor
-from experiments.outcome import PLACES
-from experiments.protocol import QUICK, SMOKE, Config, distinct
+from experiments.protocol import QUICK, SMOKE, Config, distinct, preset_like
 from experiments.results import Lanes, rows_of, trained
 from experiments.stages import Stages
 from experiments.study import EVERY, flown, places, source_splits, target_splits
@@ -75,16 +74,10 @@ class AblationConfig(Config):
         distinct("--over", self.over)
 
 
-def preset(like: Config, **changes: Any) -> AblationConfig:
-    """The preset of the other experiments, for this one."""
-    kept = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
-    return AblationConfig(**kept | changes)
-
-
 PRESETS = {
     "paper": AblationConfig(),
-    "quick": preset(QUICK, over=("residual",)),
-    "smoke": preset(SMOKE, over=("weight", "noise"), sizes=(20,), pool=20),
+    "quick": preset_like(AblationConfig, QUICK, over=("residual",)),
+    "smoke": preset_like(AblationConfig, SMOKE, over=("weight", "noise"), sizes=(20,), pool=20),
 }
 
 
@@ -167,7 +160,7 @@ def write(config: AblationConfig, trials: list[Trial], seconds: dict[str, float]
 
 def contents(config: AblationConfig, trials: list[Trial], where: dict[str, Any]) -> dict[str, str]:
     """The text of each file."""
-    used = json_value({name: value for name, value in asdict(config).items() if name not in PLACES})
+    used = json_value(config.described())
     captions = {f"{choice}.png": f"Test errors of all seeds, by {choice}" for choice in by_choice(trials)}
     record = {
         "experiment": NAME,

@@ -15,8 +15,7 @@ from experiments.conditions import augmentation, pretraining, settings
 from experiments.coverage import Config as CoverageConfig
 from experiments.coverage import CoverageRow, coverage
 from experiments.external_force import sine_floor
-from experiments.outcome import PLACES
-from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, distinct
+from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, distinct, preset_like
 from experiments.results import Lanes, rows_of, save_models
 from experiments.rivals import METHODS, PAST, Case, Method, source_only
 from experiments.stages import Stages
@@ -68,16 +67,10 @@ class ComparisonConfig(Config):
             raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")
 
 
-def preset(like: Config, **changes: Any) -> ComparisonConfig:
-    """The preset of the other experiments, for this one."""
-    shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
-    return ComparisonConfig(**shared | changes)
-
-
 PRESETS = {
     "paper": ComparisonConfig(),
-    "quick": preset(QUICK, encoding=Encoding(stopping=Stopping(20, 10))),
-    "smoke": preset(SMOKE, sizes=(20,), pool=20, encoding=Encoding(hidden=8), repeats=4),
+    "quick": preset_like(ComparisonConfig, QUICK, encoding=Encoding(stopping=Stopping(20, 10))),
+    "smoke": preset_like(ComparisonConfig, SMOKE, sizes=(20,), pool=20, encoding=Encoding(hidden=8), repeats=4),
 }
 
 
@@ -137,7 +130,7 @@ def write(
     save_figure(standings(rows, TITLE, {EXTERNAL_FORCE.name: floor}), out / "standings")
     report = Report(
         experiment=NAME,
-        config={name: value for name, value in asdict(config).items() if name not in PLACES},
+        config=config.described(),
         environment=environment(stages.seconds),
         rows=rows,
         claims=claims(rows, NAME, None),

@@ -1,6 +1,5 @@
 """What an experiment leaves in its folder: the report, the figures and the models."""
 
-from dataclasses import asdict
 from pathlib import Path
 
 import jax
@@ -20,7 +19,6 @@ from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 
 FLIGHT_SECONDS = 11.0
-PLACES = ("out", "cache")  # where files lie is not what was run
 
 
 def write_outcome(
@@ -43,7 +41,7 @@ def write_outcome(
     save_models(out / "models", found.lanes, found.rows)
     report = Report(
         experiment=experiment,
-        config={name: value for name, value in asdict(config).items() if name not in PLACES},
+        config=config.described(),
         environment=environment(found.seconds),
         rows=found.rows,
         claims=claims(found.rows, experiment, truth_theta),

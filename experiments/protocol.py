@@ -1,15 +1,16 @@
 """The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal, TypeVar
 
 import platformdirs
 
 from hybrid_jax.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
+Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
@@ -144,6 +145,10 @@ class Config:
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
+    def described(self) -> dict[str, Any]:
+        """All that fixes the results: where files lie does not."""
+        return {name: value for name, value in asdict(self).items() if name not in ("out", "cache")}
+
     def pooled(self) -> int:
         """The number of target trajectories from which a seed draws."""
         return max(self.sizes) if self.pool is None else self.pool
@@ -175,6 +180,12 @@ def distinct(option: str, names: Sequence[str]) -> None:
     """
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
+
+def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
+    """A configuration of a kind with what it shares with another one, but for its own sizes and the changes."""
+    shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
+    return kind(**shared | changes)
 
 
 def column(size: int) -> int:
