@@ -4,6 +4,7 @@ One long solve that looks its input up by time is silently wrong: a stage at the
 So an interval is a step of its own, with its input as `args`, and a `scan` goes over the intervals.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -52,6 +53,7 @@ def integrate(
     substeps: int = 1,
 ) -> Float[Array, "t d *b"]:
     """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
+    solver = _bounded(solver)
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
     begin, end = 0.0, dt / substeps
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -65,6 +67,17 @@ def integrate(
         return x, x
 
     return jax.lax.scan(interval, x0, u)[1]
+
+
+def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    """The solver with its stages in a loop of bounded length.
+
+    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`, which
+    is where the lanes of a sweep run on several devices.
+    """
+    if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
+        return dataclasses.replace(solver, scan_kind="bounded")
+    return solver
 
 
 def rollout(

@@ -5,6 +5,7 @@ import subprocess
 import sys
 from dataclasses import replace
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -37,8 +38,8 @@ def starts(lengths=LENGTHS):
 PLANS = [plan(0.03, 20, seed=1), plan(0.01, 40, seed=2), plan(0.05, 10, cap=6, seed=3)]
 
 
-def swept(states, plans, train=TRAIN, validation=VALIDATION, **options):
-    return sweep(states, stack(plans), train, validation, SETTINGS, **options)
+def swept(states, plans, train=TRAIN, validation=VALIDATION, settings=SETTINGS, **options):
+    return sweep(states, stack(plans), train, validation, settings, **options)
 
 
 def same(one, other):
@@ -67,6 +68,13 @@ def test_a_lane_is_a_run_by_the_plain_function(final):
         assert (alone.epoch, alone.status, alone.best_epoch) == (here.epoch, here.status, here.best_epoch)
         # Another program for the same sums: round-off, grown over some 50 steps.
         np.testing.assert_allclose(here.field.log_length, alone.field.log_length, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Heun(), diffrax.Tsit5()], ids=["heun", "tsit5"])
+def test_a_sweep_trains_through_the_solvers_of_diffrax(solver, final):
+    other = swept(starts(), PLANS, settings=Settings(batch_size=BATCH, solver=solver))
+    # The steps of 0.05 are short, so that the solver's error is all that is between them.
+    np.testing.assert_allclose(other.field.log_length, final.field.log_length, rtol=0, atol=0.02)
 
 
 @pytest.mark.parametrize("width", [2, 3])
