@@ -16,6 +16,7 @@ from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.files import json_text, read_json, write_whole
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment"]
+PEERS = "training_peers", "environment_peers"
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,9 @@ class Options:
     """Also write the numbers of all benchmarks to this file as JSON."""
     only: tuple[Benchmark, ...] = ("training_step", "rollout", "sweep", "environment")
     """Which benchmarks to run."""
+    peers: bool = False
+    """Also run those against rivals, training_peers and environment_peers, on one core: some eight minutes more, mostly
+    in `torch.compile`. A rival that is not installed is named and skipped: pip install -e '.[peers]'."""
 
 
 def measured(name: str, preset: str) -> dict[str, Any]:
@@ -55,17 +59,27 @@ def ratios_of(reports: Sequence[dict[str, Any]]) -> list[Ratio]:
     ]
 
 
+def absences(reports: Sequence[dict[str, Any]]) -> list[str]:
+    """A line for each rival that a benchmark skipped: which, and what would change that."""
+    rows = [(report["benchmark"], row) for report in reports for row in report["rows"]]
+    return [f"{name}: {row['rival']}: {row['skipped']}" for name, row in rows if "skipped" in row]
+
+
 def main() -> None:
     """The command line. Bad input ends in one line on stderr and exit code 2, a benchmark that fails in 1."""
     options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
     try:
         if options.out is not None:
             check_folder("--out", options.out.parent)
-        reports = [measured(name, options.preset) for name in options.only]
+        names = options.only + (PEERS if options.peers else ())
+        reports = [measured(name, options.preset) for name in names]
     except (ValueError, RuntimeError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, ValueError) else 1)
-    Console().print(ratio_table(ratios_of(reports)))
+    console = Console()
+    console.print(ratio_table(ratios_of(reports)))
+    for line in absences(reports):
+        console.print(line, markup=False)
     if options.out is not None:
         write_whole(options.out, json_text({"benchmarks": reports}))
 

@@ -1,0 +1,152 @@
+"""How many steps a second does our environment make, against rigid-body JAX written by hand and against crazyflow?
+
+By hand: the same vehicle without drag and ground effect, its Newton–Euler equations written out, RK4 in a `lax.scan`
+under `vmap`. It shows what MJX costs, which takes any body and any force; its flights are compared with ours before
+anything is timed. crazyflow: a simulator with models of its own, which knows neither our vehicle nor ground effect. So
+it flies another vehicle, a small Crazyflie whose rotors take time to speed up, with drag: as many flights by RK4 from
+rotor speeds held over each step, but of another model, so that speed can be compared and results can not. One step is
+0.01 s of one vehicle in float64. All on one core, in turns, medians; compilation is timed apart.
+
+crazyflow 0.4.0 refuses jax 0.10.2, so it is no part of the extra `peers`; beside another jax it is timed.
+smoke: one tiny batch. full: batches of 64 and 1000 flights.
+"""
+
+# crazyflow is rarely installed.
+# pyright: reportMissingImports=false
+
+import os
+
+os.environ["SCIPY_ARRAY_API"] = "1"  # crazyflow asks for it, before anything imports SciPy
+
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from benchmarks import environment, plain
+from benchmarks.peers import installed, keep_to_one_core, skipped
+from benchmarks.rigid_body_by_hand import derivative
+from benchmarks.subjects import DT, make_flights
+from benchmarks.timing import Call, Findings, Ratio, agree, compiled, in_turns, run
+from hybrid_jax.sim.forces import drag, ground_effect
+from hybrid_jax.vehicle import IRIS
+
+OURS, OURS_WITH_FORCES, BY_HAND, CRAZYFLOW = "ours", "ours, with forces", "by hand", "crazyflow"
+REMEDY = "pip install crazyflow==0.4.0, in an environment whose jax is not 0.10.2"
+# Ours makes q a unit again after each step, by hand it drifts by the error of RK4, 1e-10 over 100 steps.
+AGREEMENT = 1e-8
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Batch sizes, steps of each flight, and turns."""
+
+    batches: tuple[int, ...]
+    steps: int
+    turns: int
+
+
+PRESETS = {
+    "smoke": Preset((8,), steps=10, turns=2),
+    "full": Preset((64, 1000), steps=100, turns=10),
+}
+
+
+def compile_by_hand(x0: np.ndarray, u: np.ndarray) -> tuple[Call, float]:
+    """A call that flies them all, and the seconds it took to trace and compile."""
+    return compiled(jax.vmap(partial(plain.rk4, partial(derivative, IRIS))), x0, u)
+
+
+def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
+    """The same for crazyflow's default vehicle, hovering at 1 m but for 5 % of its rotor speeds."""
+    from crazyflow.control import Control
+    from crazyflow.control.transform import motor_force2rotor_vel
+    from crazyflow.sim import Sim
+    from crazyflow.sim.functional import rotor_vel_control
+    from crazyflow.sim.integration import Integrator
+
+    with TemporaryDirectory() as folder, contextlib.chdir(folder):  # MuJoCo leaves its log where it is
+        sim = Sim(flights, control=Control.rotor_vel, integrator=Integrator.rk4, freq=round(1 / DT))
+    advance, data = sim.build_step_fn(), sim.data
+    weight = -data.params.mass * data.params.gravity_vec[..., 2]
+    hover = motor_force2rotor_vel(weight.reshape(-1)[:1] / 4, data.params.rpm2thrust.reshape(-1, 3)[:1])  # rpm
+    commands = hover * np.random.default_rng(0).uniform(0.95, 1.05, size=(steps, flights, 1, 4))
+    states = data.states.replace(pos=data.states.pos.at[..., 2].set(1.0), rotor_vel=jnp.full((flights, 1, 4), hover))
+
+    def step(data, held):
+        data = advance(rotor_vel_control(data, held), 1)
+        return data, (data.states.pos, data.states.quat, data.states.vel, data.states.ang_vel)
+
+    def fly(data, commands):
+        return jax.lax.scan(step, data, commands)[1]
+
+    return compiled(fly, data.replace(states=states), commands)
+
+
+def measure_batch(batch: int, preset: Preset) -> dict[str, Any]:
+    """Agreement, compile seconds and steps per second for one batch size."""
+    x0, u = make_flights(batch, preset.steps)
+    programs: dict[str, tuple[Callable, float]] = {
+        OURS: environment.compile_ours((), x0, u),
+        BY_HAND: compile_by_hand(x0, u),
+    }
+    if installed("crazyflow"):
+        programs[OURS_WITH_FORCES] = environment.compile_ours((drag, ground_effect), x0, u)
+        programs[CRAZYFLOW] = compile_crazyflow(batch, preset.steps)
+    calls = {name: call for name, (call, _) in programs.items()}
+    results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
+    difference = agree("flights of ours and by hand", results[OURS], results[BY_HAND], AGREEMENT)
+    times = in_turns(calls, preset.turns)
+    return {
+        "batch": batch,
+        "steps": preset.steps,
+        "difference": difference,
+        "compile_seconds": {name: seconds for name, (_, seconds) in programs.items()},
+        "steps_per_second": {name: batch * preset.steps / taken for name, taken in times.medians().items()},
+        "rival_over_ours": {
+            rival: times.ratio(rival, ours)
+            for rival, ours in ((BY_HAND, OURS), (CRAZYFLOW, OURS_WITH_FORCES))
+            if rival in calls
+        },
+    }
+
+
+def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
+    """The measurements for reading."""
+    table = Table("flights", "", "steps/s", "compile [s]", "differs by", title=f"steps of {DT} s per second")
+    for row in rows:
+        compared = {BY_HAND: f"{row['difference']:.0e}", CRAZYFLOW: "another vehicle: not compared"}
+        for name, speed in row["steps_per_second"].items():
+            compiling = f"{row['compile_seconds'][name]:.1f}"
+            table.add_row(str(row["batch"]), name, f"{speed:,.0f}", compiling, compared.get(name, ""))
+    for row in absent:
+        table.add_row("", row["rival"], "", "", escape(row["skipped"]))
+    return table
+
+
+def ratios_of(row: dict[str, Any]) -> list[Ratio]:
+    """Our speed over the rivals'; no reach is asked for."""
+    comparisons = {BY_HAND: "ours / by hand", CRAZYFLOW: "ours with forces / crazyflow, another vehicle"}
+    task = f"steps/s on one core, {row['batch']} flights"
+    return [Ratio(f"{task}: {comparisons[rival]}", value) for rival, value in row["rival_over_ours"].items()]
+
+
+def measure(preset: Preset) -> Findings:
+    """Every batch size; the ratios are those of the last."""
+    with jax.enable_x64(True):
+        rows = [measure_batch(batch, preset) for batch in preset.batches]
+    absent = [] if installed("crazyflow") else [skipped(CRAZYFLOW, REMEDY)]
+    return Findings([*rows, *absent], [table_of(rows, absent)], ratios_of(rows[-1]))
+
+
+if __name__ == "__main__":
+    keep_to_one_core()
+    run("environment_peers", __doc__, PRESETS, measure)

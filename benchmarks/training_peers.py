@@ -1,0 +1,210 @@
+"""How long does one gradient step take, against the paper's stack and against PyTorch written for speed, core for core?
+
+A step is 100 windows of 10 intervals of 0.01 s: RK4, batch normalisation, regulariser, gradient, Adam with the
+protocol's rates, running statistics. Ours is `training.gradient_step`. The rivals start from our parameters: PyTorch
+with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; and the same with its loss, unrolled, under
+`torch.compile`. Loss, gradient and running statistics are compared before anything is timed. torchdiffeq's rk4 is the
+3/8 rule, so it is compared with our step by the 3/8 rule, to the same tolerance, and timed against our usual one, which
+takes as many evaluations. All on one core and one thread, in turns; the seconds of the first call, in which PyTorch
+compiles, are apart.
+
+smoke: fewer intervals, and `torch.compile` traces but generates no code. full: some five minutes, most of it compiling.
+"""
+
+# PyTorch is of the extra `peers`.
+# pyright: reportMissingImports=false
+
+import os
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from tempfile import TemporaryDirectory
+from typing import Any, ClassVar
+
+import diffrax
+import jax.numpy as jnp
+import numpy as np
+from rich.markup import escape
+from rich.table import Table
+
+from benchmarks.peers import installed, keep_to_one_core, skipped
+from benchmarks.subjects import make_windows, protocol
+from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run, stopwatch
+from benchmarks.training_step import AGREEMENT
+from experiments.conditions import pretraining, settings
+from experiments.protocol import Config
+from hybrid_jax.lanes import lane
+from hybrid_jax.rigid_body import LEARNED
+from hybrid_jax.rollout import RK4
+from hybrid_jax.training import gradient_step
+from hybrid_jax.vehicle import IRIS
+
+OURS, TORCHDIFFEQ, BY_HAND, COMPILED = "ours", "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
+RIVALS = TORCHDIFFEQ, BY_HAND, COMPILED
+REACH = {TORCHDIFFEQ: 50.0, COMPILED: 5.0}  # times our time
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Windows and steps of a minibatch, what generates code for `torch.compile`, and turns."""
+
+    windows: int
+    steps: int
+    backend: str
+    turns: int
+
+
+PRESETS = {
+    "full": Preset(100, 10, "inductor", turns=40),
+    "smoke": Preset(100, 2, "aot_eager", turns=2),
+}
+
+
+class ThreeEighths(diffrax.AbstractERK):
+    """The 3/8 rule, the other fourth-order method of Kutta (1901); fixed steps only."""
+
+    tableau: ClassVar = diffrax.ButcherTableau(
+        c=np.array([1 / 3, 2 / 3, 1.0]),
+        b_sol=np.array([1.0, 3.0, 3.0, 1.0]) / 8,
+        b_error=np.zeros(4),
+        a_lower=(np.array([1 / 3]), np.array([-1 / 3, 1.0]), np.array([1.0, -1.0, 1.0])),
+    )
+    interpolation_cls: ClassVar = diffrax.ThirdOrderHermitePolynomialInterpolation.from_k
+
+    def order(self, terms):
+        return 4
+
+
+@dataclass(frozen=True)
+class Step:
+    """One program: a call that makes a step, what the first one came to, and the seconds it took to compile.
+
+    PyTorch's seconds are those of its first call, which compiles and then makes a step.
+    """
+
+    call: Call
+    result: dict[str, Any]
+    seconds: float
+
+
+def missing(preset: Preset) -> list[dict[str, Any]]:
+    """A row for each rival that cannot be measured here."""
+    if not installed("torch"):
+        return [skipped(rival) for rival in RIVALS]
+    compiler = os.environ.get("CXX", "g++")
+    rows = [] if installed("torchdiffeq") else [skipped(TORCHDIFFEQ)]
+    if preset.backend == "inductor" and shutil.which(compiler) is None:
+        rows.append(skipped(COMPILED, f"the C++ compiler {compiler}, or another that CXX names"))
+    return rows
+
+
+def our_step(subject: tuple, config: Config, solver: diffrax.AbstractSolver) -> Step:
+    """Ours by some integrator."""
+    chosen = replace(settings(config), solver=solver)
+    call, seconds = compiled(partial(gradient_step, settings=chosen), *subject)
+    field, adam, value = call()
+    physics, network, running = adam.mu.physics, adam.mu.residual, field.residual.norm.running
+    moment = {
+        "physics.log_ratios": jnp.stack([physics.log_ratios[name] for name in LEARNED]),
+        "network.weight_in": network.weight_in,
+        "network.gain": network.norm.gain,
+        "network.shift": network.norm.shift,
+        "network.weight_out": network.weight_out,
+        "network.bias_out": network.bias_out,
+    }
+    result = {"loss": value, "first_moment": moment, "mean": running.mean, "variance": running.variance}
+    return Step(call, result, seconds)
+
+
+def rival_steps(subject: tuple, preset: Preset, names: Sequence[str]) -> dict[str, Step]:
+    """The rivals' first steps from where we start too."""
+    import torch
+
+    from benchmarks import torch_rivals
+
+    torch.set_num_threads(1)
+    integrators = {TORCHDIFFEQ: torch_rivals.by_torchdiffeq}
+    field, _, plan, windows = subject
+    steps = {}
+    for name in names:
+        training = torch_rivals.Training(
+            field,
+            plan.rates,
+            float(plan.regulariser_weight),
+            windows,
+            integrators.get(name, torch_rivals.by_hand),
+            preset.backend if name == COMPILED else None,
+        )
+        value, seconds = stopwatch(training)
+        steps[name] = Step(training, training.result(value), seconds)
+    return steps
+
+
+def prepare(preset: Preset, names: Sequence[str]) -> tuple[dict[str, Step], dict[str, float]]:
+    """Our step and those of the rivals that are named, each warm, and by how much each rival differs from ours.
+
+    Raises:
+        Disagreement: it is too much.
+    """
+    config = protocol(1, preset.windows)
+    state, plan = (lane(stacked, 0) for stacked in pretraining("hybrid", IRIS, config))
+    subject = state.field, state.adam, plan, make_windows(preset.windows, preset.steps)
+    ours = our_step(subject, config, RK4())
+    rivals = rival_steps(subject, preset, names) if names else {}
+    alike = {TORCHDIFFEQ: our_step(subject, config, ThreeEighths())} if TORCHDIFFEQ in names else {}
+    differences = {
+        name: agree(f"steps of {name} and ours", alike.get(name, ours).result, rival.result, AGREEMENT)
+        for name, rival in rivals.items()
+    }
+    for rival in rivals.values():
+        rival.call()
+    return {OURS: ours, **rivals}, differences
+
+
+def row_of(name: str, step: Step, differences: dict[str, float], times: Times, preset: Preset) -> dict[str, Any]:
+    """What is reported of a program."""
+    return {
+        "program": name,
+        "windows": preset.windows,
+        "steps": preset.steps,
+        "seconds": times.median(name),
+        "windows_per_second": preset.windows / times.median(name),
+        "times_ours": times.ratio(name, OURS),
+        "compile_seconds": step.seconds,
+        "difference": differences.get(name),
+    }
+
+
+def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
+    """The programs for reading."""
+    table = Table("", "ms", "windows/s", "× ours", "compile [s]", "differs by", title="one gradient step, one core")
+    for row in rows:
+        speed = f"{1e3 * row['seconds']:.2f}", f"{row['windows_per_second']:,.0f}", f"{row['times_ours']:.2f}"
+        difference = "" if row["difference"] is None else f"{row['difference']:.0e}"
+        table.add_row(row["program"], *speed, f"{row['compile_seconds']:.1f}", difference)
+    for row in absent:
+        table.add_row(row["rival"], *[""] * 4, escape(row["skipped"]))
+    return table
+
+
+def measure(preset: Preset) -> Findings:
+    """Ours against every rival that is here."""
+    absent = missing(preset)
+    names = [rival for rival in RIVALS if rival not in {row["rival"] for row in absent}]
+    with TemporaryDirectory() as cache:
+        os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache  # empty, so that compilation is timed
+        steps, differences = prepare(preset, names)
+        times = in_turns({name: step.call for name, step in steps.items()}, preset.turns)
+    rows = [row_of(name, step, differences, times, preset) for name, step in steps.items()]
+    ratios = [
+        Ratio(f"{row['program']} / ours, one core", row["times_ours"], at_least=REACH.get(row["program"]))
+        for row in rows
+        if row["program"] != OURS
+    ]
+    return Findings([*rows, *absent], [table_of(rows, absent)], ratios)
+
+
+if __name__ == "__main__":
+    keep_to_one_core()
+    run("training_peers", __doc__, PRESETS, measure)

@@ -1,0 +1,103 @@
+"""Rivals are timed where they are installed and named where they are not; how fast they are, nobody asks here."""
+
+import json
+import subprocess
+import sys
+from functools import partial
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum
+
+from benchmarks.peers import installed
+from benchmarks.rigid_body_by_hand import derivative
+from benchmarks.subjects import make_flights, untrained
+from benchmarks.training_peers import BY_HAND, COMPILED, PRESETS, RIVALS, TORCHDIFFEQ, ThreeEighths
+from hybrid_jax.rigid_body import rigid_body
+from hybrid_jax.rollout import RK4, rollout
+from hybrid_jax.vector_field import Hybrid as OurHybrid
+from hybrid_jax.vector_field import evaluate_batch
+from hybrid_jax.vehicle import IRIS
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def peers(tmp_path_factory):
+    """The reports of the smallest preset, by benchmark, and what was printed, from one command."""
+    out = tmp_path_factory.mktemp("peers") / "all.json"
+    command = [sys.executable, "-m", "benchmarks", "--preset", "smoke", "--peers", "--out", str(out), "--only"]
+    finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
+    assert finished.returncode == 0, finished.stderr
+    return {report["benchmark"]: report for report in json.loads(out.read_text())["benchmarks"]}, finished.stdout
+
+
+def test_every_rival_is_timed_or_named_with_what_would_install_it(peers):
+    reports, printed = peers
+    rows = [row for report in reports.values() for row in report["rows"]]
+    skipped = {row["rival"]: row["skipped"] for row in rows if "skipped" in row}
+    timed = {row["program"] for row in rows if "program" in row} | {
+        name for row in rows if "batch" in row for name in row["steps_per_second"]
+    }
+    assert timed & skipped.keys() == set()
+    assert timed | skipped.keys() >= {*RIVALS, "crazyflow", "ours", "by hand"}
+    for rival, remedy in skipped.items():
+        assert "pip install" in remedy
+        assert f"{rival}: {remedy}" in " ".join(printed.split())
+
+
+def test_rivals_are_compared_core_for_core(peers):
+    reports, _ = peers
+    if sys.platform == "linux":
+        assert {report["cores_used"] for report in reports.values()} == {1}
+
+
+def test_our_flights_are_those_of_the_equations_by_hand(peers):
+    (row, *_) = peers[0]["environment_peers"]["rows"]
+    assert row["difference"] < 1e-10  # float64, 0.1 s
+
+
+def test_the_gradient_step_of_every_rival_is_ours(peers):
+    pytest.importorskip("torch", reason="PyTorch is of the extra `peers`")
+    rows = {row["program"]: row for row in peers[0]["training_peers"]["rows"] if "program" in row}
+    for rival in (BY_HAND, COMPILED) + ((TORCHDIFFEQ,) if installed("torchdiffeq") else ()):
+        assert rows[rival]["difference"] < 5e-5  # sums in another order, in float32
+
+
+def test_the_field_of_the_rivals_is_ours():
+    pytest.importorskip("torch", reason="PyTorch is of the extra `peers`")
+    from benchmarks.torch_rivals import Hybrid, tensor
+
+    field = untrained("hybrid")
+    assert isinstance(field, OurHybrid)
+    x, u = (part.astype(np.float32) for part in make_flights(30, 1))
+    ours = evaluate_batch(field, jnp.asarray(x.T), jnp.asarray(u[:, 0].T)).T
+    theirs = Hybrid(field)(tensor(x), tensor(u[:, 0])).detach().numpy()
+    np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-6 * np.abs(ours).max())
+
+
+def test_the_equations_by_hand_are_those_of_the_rigid_body():
+    with jax.enable_x64(True):
+        x, u = map(jnp.asarray, make_flights(20, 1))
+        by_hand = jax.vmap(partial(derivative, IRIS))(x, u[:, 0])
+        np.testing.assert_allclose(by_hand, rigid_body(IRIS)(x.T, u[:, 0].T).T, rtol=1e-10, atol=1e-10)
+
+
+def test_the_rule_of_torchdiffeq_is_of_fourth_order_and_another():
+    with jax.enable_x64(True):
+        x0 = jnp.array([0.5, -1.0])
+
+        def end(solver, steps):
+            return rollout(pendulum(), x0, jnp.zeros((steps, 1)), 0.8 / steps, solver)[-1]
+
+        truth = end(RK4(), 512)
+        errors = [np.abs(end(ThreeEighths(), steps) - truth).max() for steps in (8, 16)]
+        assert 3.7 < np.log2(errors[0] / errors[1]) < 4.6
+        assert np.abs(end(ThreeEighths(), 8) - end(RK4(), 8)).max() > 1e-6  # far above rounding
+
+
+def test_the_preset_that_is_reported_times_each_call_ten_times():
+    assert PRESETS["full"].turns >= 10
