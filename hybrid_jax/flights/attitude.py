@@ -1,0 +1,95 @@
+"""Attitudes and frames of whole logs, in NumPy's double precision; q = (w, x, y, z), body → world.
+
+World NED (north-east-down) becomes ENU, body FRD (forward-right-down) becomes FLU (forward-left-up).
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation, Slerp
+
+Vectors = Float[np.ndarray, "n 3"]
+Quaternions = Float[np.ndarray, "n 4"]
+
+# Matrices from a frame to the library's: world z up, body forward-left-up.
+WORLDS = {"ENU": np.eye(3), "NED": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])}
+BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
+VELOCITY_FRAMES = ("world", "body")
+
+
+@dataclass(frozen=True)
+class Frames:
+    """In which frames a log states its vectors.
+
+    Attributes:
+        world: "ENU" (or any other frame with z up) or "NED".
+        body: "FLU" or "FRD".
+        velocity: "world" or "body".
+
+    Raises:
+        ValueError: another name.
+    """
+
+    world: str
+    body: str
+    velocity: str
+
+    def __post_init__(self):
+        for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", VELOCITY_FRAMES)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
+
+
+def rotation_of(q: Quaternions) -> Rotation:
+    """SciPy keeps the scalar last."""
+    return Rotation.from_quat(np.roll(q, -1, axis=-1))
+
+
+def quaternion_of(rotation: Rotation) -> Quaternions:
+    """(w, x, y, z)."""
+    return np.roll(rotation.as_quat(), 1, axis=-1)
+
+
+def from_euler(angles: Vectors) -> Quaternions:
+    """Body → world from (roll, pitch, yaw) [rad], turned about z by yaw, then y by pitch, then x by roll."""
+    return quaternion_of(Rotation.from_euler("ZYX", angles[:, ::-1]))
+
+
+def to_library(p: Vectors, q: Quaternions, v: Vectors, omega: Vectors, frames: Frames) -> Float[np.ndarray, "n 13"]:
+    """States in the library's frames from position, attitude body → world, velocity and body rates in `frames`."""
+    world, body = WORLDS[frames.world], BODIES[frames.body]
+    attitude = Rotation.from_matrix(world @ rotation_of(q).as_matrix() @ body.T)
+    velocity = attitude.apply(v @ body.T) if frames.velocity == "body" else v @ world.T
+    return np.concatenate([p @ world.T, quaternion_of(attitude), velocity, omega @ body.T], axis=1)
+
+
+def rates_between(t: Float[np.ndarray, " n"], q: Quaternions) -> Float[np.ndarray, "n-1 3"]:
+    """Mean body rates [rad/s] that turn each attitude into the next."""
+    attitude = rotation_of(q)
+    return (attitude[:-1].inv() * attitude[1:]).as_rotvec() / np.diff(t)[:, None]
+
+
+def interpolate_attitude(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], q: Quaternions) -> Quaternions:
+    """Spherical linear interpolation of q, known at times `at`, to times t within them."""
+    return quaternion_of(Slerp(at, rotation_of(q))(t))
+
+
+def interpolate(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
+    """Linear interpolation of each column."""
+    return np.stack([np.interp(t, at, column) for column in values.T], axis=1)
+
+
+def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
+    """What values held from each of `at` to the next are on average from each t to the next; held at the last t.
+
+    Where values change more slowly than t, this is the held value itself; where faster, none of them is lost.
+    """
+    if len(t) == 1:
+        return values[np.searchsorted(at, t, side="right") - 1]
+    area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(at)[:, None], axis=0)])
+    # Beyond the last sample its value is held on.
+    end = max(t[-1], at[-1]) + 1.0
+    area = np.concatenate([area, area[-1:] + values[-1:] * (end - at[-1])])
+    mean = np.diff(interpolate(t, np.append(at, end), area), axis=0) / np.diff(t)[:, None]
+    return np.concatenate([mean, values[np.searchsorted(at, t[-1:], side="right") - 1]])

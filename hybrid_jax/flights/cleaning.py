@@ -1,0 +1,169 @@
+"""Changes to a log that a user asks for by name; each returns the new log and a line that says what was done."""
+
+import numpy as np
+from scipy import signal
+
+from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.motor_response import estimate_time_constant, lagged, respond
+from hybrid_jax.flights.segments import repeats, segments
+from hybrid_jax.state import QUATERNION
+from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
+from hybrid_jax.vehicle import Vehicle
+
+JITTER = 0.1  # intervals may differ from their median by this share and still count as equal
+
+
+def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
+    """Samples at multiples of dt [s] in each segment: linear, attitude spherically, motors the mean of what is held.
+
+    Args:
+        longest_gap: gaps and repeats no longer than this [s] are interpolated across.
+
+    Raises:
+        ValueError: dt is not positive, or no segment is as long as dt.
+    """
+    if not dt > 0:
+        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
+    fresh, parts = log[~repeats(log)], []
+    for part in _joined(log, fresh, longest_gap):
+        piece = fresh[part]
+        # A little is forgiven, or rounded times would cost the last sample.
+        first, last = np.ceil(piece.t[0] / dt - 1e-6), np.floor(piece.t[-1] / dt + 1e-6)
+        if last > first:
+            parts.append(_sampled(piece, np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])))
+    if not parts:
+        raise ValueError(f"{log.name}: no segment without gaps is as long as dt = {dt} s")
+    t, x, u = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "x", "u"))
+    kept = np.concatenate([[True], np.diff(t) > 0.5 * dt])  # two segments may end and start at one time
+    done = f"resampled {len(log)} samples to {kept.sum()} at {dt} s in {len(parts)} segments"
+    return FlightLog(t[kept], x[kept], u[kept], log.name), f"{done}, bridging gaps up to {longest_gap} s"
+
+
+def _joined(log: FlightLog, fresh: FlightLog, longest_gap: float) -> list[slice]:
+    """Runs of the fresh samples whose intervals are sound or no longer than the longest gap."""
+    whole = np.diff(fresh.t) <= max(1.5 * log.dt, longest_gap)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
+    return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def _sampled(piece: FlightLog, t) -> FlightLog:
+    x = interpolate(t, piece.t, piece.x)
+    x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
+    return FlightLog(t, x, mean_of_held(t, piece.t, piece.u), piece.name)
+
+
+def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[FlightLog, str]:
+    """Second-order Butterworth filter of states and motors alike, segment by segment, so that none lags another.
+
+    Args:
+        cutoff: −3 dB frequency [Hz] (zero phase: −6 dB, since the filter runs forward and back).
+        causal: filter forward only, as on board; what is slow then comes √2 / (2π cutoff) late.
+
+    Raises:
+        ValueError: the cutoff is not between 0 and half the sampling frequency, or samples are not evenly spaced.
+    """
+    rate = 1 / log.dt
+    if not 0 < cutoff < rate / 2:
+        raise ValueError(f"cutoff must lie between 0 and half the sampling frequency {rate / 2:.6g} Hz, got {cutoff!r}")
+    sections = signal.butter(2, cutoff, fs=rate, output="sos")
+    x, u = log.x.copy(), log.u.copy()
+    for part in _even_segments(log):
+        both = np.concatenate([x[part], u[part]], axis=1)
+        both = _forward(sections, both) if causal else _both_ways(sections, both)
+        x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
+    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
+    phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
+    return FlightLog(log.t, x, u, log.name), f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
+
+
+def _forward(sections, values):
+    start = signal.sosfilt_zi(sections)[..., None] * values[0]
+    return signal.sosfilt(sections, values, axis=0, zi=start)[0]
+
+
+def _both_ways(sections, values):
+    return signal.sosfiltfilt(sections, values, axis=0, padlen=min(9, len(values) - 1))
+
+
+def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
+    """Motor values as they were `lag` [s] before (negative: after); samples that would need unknown ones are cut.
+
+    Raises:
+        ValueError: no segment is longer than the lag.
+    """
+    parts = []
+    for part in segments(log):
+        piece = log[part]
+        end = piece.t[-1] + log.dt  # the last value is held for one more interval
+        inside = (piece.t - lag >= piece.t[0] - 1e-9) & (piece.t + log.dt - lag <= end + 1e-9)
+        if inside.sum() > 1:
+            at = np.append(piece.t[inside], piece.t[inside][-1] + log.dt) - lag
+            parts.append((piece[inside], mean_of_held(at, piece.t, piece.u)[:-1]))
+    if not parts:
+        raise ValueError(f"{log.name}: no segment without gaps is longer than the lag of {lag} s")
+    t, x = (np.concatenate([getattr(piece, name) for piece, _ in parts]) for name in ("t", "x"))
+    done = f"motors shifted by {1000 * lag:.1f} ms, {len(log) - len(t)} samples cut"
+    return FlightLog(t, x, np.concatenate([u for _, u in parts]), log.name), done
+
+
+def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
+    """Rotor speeds that follow the log's motor values as τ ẇ = u − w, averaged over each interval.
+
+    Raises:
+        ValueError: the time constant is negative, or samples are not evenly spaced.
+    """
+    if not 0 <= time_constant < np.inf:
+        raise ValueError(f"time_constant must be a number of seconds of at least 0, got {time_constant!r}")
+    _even_segments(log)
+    lagging = FlightLog(log.t, log.x, lagged(log, time_constant), log.name)
+    return lagging, f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
+
+
+def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
+    """`delay_motors` by the lag that cross-correlation with the angular acceleration finds.
+
+    Raises:
+        ValueError: too little flight to tell the lag.
+    """
+    found = respond(log, vehicle)
+    if found is None or sum(found.correlations[:2]) < 0.2:
+        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be told")
+    return delay_motors(log, found.lag)
+
+
+def follow_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
+    """`lag_motors` by the time constant that explains roll and pitch best.
+
+    Raises:
+        ValueError: too little flight to tell the time constant.
+    """
+    return lag_motors(log, estimate_time_constant(log, vehicle))
+
+
+def windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectories:
+    """Windows of `steps` intervals within segments, every `stride` intervals (by default they touch).
+
+    Raises:
+        ValueError: samples are not evenly spaced, or no segment is as long as a window.
+    """
+    parts = [
+        windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps, stride=stride)
+        for part in _even_segments(log)
+        if part.stop - part.start > steps
+    ]
+    if not parts:
+        longest = max((part.stop - part.start - 1 for part in segments(log)), default=0)
+        raise ValueError(
+            f"{log.name}: no window of steps={steps}: the longest segment without gaps has {longest} intervals"
+        )
+    return concatenate(parts)
+
+
+def _even_segments(log: FlightLog) -> list[slice]:
+    for part in (found := segments(log)):
+        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
+        if uneven.any():
+            at = log.t[part][int(uneven.argmax())]
+            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return found

@@ -1,0 +1,202 @@
+"""Any CSV log through a TOML file that says what its columns mean. Nothing about units or frames is assumed:
+
+[frames]
+world = "NED"                 # or "ENU" (any frame with z up)
+body = "FRD"                  # or "FLU"
+velocity = "world"            # or "body"
+[time]
+columns = ["timestamp"]
+unit = "us"                   # s, ms, us, ns
+[position]
+columns = ["x", "y", "z"]
+unit = "mm"                   # m, cm, mm
+[attitude]                    # body → world
+columns = ["q0", "q1", "q2", "q3"]
+unit = "wxyz"                 # or xyzw; or of three columns roll, pitch, yaw: rad, deg
+[velocity]
+columns = ["vx", "vy", "vz"]
+unit = "m/s"                  # m/s, cm/s, mm/s
+[body_rates]
+columns = ["p", "q", "r"]
+unit = "deg/s"                # rad/s, deg/s
+[motors]                      # in the order of the vehicle's rotors; which way they spin is the vehicle's
+columns = ["m3", "m1", "m4", "m2"]
+unit = "rpm"                  # rad/s, rpm, rev/s, or command with
+# polynomial = [150.0, 900.0] # rad/s = c0 + c1 command + c2 command² …
+[format]
+delimiter = ";"               # may be left out: a comma
+"""
+
+import math
+import tomllib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.flights.attitude import Frames, from_euler, to_library
+from hybrid_jax.flights.flight_csv import MOST_ROWS, flight_log, read_table
+from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
+
+SCALES = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "attitude": {"wxyz": 1.0, "xyzw": 1.0, "rad": 1.0, "deg": math.pi / 180},
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "body_rates": {"rad/s": 1.0, "deg/s": math.pi / 180},
+    "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0},
+}
+COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "motors": 4}
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of one quantity and the unit they are in; for motors, the map of a command to rad/s.
+
+    Attributes:
+        columns: names in the header.
+        unit: a key of `SCALES`.
+        polynomial: coefficients c0, c1, … of rotor speed [rad/s] = Σ cᵢ commandⁱ; empty unless the unit is "command".
+    """
+
+    columns: tuple[str, ...]
+    unit: str
+    polynomial: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """What the columns of a CSV log mean; `quantities` has one entry for each key of `SCALES`.
+
+    Raises:
+        ValueError: the table and the key that cannot be, in one line.
+    """
+
+    frames: Frames
+    quantities: dict[str, Columns]
+    delimiter: str = ","
+
+    def __post_init__(self):
+        for name, scales in SCALES.items():
+            if name not in self.quantities:
+                raise ValueError(f"[{name}]: is missing; give its columns and unit")
+            _check(name, self.quantities[name], scales)
+        if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
+            raise ValueError(f"[format]: delimiter must be one character, got {self.delimiter!r}")
+
+    @property
+    def names(self) -> list[str]:
+        """All columns, in the order of `SCALES`."""
+        return [column for name in SCALES for column in self.quantities[name].columns]
+
+
+def load_column_map(path: str | Path) -> ColumnMap:
+    """Read a column map.
+
+    Raises:
+        ValueError: file, table, key and what was expected, in one line.
+    """
+    try:
+        tables = tomllib.loads(Path(path).read_text())
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ValueError(f"{path}: not a readable TOML file: {error}") from error
+    try:
+        return _column_map(tables)
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from error
+
+
+def read_mapped(path: str | Path, column_map: ColumnMap, *, most_rows: int = MOST_ROWS) -> FlightLog:
+    """Read one flight of a CSV file, plain or gzip, into the library's units and frames.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    table = read_table(path, column_map.names, delimiter=column_map.delimiter, most_rows=most_rows)
+    return flight_log(path, convert(table, column_map, str(path)))
+
+
+def convert(table: Float[np.ndarray, "n c"], column_map: ColumnMap, origin: str = "table") -> Float[np.ndarray, "n 18"]:
+    """Numbers in the order of `column_map.names` → t, state, rotor speeds as in `hybrid_jax.state`.
+
+    Raises:
+        ValueError: angles declared in rad that are degrees, or an attitude of norm zero.
+    """
+    ends = np.cumsum([len(column_map.quantities[name].columns) for name in SCALES])
+    parts = dict(zip(SCALES, np.split(table, ends[:-1], axis=1), strict=True))
+    parts = {name: part * SCALES[name][column_map.quantities[name].unit] for name, part in parts.items()}
+    q = _attitude(parts["attitude"], column_map.quantities["attitude"], origin)
+    motors, polynomial = parts["motors"], column_map.quantities["motors"].polynomial
+    u = np.polynomial.polynomial.polyval(motors, polynomial) if polynomial else motors
+    x = to_library(parts["position"], q, parts["velocity"], parts["body_rates"], column_map.frames)
+    return np.concatenate([parts["time"], x, u], axis=1)
+
+
+def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str) -> Float[np.ndarray, "n 4"]:
+    if len(stated.columns) == 3:
+        row = int(np.abs(values).max(axis=1).argmax())
+        # Yaw may be counted over turns, tilt may not.
+        if np.abs(values[:, :2]).max() > 2 * math.pi:
+            raise ValueError(
+                f"{origin}: row {row + 2}, field {' '.join(stated.columns)}: roll or pitch above 2π; "
+                'are the angles degrees? set [attitude] unit = "deg"'
+            )
+        return from_euler(values)
+    q = np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
+    with np.errstate(over="ignore"):
+        norm = np.linalg.norm(q, axis=1)
+    for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
+        raise ValueError(
+            f"{origin}: row {row + 2}, field {' '.join(stated.columns)}: norm is {norm[row]:.4g}, not 1; "
+            "cut out samples without an attitude, or name the four quaternion columns"
+        )
+    return q
+
+
+def _column_map(tables: dict[str, Any]) -> ColumnMap:
+    unknown = sorted(tables.keys() - {"frames", "format", *SCALES})
+    if unknown:
+        raise ValueError(f"[{unknown[0]}]: no such table; known are frames, {', '.join(SCALES)}, format")
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise ValueError(f"[{name}]: must be a table, got {table!r}")
+    frames, form = tables.get("frames", {}), tables.get("format", {})
+    _require_keys("frames", frames, ("world", "body", "velocity"), ())
+    _require_keys("format", form, (), ("delimiter",))
+    quantities = {}
+    for name in SCALES:
+        if name in tables:
+            _require_keys(name, tables[name], ("columns", "unit"), ("polynomial",))
+            lists = {key: tables[name].get(key, []) for key in ("columns", "polynomial")}
+            if not all(isinstance(value, list) for value in lists.values()):
+                raise ValueError(f"[{name}]: columns and polynomial must be lists, got {lists}")
+            quantities[name] = Columns(tuple(lists["columns"]), tables[name]["unit"], tuple(lists["polynomial"]))
+    try:
+        return ColumnMap(Frames(**frames), quantities, form.get("delimiter", ","))
+    except TypeError as error:
+        raise ValueError(f"a value of the wrong type: {error}") from error
+
+
+def _require_keys(name: str, table: dict[str, Any], needed: tuple[str, ...], allowed: tuple[str, ...]) -> None:
+    for key in needed:
+        if key not in table:
+            raise ValueError(f"[{name}]: {key} is missing")
+    for key in table:
+        if key not in needed + allowed:
+            raise ValueError(f"[{name}]: {key}: no such key; known are {', '.join(needed + allowed)}")
+
+
+def _check(name: str, stated: Columns, scales: dict[str, float]) -> None:
+    if not isinstance(stated.unit, str) or stated.unit not in scales:
+        raise ValueError(f"[{name}]: unit must be one of {', '.join(scales)}, got {stated.unit!r}")
+    count = COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
+    if len(stated.columns) != count or not all(isinstance(column, str) for column in stated.columns):
+        raise ValueError(f"[{name}]: columns must be {count} names for unit {stated.unit}, got {list(stated.columns)}")
+    numbers = [isinstance(c, int | float) and math.isfinite(c) for c in stated.polynomial]
+    if bool(numbers) != (stated.unit == "command") or not all(numbers):
+        raise ValueError(
+            f"[{name}]: polynomial must be numbers c0, c1, … if and only if the unit is command, "
+            f"got {list(stated.polynomial)} for {stated.unit}"
+        )

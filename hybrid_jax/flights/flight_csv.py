@@ -1,0 +1,151 @@
+"""Flight-log CSV, plain or gzip: t, then the state, then the rotor speeds, one row per sample; SI units.
+
+The header names the columns; their order is free and columns of other names are left out.
+"""
+
+import gzip
+import io
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import IO
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.flights.attitude import rates_between
+from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
+from hybrid_jax.state import BODY_RATES, QUATERNION
+
+BLOCK = 1 << 22  # characters read at once
+LONGEST_ROW = 1 << 16
+MOST_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
+
+
+def read_csv(path: str | Path, *, most_rows: int = MOST_ROWS) -> FlightLog:
+    """Read one flight.
+
+    Raises:
+        ValueError: file, row (the first line is row 1), field and what to do, in one line.
+    """
+    return flight_log(path, read_table(path, COLUMNS, most_rows=most_rows))
+
+
+def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
+    """The flight of a file whose row i + 2 holds table[i] in the order of `COLUMNS`, SI units and the library's frames.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    t, x, u = table[:, 0], table[:, 1:14], table[:, 14:]
+    require_possible(t, x, u, path, "row", 2)
+    log = FlightLog(t, x, u, str(path))
+    _refuse_degrees(log, path)
+    return log
+
+
+def read_table(
+    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", most_rows: int = MOST_ROWS
+) -> Float[np.ndarray, "n c"]:
+    """The named columns of a CSV file with a header, in the order asked for; every number is finite.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    try:
+        with Path(path).open("rb") as file:
+            parts = list(_parts(path, _text(file), columns, delimiter, most_rows))
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path}: is not text; export the log as CSV in UTF-8") from error
+    except (EOFError, zlib.error) as error:
+        raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    return np.concatenate(parts)
+
+
+def _text(file: IO[bytes]) -> IO[str]:
+    packed = file.read(2) == b"\x1f\x8b"
+    file.seek(0)
+    return io.TextIOWrapper(gzip.open(file) if packed else file, encoding="utf-8-sig")  # type: ignore[arg-type]
+
+
+def _parts(path, text: IO[str], columns, delimiter: str, most_rows: int) -> Iterator[Float[np.ndarray, "n c"]]:
+    header = text.readline(LONGEST_ROW)
+    names = [name.strip() for name in header.split(delimiter)]
+    for name in columns:
+        if names.count(name) != 1:
+            raise ValueError(_header_complaint(path, name, names, header))
+    picked, row = [names.index(name) for name in columns], 2
+    while block := text.read(BLOCK):
+        lines = (block + text.readline(LONGEST_ROW)).split("\n")
+        if not lines[-1]:
+            lines.pop()
+        elif len(lines[-1]) >= LONGEST_ROW:
+            raise ValueError(
+                f"{path}: row {row + len(lines) - 1}: is longer than any row of numbers; is this a CSV file?"
+            )
+        if row - 2 + len(lines) > most_rows:
+            raise ValueError(f"{path}: row {most_rows + 2}: more than {most_rows} rows; split the file by flight")
+        yield _numbers(path, lines, row, names, picked, delimiter)
+        row += len(lines)
+    if row == 2:
+        raise ValueError(f"{path}: row 2: there are no samples below the header; record or export the flight again")
+
+
+def _header_complaint(path, name: str, names: list[str], header: str) -> str:
+    if not header.strip():
+        return f"{path}: row 1: the file is empty or has no header; export the log again"
+    if name in names:
+        return f"{path}: row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
+    found = ", ".join(names[:20])[:200].encode("unicode_escape").decode()
+    return f"{path}: row 1, field {name}: no such column among {found}; rename a column or use a column map"
+
+
+def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
+    """The picked cells of some lines, the first of which is the given row."""
+    commas = len(names) - 1
+    for at, line in enumerate(lines):
+        if line.count(delimiter) != commas:
+            found = f"{line.count(delimiter) + 1} fields" if line.strip() else "a blank line"
+            raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; repair or cut the row out")
+    try:
+        table = np.loadtxt(lines, delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
+    except ValueError:
+        table = None
+    if table is None or table.shape != (len(lines), len(picked)) or not np.isfinite(table).all():
+        raise ValueError(f"{path}: {_bad_cell(lines, row, names, picked, delimiter)}")
+    return table
+
+
+def _bad_cell(lines, row, names, picked, delimiter) -> str:
+    for at, line in enumerate(lines):
+        cells = line.split(delimiter)
+        for column in picked:
+            cell = cells[column].strip()
+            try:
+                if np.isfinite(np.loadtxt([cell or "-"], delimiter=delimiter, comments=None)).all():
+                    continue
+            except ValueError:
+                pass
+            found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
+            return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"
+    return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"
+
+
+def _refuse_degrees(log: FlightLog, path: str | Path) -> None:
+    """Body rates that are 180/π times what the attitude does are degrees."""
+    if len(log) < 3:
+        return
+    log = log[:100_000]  # enough to tell, and no second copy of a long log
+    turned = np.linalg.norm(rates_between(log.t, log.x[:, QUATERNION]), axis=1)
+    stated = np.linalg.norm(log.x[:-1, BODY_RATES], axis=1)
+    # Medians: noise and lost samples are no unit.
+    if np.median(turned) > 0.02 and 30 < np.median(stated) / np.median(turned) < 110:
+        row = int(stated.argmax()) + 2
+        raise ValueError(
+            f"{path}: row {row}, field wx wy wz: body rates (here {stated.max():.4g}) are 57 times those of the "
+            f"attitude: degrees per second; convert them to rad/s or declare the unit in a column map"
+        )

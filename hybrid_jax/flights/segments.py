@@ -1,0 +1,30 @@
+"""Where a log may be integrated: stretches without gaps and without samples that were repeated because none came."""
+
+import numpy as np
+from jaxtyping import Bool
+
+from hybrid_jax.flights.log import FlightLog
+
+GAP = 1.5  # intervals longer than this many times the median are gaps
+
+
+def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether samples are missing in an interval."""
+    return np.diff(log.t) > GAP * log.dt if len(log) > 1 else np.zeros(0, bool)
+
+
+def repeats(log: FlightLog) -> Bool[np.ndarray, " n"]:
+    """Whether a sample's state is, to the last digit, that of the sample before: a vehicle in flight has noise."""
+    return np.concatenate([[False], (np.diff(log.x, axis=0) == 0).all(axis=1)])
+
+
+def sound_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether an interval has no gap and two measured ends."""
+    stale = repeats(log)
+    return ~(gaps(log) | stale[:-1] | stale[1:])
+
+
+def segments(log: FlightLog) -> list[slice]:
+    """The longest runs of samples joined by sound intervals, two samples or more each."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], sound_intervals(log), [0]])))
+    return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]

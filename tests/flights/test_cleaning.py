@@ -1,0 +1,170 @@
+"""Cleaning never joins what was apart, says what it did, and does to known signals what it says."""
+
+import numpy as np
+import pytest
+
+from hybrid_jax.flights.cleaning import (
+    align_motors,
+    delay_motors,
+    follow_motors,
+    lag_motors,
+    low_pass,
+    resample,
+    windows,
+)
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.motor_response import lagged
+from hybrid_jax.flights.segments import gaps, repeats, segments
+from hybrid_jax.trajectories import check
+from hybrid_jax.vehicle import IRIS
+
+
+def with_gap(log, start=400, stop=420):
+    kept = np.ones(len(log), bool)
+    kept[start:stop] = False
+    return log[kept]
+
+
+def with_repeat(log, at=700):
+    x = log.x.copy()
+    x[at] = x[at - 1]
+    return FlightLog(log.t, x, log.u)
+
+
+def test_segments_end_at_gaps_and_repeats(flight):
+    log = with_repeat(with_gap(flight), 680)
+    assert np.flatnonzero(gaps(log)).tolist() == [399]
+    assert np.flatnonzero(repeats(log)).tolist() == [680]
+    assert segments(log) == [slice(0, 400), slice(400, 680), slice(681, len(log))]
+
+
+@pytest.mark.parametrize("stride", [None, 1, 7])
+def test_windows_hold_consecutive_samples_and_never_cross_a_gap(flight, stride):
+    x = flight.x.copy()
+    x[:, 0] = flight.t  # each state says when it was
+    marked = with_repeat(with_gap(FlightLog(flight.t, x, flight.u)))
+    cut = check(windows(marked, 20, stride))
+    times = np.concatenate([cut.x0[:, None, 0], cut.x[:, :, 0]], axis=1)
+    np.testing.assert_allclose(np.diff(times, axis=1), 0.01, atol=1e-9)
+    np.testing.assert_array_equal(cut.u[0], marked.u[:20])
+    expected = sum((part.stop - part.start - 21) // (stride or 20) + 1 for part in segments(marked))
+    assert len(cut) == expected
+
+
+def test_windows_refuse_what_they_cannot_cut(flight, refusal):
+    refusal(lambda: windows(with_gap(flight[:800]), 500), "steps=500", "399 intervals")
+    t = flight.t.copy()
+    t[50] += 0.003
+    refusal(lambda: windows(FlightLog(t, flight.x, flight.u), 10), "resample")
+
+
+def test_resampling_a_flight_gives_the_flight(flight):
+    rng = np.random.default_rng(0)
+    t = flight.t + rng.uniform(-0.002, 0.002, len(flight))
+    x = np.stack([np.interp(t, flight.t, column) for column in flight.x.T], axis=1)
+    log, done = resample(FlightLog(t, x, flight.u), 0.01)
+    at = np.round((log.t - flight.t[0]) / 0.01).astype(int)
+    np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-12)
+    np.testing.assert_allclose(log.x, flight.x[at], atol=0.02)  # linear between samples: ẍ dt² / 8
+    assert "resampled 1200 samples" in done
+    assert len(windows(log, 50)) >= 23
+
+
+def test_resampling_keeps_gaps_unless_asked_to_bridge_them(flight):
+    log = with_gap(flight)
+    kept, _ = resample(log, 0.01)
+    bridged, done = resample(log, 0.01, longest_gap=0.25)
+    assert (len(segments(kept)), len(segments(bridged))) == (2, 1)
+    assert "0.25" in done
+    np.testing.assert_allclose(kept.t, log.t, atol=1e-9)
+    repeated, _ = resample(with_repeat(flight), 0.01, longest_gap=0.021)
+    assert not repeats(repeated).any()
+    np.testing.assert_allclose(repeated.x[700], 0.5 * (flight.x[699] + flight.x[701]), atol=1e-4)
+
+
+def test_coarser_resampling_loses_no_thrust(flight):
+    log, _ = resample(flight, 0.04)
+    first = int(np.argmin(np.abs(flight.t - log.t[0])))
+    means = flight.u[first : first + 4 * (len(log) - 1)].reshape(-1, 4, 4).mean(axis=1)
+    np.testing.assert_allclose(log.u[:-1], means, rtol=1e-6)
+
+
+def tone(flight, hertz):
+    x = np.tile(flight.x[:1], (len(flight), 1))
+    x[:, 12] = np.sin(2 * np.pi * hertz * flight.t)
+    u = np.tile(500 + 100 * x[:, 12:], (1, 4))
+    return FlightLog(flight.t, x, u)
+
+
+@pytest.mark.parametrize(("causal", "gain"), [(False, 0.5), (True, np.sqrt(0.5))])
+def test_a_tone_at_the_cutoff_is_damped_as_stated(flight, causal, gain):
+    log, done = low_pass(tone(flight, 5.0), 5.0, causal=causal)
+    middle = slice(400, 800)
+    assert np.abs(log.x[middle, 12]).max() == pytest.approx(gain, rel=0.02)
+    # States and motors are filtered alike.
+    np.testing.assert_allclose(log.u[middle, 0], 500 + 100 * log.x[middle, 12], atol=1e-6)
+    assert ("causal" in done, "zero phase" in done) == (causal, not causal)
+
+
+def test_the_stated_delay_is_that_of_slow_motion(flight):
+    slow = tone(flight, 0.5)
+    zero, _ = low_pass(slow, 5.0)
+    late, done = low_pass(slow, 5.0, causal=True)
+    middle = slice(300, 900)
+    np.testing.assert_allclose(zero.x[middle, 12], slow.x[middle, 12], atol=1e-3)
+    expected = np.sin(2 * np.pi * 0.5 * (slow.t - 0.045))
+    assert "45.0 ms late" in done
+    np.testing.assert_allclose(late.x[middle, 12], expected[middle], atol=0.01)
+
+
+def test_filters_do_not_reach_across_gaps(flight):
+    other = flight.x.copy()
+    other[420:, 10:] += 5.0
+    a, _ = low_pass(with_gap(flight), 5.0)
+    b, _ = low_pass(with_gap(FlightLog(flight.t, other, flight.u)), 5.0)
+    np.testing.assert_array_equal(a.x[:400], b.x[:400])
+
+
+@pytest.mark.parametrize("cutoff", [0.0, 50.1, -1.0, np.nan])
+def test_impossible_cutoffs_are_refused(flight, refusal, cutoff):
+    refusal(lambda: low_pass(flight, cutoff), "cutoff must lie between 0 and half the sampling frequency")
+
+
+@pytest.mark.parametrize("steps", [-3, 0, 4])
+def test_a_shift_by_whole_samples_moves_rows(flight, steps):
+    log, done = delay_motors(flight, steps * 0.01)
+    at = np.searchsorted(flight.t, log.t + 1e-6) - 1
+    assert len(log) == len(flight) - abs(steps)
+    np.testing.assert_allclose(log.u, flight.u[at - steps], rtol=1e-6)
+    np.testing.assert_allclose(log.x, flight.x[at], rtol=0, atol=1e-15)
+    assert f"{abs(steps)} samples cut" in done
+
+
+def test_alignment_finds_the_shift(flight, refusal):
+    late = FlightLog(flight.t[:-5], flight.x[:-5], flight.u[5:])
+    log, done = align_motors(late, IRIS)
+    assert float(done.split("by ")[1].split(" ms")[0]) == pytest.approx(50, abs=2)
+    np.testing.assert_allclose(log.u, flight.u[5:-1][: len(log)], rtol=0.02)
+    still = FlightLog(flight.t, flight.x, flight.u * 0 + 400)
+    refusal(lambda: align_motors(still, IRIS), "do not follow the motors")
+    refusal(lambda: follow_motors(still, IRIS), "do not follow the motors")
+
+
+def test_a_lag_of_first_order_answers_a_step_with_an_exponential(flight):
+    u = np.where(np.arange(len(flight))[:, None] < 100, 400.0, 500.0) * np.ones(4)
+    log, done = lag_motors(FlightLog(flight.t, flight.x, u), 0.05)
+    edges = 500 - 100 * np.exp(-np.arange(31) * 0.01 / 0.05)
+    area = 500 * 0.01 + 0.05 * np.diff(500 - edges)  # of each interval, in closed form
+    np.testing.assert_allclose(log.u[100:130, 0], area / 0.01, rtol=1e-9)
+    np.testing.assert_allclose(log.u[:100], 400)
+    assert "50.0 ms" in done
+
+
+def test_the_time_constant_of_commands_is_found(flight):
+    """Commands that a lag of 40 ms turns into the flight's rotor speeds."""
+    speeds, step = flight.u, flight.dt / 0.04
+    commands = speeds[:-1] + np.diff(speeds, axis=0) / (1 - np.exp(-step))
+    commanded = FlightLog(flight.t[:-1], flight.x[:-1], np.maximum(commands, 0))
+    np.testing.assert_allclose(lagged(commanded, 0.04)[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
+    _, done = follow_motors(commanded, IRIS)
+    assert float(done.split("of ")[1].split(" ms")[0]) == pytest.approx(40, rel=0.25)

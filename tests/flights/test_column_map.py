@@ -1,0 +1,132 @@
+"""A log in other names, units, orders and frames becomes the same flight as in the library's own."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.column_map import load_column_map, read_mapped
+
+GOOD = """
+[frames]
+world = "NED"
+body = "FRD"
+velocity = "body"
+[time]
+columns = ["stamp"]
+unit = "us"
+[position]
+columns = ["x", "y", "z"]
+unit = "mm"
+[attitude]
+columns = ["q1", "q2", "q3", "q4"]
+unit = "xyzw"
+[velocity]
+columns = ["u", "v", "w"]
+unit = "cm/s"
+[body_rates]
+columns = ["p", "q", "r"]
+unit = "deg/s"
+[motors]
+columns = ["m3", "m1", "m4", "m2"]
+unit = "rpm"
+[format]
+delimiter = ";"
+"""
+EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
+AFFINE = [('"rpm"', '"command"\npolynomial = [100.0, 1000.0]')]
+QUADRATIC = [('"rpm"', '"command"\npolynomial = [50, 200.0, 800.0]')]
+
+
+def foreign(flight):
+    """The flight as a logger in NED, FRD and the units of GOOD writes it, by name of column."""
+    world, body = WORLDS["NED"], BODIES["FRD"]
+    to_world = Rotation.from_quat(np.roll(flight.x[:, 3:7], -1, axis=1))
+    attitude = Rotation.from_matrix(world.T @ to_world.as_matrix() @ body)
+    u = flight.u
+    command = (u - 100) / 1000
+    squared = (-200 + np.sqrt(200**2 + 4 * 800 * (u - 50))) / 1600
+    yaw, pitch, roll = attitude.as_euler("ZYX", degrees=True).T
+    columns = {"stamp": flight.t * 1e6 + 7e9, "roll": roll, "pitch": pitch, "yaw": yaw}
+    columns |= dict(zip("xyz", 1000 * world.T @ flight.x[:, :3].T, strict=True))
+    columns |= dict(zip(("q1", "q2", "q3", "q4"), attitude.as_quat().T, strict=True))
+    columns |= dict(zip("uvw", 100 * body @ to_world.inv().apply(flight.x[:, 7:10]).T, strict=True))
+    columns |= dict(zip("pqr", np.rad2deg(body @ flight.x[:, 10:].T), strict=True))
+    for name, motors in (("rpm", u * 30 / np.pi), ("affine", command), ("quadratic", squared)):
+        columns |= dict(zip((f"{name}_{m}" for m in ("m3", "m1", "m4", "m2")), motors.T, strict=True))
+    return columns
+
+
+@pytest.fixture
+def mapped(tmp_path):
+    def read(columns, changes=(), motors="rpm"):
+        text = GOOD
+        for old, new in changes:
+            assert old in text
+            text = text.replace(old, new)
+        (tmp_path / "map.toml").write_text(text)
+        names = [name.removeprefix(f"{motors}_") for name in columns]
+        rows = [";".join(map(repr, row)) for row in np.column_stack(list(columns.values())).tolist()]
+        (tmp_path / "log.csv").write_text("\n".join([";".join(names), *rows]))
+        return read_mapped(tmp_path / "log.csv", load_column_map(tmp_path / "map.toml"))
+
+    return read
+
+
+@pytest.mark.parametrize(
+    ("changes", "motors"), [((), "rpm"), (EULER, "rpm"), (AFFINE, "affine"), (QUADRATIC, "quadratic")]
+)
+def test_a_foreign_log_is_the_same_flight(flight, mapped, changes, motors):
+    log = mapped(foreign(flight), changes, motors)
+    np.testing.assert_allclose(log.t - log.t[0], flight.t - flight.t[0], atol=1e-9)
+    np.testing.assert_allclose(log.x, flight.x, atol=1e-9)
+    np.testing.assert_allclose(log.u, flight.u, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ([('world = "NED"', 'world = "SED"')], ("world must be one of ENU, NED", "'SED'")),
+        ([('world = "NED"', "")], ("[frames]", "world is missing")),
+        ([('unit = "mm"', 'unit = "ft"')], ("[position]", "m, cm, mm", "'ft'")),
+        ([('unit = "mm"', "unit = 3")], ("[position]", "unit")),
+        ([('unit = "mm"', "")], ("[position]", "unit is missing")),
+        ([('["u", "v", "w"]', '["u", "v"]')], ("[velocity]", "3 names")),
+        ([('["u", "v", "w"]', '"uvw"')], ("[velocity]", "lists")),
+        ([("[position]", "[place]")], ("[place]", "no such table")),
+        ([('unit = "deg/s"', 'unit = "deg/s"\nsign = 1')], ("[body_rates]", "sign", "no such key")),
+        ([('"rpm"', '"command"')], ("[motors]", "polynomial")),
+        ([('"rpm"', '"rpm"\npolynomial = [1.0]')], ("[motors]", "polynomial")),
+        ([('delimiter = ";"', 'delimiter = ";;"')], ("[format]", "delimiter")),
+        ([("[format]", "[format")], ("not a readable TOML",)),
+    ],
+)
+def test_a_wrong_map_is_refused(flight, mapped, refusal, tmp_path, changes, words):
+    refusal(lambda: mapped(foreign(flight[:3]), changes), tmp_path / "map.toml", *words)
+
+
+def test_wrong_data_are_refused_with_the_users_own_names(flight, mapped, refusal):
+    columns = foreign(flight)
+    refusal(lambda: mapped(columns, [*EULER[:1], ('"xyzw"', '"rad"')]), "log.csv", "roll pitch yaw", "degrees")
+    refusal(lambda: mapped(columns, [('"deg/s"', '"rad/s"')]), "log.csv", "row", "degrees per second")
+    refusal(lambda: mapped(columns, [('"p", ', '"pp", ')]), "log.csv", "field pp", "column map")
+    stopped = columns | {"q1": columns["q1"] * 0, "q2": columns["q1"] * 0, "q3": columns["q1"] * 0}
+    stopped["q4"] = np.where(np.arange(len(flight)) == 7, 0.0, 1.0)
+    refusal(lambda: mapped(stopped), "row 9", "q1 q2 q3 q4", "norm is 0")
+    refusal(lambda: mapped(columns | {"u": np.where(flight.t > 0.305, np.nan, 0)}), "row", "field u")
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.text(max_size=80), st.integers(0, len(GOOD)))
+def test_any_map_is_read_or_refused(tmp_path_factory, text, at):
+    path = tmp_path_factory.getbasetemp() / "fuzzed.toml"
+    path.write_bytes((GOOD[:at] + text + GOOD[at:]).encode("utf-8", "replace"))
+    try:
+        load_column_map(path)
+        message = str(path)
+    except ValueError as error:
+        message = str(error)
+    assert "\n" not in message
+    assert str(path) in message

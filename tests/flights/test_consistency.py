@@ -1,0 +1,130 @@
+"""A sound flight passes every check; each usual mistake is caught by the check for it, which names the correction."""
+
+import numpy as np
+import pytest
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
+from hybrid_jax.flights.cleaning import delay_motors
+from hybrid_jax.flights.consistency import FAILS, NOTHING, OK, UNKNOWN, check_log
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.motor_response import ORDERS
+from hybrid_jax.vehicle import IRIS
+
+VELOCITY, RATES, THRUST = "dp/dt against v", "q̇ against ω", "v̇ against thrust along body z"
+RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
+YAW, LAG = "spin against yaw", "lag of the gyro behind the motors"
+
+
+def table(log):
+    return {check.name: check for check in check_log(log, IRIS)}
+
+
+def with_parts(log, p=None, q=None, v=None, omega=None, u=None):
+    parts = [log.x[:, :3], log.x[:, 3:7], log.x[:, 7:10], log.x[:, 10:]]
+    chosen = [own if other is None else other for own, other in zip(parts, (p, q, v, omega), strict=True)]
+    return FlightLog(log.t, np.concatenate(chosen, axis=1), log.u if u is None else u)
+
+
+def noisy(log, rng):
+    """Sensors of a small quadrotor."""
+    x = log.x + rng.normal(size=log.x.shape) * np.repeat([1e-3, 2e-3, 0.02, 0.03], [3, 4, 3, 3])
+    return FlightLog(log.t, x, log.u + rng.normal(size=log.u.shape))
+
+
+def as_ned(log):
+    """The numbers that a logger in NED and FRD would have written."""
+    world, body = WORLDS["NED"], BODIES["FRD"]
+    q = quaternion_of(rotation_of(np.eye(4)[:1]).from_matrix(world.T @ rotation_of(log.x[:, 3:7]).as_matrix() @ body))
+    return with_parts(log, log.x[:, :3] @ world, q, log.x[:, 7:10] @ world, log.x[:, 10:] @ body)
+
+
+@pytest.mark.parametrize("noise", [False, True])
+def test_a_sound_flight_passes(flight, noise):
+    log = noisy(flight, np.random.default_rng(0)) if noise else flight
+    for check in check_log(log, IRIS):
+        assert (check.verdict, check.suggestion) == (OK, NOTHING), check
+
+
+def body_velocity(log):
+    return with_parts(log, v=rotation_of(log.x[:, 3:7]).inv().apply(log.x[:, 7:10]))
+
+
+def gyro_in_world(log):
+    return with_parts(log, omega=rotation_of(log.x[:, 3:7]).apply(log.x[:, 10:]))
+
+
+MISTAKES = {
+    "body velocity": (body_velocity, VELOCITY, "body frame (FLU)"),
+    "NED velocity": (lambda log: with_parts(log, v=log.x[:, 7:10] @ WORLDS["NED"]), VELOCITY, "velocity is NED"),
+    "mm": (lambda log: with_parts(log, p=log.x[:, :3] * 1000), VELOCITY, "position is in mm"),
+    "xyzw": (lambda log: with_parts(log, q=np.roll(log.x[:, 3:7], -1, axis=1)), RATES, "(x, y, z, w), read as"),
+    "inverse": (lambda log: with_parts(log, q=log.x[:, 3:7] * [1, -1, -1, -1]), RATES, "world → body"),
+    "degrees": (lambda log: with_parts(log, omega=np.rad2deg(log.x[:, 10:])), RATES, "degrees"),
+    "FRD rates": (lambda log: with_parts(log, omega=log.x[:, 10:] @ BODIES["FRD"]), RATES, "FRD"),
+    "world rates": (gyro_in_world, RATES, "world frame"),
+    "NED and FRD": (as_ned, THRUST, 'world = "NED" and body = "FRD"'),
+    "rpm": (lambda log: with_parts(log, u=log.u * 30 / np.pi), RATIO, "rpm"),
+    "commands": (lambda log: with_parts(log, u=log.u / 1100), RATIO, "normalised"),
+    "thrust": (lambda log: with_parts(log, u=log.u * 1.3), RATIO, "thrust_coefficient by 0.59"),
+    "lag": (lambda log: with_parts(log[:-5], u=log.u[5:]), LAG, "ms later"),
+    "lead": (lambda log: with_parts(log[5:], u=log.u[:-5]), LAG, "ms earlier"),
+}
+
+
+@pytest.mark.parametrize("mistake", MISTAKES)
+def test_a_mistake_is_caught_and_its_correction_named(flight, mistake):
+    make, name, words = MISTAKES[mistake]
+    check = table(make(noisy(flight, np.random.default_rng(1))))[name]
+    assert check.verdict == FAILS, check
+    assert words in check.suggestion, check
+
+
+@pytest.mark.parametrize("order", ORDERS.tolist(), ids=str)
+def test_any_order_of_motors_is_told(flight, order):
+    check = table(with_parts(flight, u=flight.u[:, order]))[ORDER]
+    back = " ".join(f"u{order.index(rotor)}" for rotor in range(4))
+    assert check.suggestion == NOTHING if order == [0, 1, 2, 3] else back in check.suggestion
+
+
+def test_reversed_spin_is_told(flight):
+    arms, squares = np.array(IRIS.rotor_positions), flight.u**2
+    mix = np.stack([np.ones(4), arms[:, 1], -arms[:, 0], np.array(IRIS.spin)])
+    squares = np.linalg.solve(mix, mix @ squares.T * [[1], [1], [1], [-1]]).T
+    check = table(with_parts(flight, u=np.sqrt(squares)))
+    assert check[ORDER].verdict == OK
+    assert (check[YAW].verdict, "flip" in check[YAW].suggestion) == (FAILS, True)
+
+
+def test_the_suggested_shift_repairs_the_lag(flight):
+    late = with_parts(flight[:-5], u=flight.u[5:])
+    assert table(late)[LAG].value == pytest.approx(50, abs=2)
+    repaired, _ = delay_motors(late, table(late)[LAG].value / 1000)
+    assert table(repaired)[LAG].verdict == OK
+
+
+def test_gaps_and_repeats_are_counted_and_hide_no_other_mistake(flight):
+    kept = np.ones(len(flight), bool)
+    kept[101::50] = False
+    x = flight.x.copy()
+    x[30::60] = x[29::60][: len(x[30::60])]
+    check = table(FlightLog(flight.t, x, flight.u)[kept])
+    assert check["gaps"].value == pytest.approx(22 / 1178, rel=0.1)
+    assert check["repeated samples"].value == pytest.approx(20 / 1178, rel=0.1)
+    assert [check[name].verdict for name in ("gaps", "repeated samples", VELOCITY, RATES, THRUST)] == [FAILS] * 2 + [
+        OK
+    ] * 3
+
+
+def test_a_vehicle_at_rest_tells_nothing(flight):
+    x = np.tile(flight.x[:1], (300, 1))
+    x[:, 3:] = [1.0, *np.zeros(9)]
+    x[:, 0] += np.random.default_rng(0).normal(size=300) * 1e-4
+    log = FlightLog(np.arange(300) * 0.01, x, np.full((300, 4), IRIS.hover_speed))
+    found = table(log)
+    assert {found[name].verdict for name in (VELOCITY, RATES, THRUST, ORDER, YAW, LAG)} == {UNKNOWN}
+    assert found[RATIO].verdict == OK
+
+
+@pytest.mark.parametrize("samples", [2, 3, 10, 30])
+def test_short_logs_are_checked_without_error(flight, samples):
+    assert len(table(flight[:samples])) == 9

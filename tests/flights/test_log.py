@@ -1,0 +1,55 @@
+"""A flight log is whole and possible, or refused with the first thing that is wrong."""
+
+import numpy as np
+import pytest
+
+from hybrid_jax.flights.log import FlightLog
+
+
+def parts(log):
+    return {"t": log.t.copy(), "x": log.x.copy(), "u": log.u.copy()}
+
+
+def test_quaternions_become_unit_and_continuous(flight):
+    signs = np.where(np.arange(len(flight)) % 3 == 1, -1.01, 0.99)[:, None]
+    x = np.concatenate([flight.x[:, :3], flight.x[:, 3:7] * signs, flight.x[:, 7:]], axis=1)
+    again = FlightLog(flight.t, x, flight.u)
+    np.testing.assert_allclose(again.x, flight.x, atol=1e-12)
+    assert again.x[0, 3] >= 0
+
+
+def test_the_arrays_given_are_not_changed(flight):
+    x = -flight.x
+    x[:, 3:7] *= 1.01
+    before = x.copy()
+    FlightLog(flight.t, x, flight.u)
+    np.testing.assert_array_equal(x, before)
+
+
+@pytest.mark.parametrize(
+    ("array", "at", "value", "words"),
+    [
+        ("t", 5, np.nan, ("sample 5", "field t", "nan")),
+        ("t", 5, 0.0, ("sample 5", "field t", "goes back")),
+        ("x", (7, 8), np.inf, ("sample 7", "field vy", "inf")),
+        ("u", (3, 2), np.nan, ("sample 3", "field u2")),
+        ("u", (3, 2), -1.0, ("sample 3", "field u2", "negative")),
+        ("x", (9, slice(3, 7)), 0.0, ("sample 9", "qw", "norm is 0")),
+        ("x", (9, 3), 1e200, ("sample 9", "qw", "norm is inf")),
+    ],
+)
+def test_what_cannot_be_is_named(flight, refusal, array, at, value, words):
+    broken = parts(flight)
+    broken[array][at] = value
+    refusal(lambda: FlightLog(**broken, name="mine"), "mine", *words)
+
+
+def test_a_repeated_time_is_told_from_one_that_goes_back(flight, refusal):
+    broken = parts(flight)
+    broken["t"][6] = broken["t"][5]
+    refusal(lambda: FlightLog(**broken), "sample 6", "repeats")
+
+
+def test_shapes_must_agree(flight, refusal):
+    refusal(lambda: FlightLog(flight.t[1:], flight.x, flight.u), "(n, 13)")
+    refusal(lambda: FlightLog(flight.t[:0], flight.x[:0], flight.u[:0]), "no samples")

@@ -1,0 +1,183 @@
+"""A ULog written here, byte by byte, is read as the flight it holds, whatever the clock of each topic.
+
+The format: docs.px4.io, "ULog File Format", version 1.
+"""
+
+import struct
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from scipy.interpolate import CubicSpline
+from scipy.spatial.transform import Rotation
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.ulog import read_ulog
+from hybrid_jax.state import QUATERNION
+
+pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
+
+FORMATS = {
+    "vehicle_local_position": "uint64_t timestamp;uint64_t timestamp_sample;"
+    "float x;float y;float z;float vx;float vy;float vz;",
+    "vehicle_attitude": "uint64_t timestamp;uint64_t timestamp_sample;float[4] q;",
+    "vehicle_angular_velocity": "uint64_t timestamp;uint64_t timestamp_sample;float[3] xyz;",
+    "actuator_motors": "uint64_t timestamp;uint64_t timestamp_sample;float[12] control;",
+    "esc_status": "uint64_t timestamp;esc_report[8] esc;",
+    "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
+}
+STATES = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity")
+START = 12_000_000  # µs since boot
+
+
+def message(kind, payload):
+    return struct.pack("<HB", len(payload), ord(kind)) + payload
+
+
+def ulog(topics):
+    """Bytes of a log: topic → list of packed samples, each of which begins with its time."""
+    parts = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", START), message("B", bytes(40))]
+    parts += [message("F", f"{name}:{fields}".encode()) for name, fields in FORMATS.items()]
+    parts += [message("A", struct.pack("<BH", 0, at) + name.encode()) for at, name in enumerate(topics)]
+    data = [(sample[:8], at, sample) for at, samples in enumerate(topics.values()) for sample in samples]
+    for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0])):
+        parts.append(message("D", struct.pack("<H", at) + sample))
+    return b"".join(parts)
+
+
+def stamped(times, values, delay=0):
+    """Samples of floats whose message came `delay` µs after what was measured."""
+    stamps = (START + np.round(times * 1e6)).astype(int).tolist()
+    return [
+        struct.pack(f"<QQ{len(row)}f", stamp + delay, stamp, *row) for stamp, row in zip(stamps, values, strict=True)
+    ]
+
+
+@pytest.fixture(scope="module")
+def topics(flight):
+    """The constructed flight as PX4 logs it: NED and FRD, position at 50 Hz, attitude at 125, gyro at 200."""
+    t = flight.t - flight.t[0]
+    body, world = BODIES["FRD"], WORLDS["NED"]
+
+    def at(rate, columns):
+        times = np.arange(0.003, t[-1], 1 / rate)
+        return times, CubicSpline(t, flight.x[:, columns])(times)
+
+    times, moving = at(50, [0, 1, 2, 7, 8, 9])
+    local = stamped(times, np.concatenate([moving[:, :3] @ world, moving[:, 3:] @ world], axis=1), delay=4000)
+    times, q = at(125, QUATERNION)
+    turned = Rotation.from_matrix(world.T @ Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix() @ body)
+    attitude = stamped(times, np.roll(turned.as_quat(), 1, axis=1), delay=2000)
+    times, omega = at(200, slice(10, 13))
+    return dict(zip(STATES, (local, attitude, stamped(times, omega @ body)), strict=True))
+
+
+def escs(t, u):
+    rpm = np.round(np.concatenate([u, 0 * u], axis=1) * 30 / np.pi).astype(int)
+    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
+    return [
+        struct.pack("<Q", stamp) + b"".join(struct.pack("<Qi", stamp, speed) for speed in row)
+        for stamp, row in zip(stamps, rpm.tolist(), strict=True)
+    ]
+
+
+def commands(t, u):
+    rest = np.full((len(u), 8), np.nan)
+    return stamped(t, np.concatenate([(u - 100) / 1000, rest], axis=1))
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(topics):
+        path = tmp_path / "flight.ulg"
+        path.write_bytes(topics if isinstance(topics, bytes) else ulog(topics))
+        return path
+
+    return write
+
+
+def test_a_flight_with_esc_rpm_is_read(flight, topics, written):
+    t = flight.t - flight.t[0]
+    log = read_ulog(written(topics | {"esc_status": escs(t, flight.u)}))
+    np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-9)
+    truth = CubicSpline(t, flight.x)(log.t + 0.003)
+    # Linear between samples: ẍ / (8 · 50²) of position and velocity, ω̈ / (8 · 200²) of rates; slerp of attitude.
+    np.testing.assert_allclose(log.x[:, 3:7], truth[:, 3:7], atol=2e-4)
+    np.testing.assert_allclose(log.x[:, [0, 1, 2, 7, 8, 9]], truth[:, [0, 1, 2, 7, 8, 9]], atol=5e-3)
+    np.testing.assert_allclose(log.x[:, 10:], truth[:, 10:], atol=5e-3)
+    # A sample at 3 ms finds 7 ms of one held value and 3 ms of the next.
+    mean = 0.7 * flight.u[:-1] + 0.3 * flight.u[1:]
+    np.testing.assert_allclose(log.u[:-1], mean[: len(log) - 1], atol=0.1)
+
+
+def test_a_flight_with_commands_is_read_through_their_map(flight, topics, written, refusal):
+    path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
+    log = read_ulog(path, polynomial=(100.0, 1000.0), motor_order=(2, 0, 3, 1))
+    np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
+    refusal(lambda: read_ulog(path), path, "actuator_motors", "polynomial")
+    refusal(lambda: read_ulog(path, motor_order=(0, 1, 2, 2)), "motor_order")
+    refusal(lambda: read_ulog(path, dt=0.0), "dt must be")
+
+
+def test_escs_that_report_nothing_leave_the_commands(flight, topics, written):
+    t = flight.t - flight.t[0] + 0.003
+    both = topics | {"esc_status": escs(t, 0 * flight.u), "actuator_motors": commands(t, flight.u)}
+    log = read_ulog(written(both), polynomial=(100.0, 1000.0))
+    np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-5)
+
+
+@pytest.mark.parametrize("missing", STATES)
+def test_a_missing_topic_is_named(flight, topics, written, refusal, missing):
+    motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
+    path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
+    refusal(lambda: read_ulog(path), path, missing, "add it")
+
+
+def test_a_log_without_motors_is_refused(topics, written, refusal):
+    path = written(topics)
+    refusal(lambda: read_ulog(path), path, "no motors", "actuator_motors", "esc_status")
+
+
+def test_a_dropout_becomes_a_gap(flight, topics, written):
+    t = flight.t - flight.t[0]
+    holed = topics["vehicle_attitude"][:500] + topics["vehicle_attitude"][550:]  # 0.4 s from 4.003 s on
+    log = read_ulog(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)}))
+    intervals = np.diff(log.t)
+    assert intervals.max() == pytest.approx(0.4, abs=0.02)
+    assert np.count_nonzero(intervals > 0.015) == 1
+    truth = CubicSpline(t, flight.x)(log.t + 0.003)
+    np.testing.assert_allclose(log.x[:, 3:7], truth[:, 3:7], atol=2e-4)
+
+
+def test_what_is_no_ulog_is_refused(flight, topics, written, refusal, tmp_path):
+    topics = topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)}
+    whole = ulog(topics)
+    for content in (b"", b"t,px,py\n", whole[:7]):
+        refusal(lambda content=content: read_ulog(written(content)), "flight.ulg")
+    refusal(lambda: read_ulog(tmp_path / "none.ulg"), "none.ulg", "cannot be read")
+    zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
+    refusal(lambda: read_ulog(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
+    bad = stamped(np.arange(0.0, 5, 0.01), np.full((500, 3), np.nan))
+    refusal(lambda: read_ulog(written(topics | {"vehicle_angular_velocity": bad})), "sample 0", "xyz[0]", "not finite")
+
+
+@pytest.fixture(scope="module")
+def short(flight, topics):
+    few = {name: samples[:60] for name, samples in topics.items()}
+    return ulog(few | {"esc_status": escs(flight.t[:60] - flight.t[0], flight.u[:60])})
+
+
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damage_is_refused_in_one_line_or_read_around(written, short, capfd, data):
+    at = data.draw(st.integers(0, len(short)))
+    content = short[:at] + data.draw(st.binary(max_size=20)) + short[at + data.draw(st.integers(0, 100)) :]
+    try:
+        read_ulog(written(content))
+        message = "flight.ulg"
+    except ValueError as error:
+        message = str(error)
+    assert "\n" not in message
+    assert "flight.ulg" in message
+    assert capfd.readouterr().out == ""
