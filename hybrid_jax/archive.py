@@ -3,9 +3,10 @@
 import hashlib
 import io
 import json
+import math
 import zipfile
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import equinox as eqx
@@ -13,9 +14,11 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from hybrid_jax.checks import one_line
 from hybrid_jax.files import write_whole
 
 HEADER = "header.json"
+NUMERIC = "biufc"  # kinds of NumPy types that are kept
 Arrays = Mapping[str, np.ndarray]
 
 
@@ -26,9 +29,12 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
         form: what kind of archive it is, and the version of that kind; the reader asks for the same.
 
     Raises:
-        ValueError: the metadata are not JSON.
+        ValueError: the metadata are not JSON, or an array is not of numbers.
         OSError: the folder cannot be written.
     """
+    for name, array in arrays.items():
+        if array.dtype.kind not in NUMERIC:
+            raise ValueError(f"array {name!r} is of {array.dtype}, which cannot be saved")
     header = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}
     buffer = io.BytesIO()
     # An .npz is a zip of .npy; entries made by hand carry no clock, so equal content gives equal bytes.
@@ -48,20 +54,19 @@ def load_archive(path: str | Path, form: str) -> tuple[Any, dict[str, np.ndarray
     """
     path = Path(path)
     try:
-        with zipfile.ZipFile(path) as archive:
-            # Reading an entry whole verifies its CRC before NumPy believes its header.
-            entries = {name: archive.read(name) for name in archive.namelist()}
+        entries = _read_entries(path)
         header = json.loads(entries.pop(HEADER, b"{}"))
         if not isinstance(header, dict) or header.get("format") != form:
             raise ValueError(f"has no header of {form!r}")
-        arrays = {name.removesuffix(".npy"): _read_array(entry) for name, entry in entries.items()}
+        arrays = {name.removesuffix(".npy"): _read_array(name, entry) for name, entry in entries.items()}
+        found = digest(header.get("metadata"), arrays)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, NotImplementedError) as error:
-        raise ValueError(f"{path}: truncated, damaged or not a {form.rsplit(' ', 1)[0]}: {error}") from error
-    if header.get("sha256") != digest(header.get("metadata"), arrays):
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError) as error:
+        raise ValueError(f"{path}: truncated, damaged or not a {form.rsplit(' ', 1)[0]}: {one_line(error)}") from error
+    if header.get("sha256") != found:
         raise ValueError(f"{path}: checksum differs from the one recorded: the file is damaged or was altered")
-    return header["metadata"], arrays
+    return header.get("metadata"), arrays
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
@@ -86,7 +91,7 @@ def encode(value: Any, **layout: Any) -> bytes:
     """
     try:
         return json.dumps(value, allow_nan=False, **layout).encode()
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, RecursionError) as error:
         raise ValueError(f"configuration and metadata must be JSON: {error}") from error
 
 
@@ -115,8 +120,36 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
     return eqx.combine(jax.tree.unflatten(structure, [arrays[name] for name in names]), rest)
 
 
-def _read_array(entry: bytes) -> np.ndarray:
-    return np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+def _read_entries(path: Path) -> dict[str, bytes]:
+    """The bytes of each entry by its name.
+
+    Nothing is written, so no name leads anywhere; one that would was not written here. Nor is a compressed entry, with
+    which a small file could fill the memory.
+    """
+    with zipfile.ZipFile(path) as archive:
+        for entry in archive.infolist():
+            place = PurePosixPath(entry.filename.replace("\\", "/"))
+            if place.is_absolute() or ".." in place.parts:
+                raise ValueError(f"entry {entry.filename!r} leads out of the file's folder")
+            if entry.compress_type != zipfile.ZIP_STORED or entry.compress_size != entry.file_size:
+                raise ValueError(f"entry {entry.filename!r} is compressed")
+        if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
+            raise ValueError("its entries declare more than the file holds")
+        # Reading an entry whole verifies its CRC.
+        return {name: archive.read(name) for name in archive.namelist()}
+
+
+def _read_array(name: str, entry: bytes) -> np.ndarray:
+    """The array of numbers in a .npy, whose header is believed only if it declares what is there."""
+    file = io.BytesIO(entry)
+    if np.lib.format.read_magic(file) != (1, 0):
+        raise ValueError(f"entry {name!r} is a .npy of a version that is not written here")
+    shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
+    declared = math.prod(shape) * dtype.itemsize if min(shape, default=0) >= 0 else None
+    if dtype.kind not in NUMERIC or declared != len(entry) - file.tell():
+        raise ValueError(f"entry {name!r} holds no numbers, or other than {dtype}{list(shape)}, as it declares")
+    order = "F" if in_fortran_order else "C"
+    return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)
 
 
 def _contiguous(array: np.ndarray) -> np.ndarray:

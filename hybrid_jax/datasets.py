@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from hybrid_jax.archive import digest, encode, load_archive, save_archive
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.checks import one_line
+from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 FORMAT = "hybrid_jax dataset 1"
 ARRAYS = ("x0", "u", "x")
@@ -53,13 +54,12 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
     """Write a dataset, whole or not at all. Saving the same windows and configuration again leaves the file as it is.
 
     Raises:
-        ValueError: windows are malformed, metadata are not JSON, or the file exists with other content and `overwrite`
-            is off.
+        ValueError: windows are malformed, or those of a vehicle have no unit quaternions; metadata are not JSON; or the
+            file exists with other content and `overwrite` is off.
         OSError: the folder cannot be written.
     """
     path = Path(path)
-    for name, windows in dataset.splits.items():
-        check(windows, f"{path}: split {name!r}")
+    _check_splits(path, dataset)
     if path.exists() and not overwrite:
         if _has_content(path, content_hash(dataset)):
             return
@@ -81,11 +81,10 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
             name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=float(entry["dt"]))
             for name, entry in header["splits"].items()
         }
-        dataset = Dataset(splits, header["about"], origin=str(path))
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a whole dataset: lacks {error}") from error
-    for name, windows in splits.items():
-        check(windows, f"{path}: split {name!r}")
+        dataset = Dataset(splits, dict(header["about"]), origin=str(path))
+    except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
+        raise ValueError(f"{path}: not a whole dataset: lacks {one_line(error)}") from error
+    _check_splits(path, dataset)
     if expected_config is not None:
         require_config(path, dataset.config, expected_config)
     return dataset
@@ -110,6 +109,15 @@ def versions(*packages: str) -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "not installed"
     return found
+
+
+def _check_splits(path: Path | str, dataset: Dataset) -> None:
+    if not isinstance(dataset.config, Mapping):
+        raise ValueError(f"{path}: config must be a mapping, got {type(dataset.config).__name__}")
+    for name, windows in dataset.splits.items():
+        check(windows, f"{path}: split {name!r}")
+        if "vehicle" in dataset.config:
+            check_attitudes(windows, f"{path}: split {name!r}")
 
 
 def _split_table(dataset: Dataset) -> dict[str, Any]:

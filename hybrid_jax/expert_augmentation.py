@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from hybrid_jax import checks
 from hybrid_jax.least_squares import parametrise
 from hybrid_jax.metrics import mse
 from hybrid_jax.models import portable
@@ -91,10 +92,13 @@ def expert_augmented(
         past: windows of source flight, for the scale of what the encoder reads; their length is what it reads later.
 
     Raises:
-        ValueError: the box is not 0 < low <= high.
+        ValueError: the box is not 0 < low <= high, or past windows that are malformed.
     """
-    if not 0 < box[0] <= box[1]:
+    if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
         raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
+    check(past, "past")
+    checks.count("hidden", hidden)
+    checks.key("key", key)
     readings = jax.vmap(read)(past)
     sizes = (readings.shape[1], hidden, hidden, parametrise(expert)[0].size)
     keys = jax.random.split(key, len(sizes) - 1)
@@ -135,10 +139,17 @@ class Augmentation:
     Attributes:
         past: intervals at the head of a window that the encoder reads; the rest is predicted.
         seed: of the θ_p.
+
+    Raises:
+        ValueError: no positive past, or a negative seed.
     """
 
     past: int = 10
     seed: int = 0
+
+    def __post_init__(self):
+        checks.count("past", self.past)
+        checks.count("seed", self.seed, least=0)
 
     def prepare(self, windows: Trajectories, name: str) -> Labelled:
         check(windows, name)
@@ -184,7 +195,12 @@ class Augmentation:
 
 
 def prediction_mse(field: ExpertAugmented, windows: Trajectories, past: int, solver=None) -> Float[Array, ""]:
-    """L_MSE of what is predicted after the first `past` intervals of each window, mean over windows."""
+    """L_MSE of what is predicted after the first `past` intervals of each window, mean over windows.
+
+    Raises:
+        ValueError: windows that are malformed, or not longer than `past`.
+    """
+    check(windows, "windows")
 
     def one(window: Trajectories) -> Float[Array, ""]:
         before, after = split(window, past)

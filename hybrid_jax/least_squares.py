@@ -15,8 +15,10 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from hybrid_jax import checks
+from hybrid_jax.rigid_body import moves_a_rigid_body
 from hybrid_jax.rollout import rollout
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
@@ -59,7 +61,6 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
         return state.terminate | small, state.result
 
 
-@eqx.filter_jit
 def fit_physics(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -72,12 +73,30 @@ def fit_physics(
     is that of θ_p: to about 1e-3 standard errors in float32.
 
     Args:
-        windows: of any length; their numbers are not looked at (`trajectories.check` does that).
+        windows: of any length; in a compiled program their numbers are not looked at.
         solver: integrates the rollouts; RK4 by default.
 
     Raises:
-        ValueError: the physics has nothing to fit.
+        ValueError: the physics has nothing to fit, or windows that are malformed or not of this field.
     """
+    check_windows(field, windows)
+    checks.count("max_steps", max_steps)
+    return _fit_physics(field, windows, solver, max_steps)
+
+
+def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
+    """Refuse windows that nothing can be learned from: malformed ones, or those of a rigid body that has no attitude.
+
+    Raises:
+        ValueError: what of `name` is wrong, and where.
+    """
+    check(windows, name)
+    if moves_a_rigid_body(field):
+        check_attitudes(windows, name)
+
+
+@eqx.filter_jit
+def _fit_physics(field, windows: Trajectories, solver: diffrax.AbstractSolver | None, max_steps: int) -> PhysicsFit:
     start, rebuild = parametrise(field)
 
     def residuals(theta: Float[Array, " p"]) -> Float[Array, "n t d"]:

@@ -14,10 +14,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from hybrid_jax import checks
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.residual import LinearResidual, ResidualNetwork
-from hybrid_jax.rollout import rollout_batch
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.rollout import checked, integrate
+from hybrid_jax.trajectories import Trajectories, check
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 
 PENALTIES = tuple(10.0**power for power in range(6, -5, -1))  # the most cautious first
@@ -65,15 +66,18 @@ def last_layer(
         penalty: positive.
 
     Raises:
-        ValueError: another field.
+        ValueError: another field, windows that are malformed, or a penalty that is known and not positive.
     """
     network = field.residual if isinstance(field, Hybrid) else field
     if not isinstance(network, ResidualNetwork):
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
+    check(windows, "windows")
+    checks.positive("penalty", penalty)
     intervals = intervals_of(windows)
+    lacking = defects(field, intervals, solver)
     activations = jax.vmap(network.activations)
     middle = (activations(intervals.before, intervals.u) + activations(intervals.after, intervals.u)) / 2
-    weight, bias = ridge(middle, defects(field, intervals, solver), penalty)
+    weight, bias = ridge(middle, lacking, penalty)
     output = (network.weight_out + weight, network.bias_out + bias)
     moved = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, output)
     return Hybrid(field.physics, moved) if isinstance(field, Hybrid) else moved
@@ -89,7 +93,12 @@ def linear_residual(
 
     Args:
         penalty: positive; on the map of [x, u] less its mean over its standard deviation, so that units do not matter.
+
+    Raises:
+        ValueError: windows that are malformed, or a penalty that is known and not positive.
     """
+    check(windows, "windows")
+    checks.positive("penalty", penalty)
     intervals = intervals_of(windows)
     z = jnp.concatenate([(intervals.before + intervals.after) / 2, intervals.u], axis=1)
     mean, scale = standard(z)
@@ -108,7 +117,16 @@ def adapted(
     """The method's field at the penalty that predicts the validation windows best.
 
     Pure: `jax.jit` compiles it, `jax.vmap` maps it over stacked fields and training windows.
+
+    Raises:
+        ValueError: windows that are malformed, or penalties that are not positive numbers.
     """
+    check(train, "train")
+    check(validation, "validation")
+    if not penalties:
+        raise ValueError("penalties must be some positive numbers, got none")
+    for penalty in penalties:
+        checks.positive("penalties", penalty, "positive finite numbers")
     grid = jnp.asarray(penalties, float)
     # The decomposition inside `ridge` does not depend on the penalty, so vmap computes it once for the whole grid.
     candidates = eqx.filter_vmap(lambda penalty: method(field, train, penalty))(grid)
@@ -134,7 +152,7 @@ def intervals_of(windows: Trajectories) -> Intervals:
     """All intervals of all windows."""
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
-    return Intervals(*(a.reshape(-1, a.shape[-1]) for a in (before, x, u)), dt=windows.dt)
+    return Intervals(*(jnp.reshape(a, (x.shape[0] * x.shape[1], a.shape[2])) for a in (before, x, u)), dt=windows.dt)
 
 
 def defects(
@@ -147,10 +165,13 @@ def defects(
     side, so the mean of the two is free of it. A field that is exact has no defect at all.
     """
 
-    def step(start: Float[Array, "s d"], dt: float) -> Float[Array, "s d"]:
-        return rollout_batch(field, start, intervals.u[:, None], dt, solver)[:, 0]
-
     before, after, dt = intervals.before, intervals.after, intervals.dt
+    before, u, solver = checked(field, before, intervals.u[:, None], dt, solver, windows=True)
+    after = after.astype(before.dtype)
+
+    def step(start: Float[Array, "s d"], dt: float) -> Float[Array, "s d"]:
+        return jax.vmap(lambda x, held: integrate(field, x, held, dt, solver))(start, u)[:, 0]
+
     return ((after - step(before, dt)) + (step(after, -dt) - before)) / (2 * dt)
 
 

@@ -2,15 +2,23 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.rollout import rollout
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check
 from hybrid_jax.vector_field import AbstractVectorField
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window."""
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window.
+
+    Raises:
+        ValueError: the two are of different shapes, or hold no state.
+    """
+    if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
+        raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
     return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
 
 
@@ -19,8 +27,17 @@ def deployed_mse(
 ) -> Float[Array, ""]:
     """L_MSE of a field as deployed, mean over windows, compared with the truth at every `every`-th interval's end.
 
-    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache.
+    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache. It is not finite where
+    the field diverges.
+
+    Raises:
+        ValueError: windows that `trajectories.check` or the field refuses, or an `every` beyond their horizon.
     """
+    check(windows, "windows")
+    checks.count("chunk", chunk)
+    checks.count("every", every)
+    if every > windows.horizon:
+        raise ValueError(f"every={every} is more than the {windows.horizon} intervals of the windows")
 
     def one(window: Trajectories) -> Float[Array, ""]:
         predicted = rollout(field, window.x0, window.u, window.dt, solver)
@@ -30,5 +47,11 @@ def deployed_mse(
 
 
 def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no gain, negative means that fine-tuning hurt (paper, Eq. 9)."""
+    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no gain, negative means that fine-tuning hurt (paper, Eq. 9).
+
+    Raises:
+        ValueError: a source_mse that is known, and zero or negative: against it nothing is a gain.
+    """
+    if not checks.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
+        raise ValueError(f"source_mse must be positive, got {source_mse}")
     return (source_mse - adapted_mse) / source_mse

@@ -12,11 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.features import Accelerations, BodyFrame, Placeless
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
-from hybrid_jax.rigid_body import RigidBody
-from hybrid_jax.rollout import rollout, rollout_batch
+from hybrid_jax.rigid_body import RigidBody, check_start
+from hybrid_jax.rollout import checked, rollout, rollout_batch
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, Statistics
 from hybrid_jax.vehicle import Vehicle
 
@@ -56,21 +57,27 @@ class Model:
     ) -> Float[Array, "*n t d"]:
         """The states after each of t intervals of dt [s] with the inputs held over them; one window or n.
 
+        What is returned is finite: a prediction that diverges is of no use to a caller, who might not look. Where the
+        other windows are wanted all the same, `rollout_batch` carries on.
+
         Raises:
-            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive, or a model that
-                is no vector field.
+            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive, a start of a
+                rigid body without a unit quaternion, a model that is no vector field or not of such states and inputs,
+                or a prediction that diverges; says in which window and from which interval on.
         """
         if not callable(self.field):
             name = type(self.field).__name__
             raise ValueError(f"the model is a {name}, which needs more than x0 and u; use the methods of its `field`")
-        x0, u = jnp.asarray(x0, float), jnp.asarray(u, float)
-        if x0.ndim not in (1, 2) or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
-            raise ValueError(f"x0 (d,) and u (t, m), or (n, d) and (n, t, m), expected; got {x0.shape} and {u.shape}")
-        if not (np.isfinite(x0).all() and np.isfinite(u).all()):
-            raise ValueError("x0 and u must be finite")
-        if not 0 < dt < float("inf"):
-            raise ValueError(f"dt must be a positive number of seconds, got {dt}")
-        return _predict(self.field, x0, u, dt)
+        x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
+        checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
+        check_start(self.field, x0)
+        predicted = _predict(self.field, x0, u, dt)
+        lost = ~np.isfinite(predicted).all(axis=-1)
+        if lost.any():
+            *window, interval = np.argwhere(lost)[0].tolist()
+            where = f" of window {window[0]}, the first of {lost.any(axis=-1).sum()}," if window else ""
+            raise ValueError(f"the prediction{where} diverges: it is not finite from interval {interval} on")
+        return predicted
 
 
 @eqx.filter_jit
@@ -97,11 +104,15 @@ def load(path: str | Path) -> Model:
     """
     metadata, arrays = load_archive(path, FORMAT)
     try:
-        return Model(_decode(metadata["field"], arrays), metadata["about"])
-    except (KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path}: not a whole model: {error}") from error
+        field: Any = _decode(metadata["field"], arrays)
+        about = dict(metadata["about"])
+    except (KeyError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(f"{path}: not a whole model: {checks.one_line(error)}") from error
     except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path}: {checks.one_line(error)}") from error
+    if type(field).__name__ not in _KINDS:
+        raise ValueError(f"{path}: not a whole model: its field is a {type(field).__name__}")
+    return Model(field, about)
 
 
 def describe(field: AbstractVectorField) -> Any:
@@ -119,10 +130,12 @@ def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
         parts = {f.name: _encode(getattr(value, f.name), f"{path}/{f.name}", arrays) for f in fields(value)}
         return {"kind": name, "fields": parts}
     match value:
-        case jax.Array() | np.ndarray():
+        case jax.Array() | np.ndarray() if not jnp.issubdtype(value.dtype, jax.dtypes.extended):
+            if path in arrays:
+                raise ValueError(f"two arrays would be {path}; let no key of a dictionary hold a '/'")
             arrays[path] = np.asarray(value)
             return {"array": path}
-        case dict():
+        case dict() if all(isinstance(key, str) for key in value):
             return {"items": {key: _encode(item, f"{path}/{key}", arrays) for key, item in value.items()}}
         case tuple():
             return {"tuple": [_encode(item, f"{path}/{i}", arrays) for i, item in enumerate(value)]}

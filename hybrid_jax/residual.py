@@ -13,14 +13,23 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from hybrid_jax import checks
 from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, evaluate_batch, observe
 
 
 class InputScaling(eqx.Module):
-    """Fixed affine scaling of the inputs: u ↦ (u − offset) / scale, so that they are of the size of the states."""
+    """Fixed affine scaling of the inputs: u ↦ (u − offset) / scale, so that they are of the size of the states.
+
+    Raises:
+        ValueError: an offset that is not finite, or a scale that is not positive.
+    """
 
     offset: float = eqx.field(static=True, default=0.0)
     scale: float = eqx.field(static=True, default=1.0)
+
+    def __check_init__(self):
+        checks.number("offset", self.offset)
+        checks.positive("scale", self.scale)
 
     def __call__(self, u: Float[Array, " m *b"]) -> Float[Array, " m *b"]:
         return (u - self.offset) / self.scale
@@ -165,12 +174,18 @@ def residual_network(
         outputs: how many numbers it returns, if not one for each of the state.
 
     Raises:
-        ValueError: another norm.
+        ValueError: another norm, sizes that are no positive integers, or no random key.
     """
-    if norm not in NORMS:
-        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {norm!r}")
+    if norm not in tuple(NORMS):
+        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {checks.shown(norm)}")
+    outputs = state_size if outputs is None else outputs
+    sizes = {"state_size": state_size, "hidden": hidden, "outputs": outputs}
+    for name, size in sizes.items():
+        checks.count(name, size)
+    checks.count("input_size", input_size, least=0)
+    checks.key("key", key)
     key_in, key_out, key_bias = jax.random.split(key, 3)
-    fan_in, outputs = state_size + input_size, state_size if outputs is None else outputs
+    fan_in = state_size + input_size
     return ResidualNetwork(
         weight_in=_uniform(key_in, (hidden, fan_in), fan_in),
         norm=NORMS[norm](hidden, fan_in, jax.random.fold_in(key, 3)),

@@ -6,8 +6,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import rotation
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax import checks, rotation
+from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
 from hybrid_jax.vehicle import Vehicle
 
@@ -23,10 +23,19 @@ class RigidBody(AbstractVectorField):
     Attributes:
         log_ratios: log(Ix / nominal), log(Iy / nominal), log(k / nominal).
         vehicle: the known constants and the nominal values.
+
+    Raises:
+        ValueError: other parameters than Ix, Iy, k, or no vehicle.
     """
 
     log_ratios: dict[str, Float[Array, ""]]
     vehicle: Vehicle = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.log_ratios, dict) or set(self.log_ratios) != set(LEARNED):
+            raise ValueError(f"log_ratios must hold {', '.join(LEARNED)}, got {checks.shown(self.log_ratios)}")
+        if not isinstance(self.vehicle, Vehicle):
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.shown(self.vehicle)}")
 
     def theta(self) -> dict[str, Float[Array, ""]]:
         """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
@@ -48,7 +57,13 @@ def rigid_body(vehicle: Vehicle) -> RigidBody:
 
 
 def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm."""
+    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm.
+
+    Raises:
+        ValueError: not 0 < low <= high.
+    """
+    if not 0 < low <= high < np.inf:
+        raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
     return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
 
@@ -57,6 +72,22 @@ def guess_off(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
     """The rigid body with each of θ_p at nominal times or over 1 + off, at random."""
     signs = jax.random.rademacher(key, (len(LEARNED),), float)
     return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
+
+
+def moves_a_rigid_body(field) -> bool:
+    """Whether a rigid body is anywhere in a field, so that a state of 13 is that of state.py."""
+    parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, RigidBody))
+    return any(isinstance(part, RigidBody) for part in parts)
+
+
+def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
+    """Refuse starts of a rigid body whose quaternion is no rotation; of another field's nothing is known.
+
+    Raises:
+        ValueError: the place of the first and its norm.
+    """
+    if x0.shape[-1:] == (STATE_SIZE,) and moves_a_rigid_body(field):
+        checks.unit_quaternions("x0", x0)
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:

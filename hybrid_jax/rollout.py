@@ -9,11 +9,13 @@ from collections.abc import Callable
 from typing import ClassVar
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
@@ -72,8 +74,8 @@ def integrate(
 def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
     """The solver with its stages in a loop of bounded length.
 
-    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`, which
-    is where the lanes of a sweep run on several devices.
+    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`, in
+    which the lanes of a sweep run on several devices.
     """
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
         return dataclasses.replace(solver, scan_kind="bounded")
@@ -88,8 +90,16 @@ def rollout(
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "t d"]:
-    """The trajectory of a field as deployed: x[i] is the state (i + 1) dt [s] after x0; u[i] is held until then."""
-    return integrate(field, jnp.asarray(x0), jnp.asarray(u), dt, RK4() if solver is None else solver, substeps)
+    """The trajectory of a field as deployed: x[i] is the state (i + 1) dt [s] after x0; u[i] is held until then.
+
+    One that diverges goes on as infinity or NaN, here as in compiled code; `Model.predict` raises.
+
+    Raises:
+        ValueError: an argument of the wrong shape or type, or, where its numbers are known, one that is not finite; dt
+            or substeps that are not positive; or a field that cannot take x0 and u, or returns no ẋ of the shape of x0.
+    """
+    x0, u, solver = checked(field, x0, u, dt, solver, substeps)
+    return integrate(field, x0, u, dt, solver, substeps)
 
 
 def rollout_batch(
@@ -100,8 +110,55 @@ def rollout_batch(
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "n t d"]:
-    """`rollout` of each of n windows."""
-    return jax.vmap(lambda start, held: rollout(field, start, held, dt, solver, substeps))(x0, u)
+    """`rollout` of each of n windows.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
+    return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
+
+
+def checked(
+    field, x0, u, dt, solver, substeps: int = 1, *, windows: bool = False
+) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], diffrax.AbstractSolver]:
+    """x0 in the precision of ẋ, u, and the solver or the default one.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    x0, u = checks.floating("x0", x0), checks.floating("u", u)
+    expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
+    if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
+        raise ValueError(f"{expected} expected, got shapes {x0.shape} and {u.shape}")
+    checks.positive("dt", dt, "a positive number of seconds")
+    checks.count("substeps", substeps)
+    solver = RK4() if solver is None else solver
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise ValueError(f"solver must be one of diffrax or hybrid_jax.rollout.SOLVERS, got {checks.shown(solver)}")
+    slope = check_field(
+        field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
+    )
+    return x0.astype(jnp.result_type(x0.dtype, slope.dtype)), u, solver
+
+
+def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """Shape and type of ẋ = field(x, u), for a state and an input of which nothing else is known.
+
+    Raises:
+        ValueError: the field cannot take them, or returns no ẋ of the shape of x.
+    """
+    name = getattr(field, "__name__", type(field).__name__)
+    given = f"a state {x.shape} and an input {u.shape}"
+    try:
+        slope = eqx.filter_eval_shape(field, x, u)
+    except Exception as error:  # the field may be anybody's code
+        said = f"{type(error).__name__}: {checks.one_line(error)}"
+        raise ValueError(f"field: {name} does not take {given}: {said}") from error
+    if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
+        found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__
+        raise ValueError(f"field: {name} must return a derivative {x.shape} for {given}, returned {found}")
+    return slope
 
 
 def rollout_minibatch(

@@ -164,8 +164,12 @@ def from_csv(text: str) -> list[Row]:
     Raises:
         ValueError: other columns, or a field out of its range.
     """
+    try:
+        records = list(csv.DictReader(io.StringIO(text)))
+    except csv.Error as error:
+        raise ValueError(f"not CSV: {error}") from error
     rows = []
-    for record in csv.DictReader(io.StringIO(text)):
+    for record in records:
         if None in record or None in record.values():
             raise ValueError("a line of the CSV has too many or too few cells")
         theta = {name: record.pop(name, "") for name in THETA}

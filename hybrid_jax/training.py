@@ -10,8 +10,11 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
+from hybrid_jax import checks
 from hybrid_jax.objective import Learner, Settings
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.rigid_body import moves_a_rigid_body
+from hybrid_jax.rollout import checked
+from hybrid_jax.trajectories import Trajectories, check_attitudes
 from hybrid_jax.vector_field import AbstractVectorField, trainable
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
@@ -149,19 +152,59 @@ def fit(
     """Train one field on all windows of `train`; `result.best` is the field of the best validation epoch.
 
     Raises:
-        ValueError: data that the objective refuses, or fewer training windows than a minibatch.
+        ValueError: data that the objective refuses, that are not of the field's states and inputs, or are of a rigid
+            body and have no unit quaternions; fewer training windows than a minibatch; rates that do not go with the
+            field; a rule that makes no sense; or no random key.
     """
     settings = Settings() if settings is None else settings
     data = settings.objective.prepare(train, "train")
     judged_on = settings.objective.prepare(validation, "validation")
+    for name, windows in (("train", train), ("validation", validation)):
+        _check_match(field, windows, name, settings)
+    checks.key("key", key)
+    checks.count("settings.batch_size", settings.batch_size)
     if len(data) < settings.batch_size:
         raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
+    try:
+        jax.tree.map(lambda *_: None, rates, eqx.filter(field, trainable(field)))
+    except (TypeError, ValueError) as error:
+        raise ValueError(
+            f"rates must be a number, or a tree of them that begins as the field does, got {checks.shown(rates)}"
+        ) from error
     plan = make_plan(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, regulariser_weight)
     return _fit(start(field, key), plan, data, judged_on, settings)
 
 
+def _check_match(field: Learner, windows: Trajectories, name: str, settings: Settings) -> None:
+    """Refuse windows that are not of the field: a learner that is no vector field is the objective's business."""
+    if isinstance(field, AbstractVectorField):
+        try:
+            x0, _, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        if x0.dtype != jnp.result_type(windows.x0):
+            raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
+    if moves_a_rigid_body(field):
+        check_attitudes(windows, name)
+
+
 def make_plan(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> Plan:
-    """A plan with every number as an array, as `vmap` wants it."""
+    """A plan with every number as an array, as `vmap` wants it.
+
+    Raises:
+        ValueError: a number that makes no sense, by its name.
+    """
+    for rate in jax.tree.leaves(rates):
+        checks.not_negative("rates", rate)
+    counts = {
+        "n_train": (n_train, 0),
+        "min_epochs": (min_epochs, 0),
+        "patience": (patience, 0),
+        "max_epochs": (max_epochs, 1),
+    }
+    for name, (value, least) in counts.items():
+        checks.count(name, value, least)
+    checks.not_negative("regulariser_weight", regulariser_weight)
 
     def integer(number) -> Int[Array, "..."]:
         return jnp.asarray(number, jnp.int32)

@@ -5,6 +5,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
+from hybrid_jax.state import STATE_SIZE
+
 
 class Trajectories(eqx.Module):
     """n windows of t equal intervals.
@@ -30,17 +33,30 @@ class Trajectories(eqx.Module):
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
-        """The windows that index picks: a slice or an array of indices, traced ones included."""
+        """The windows that index picks: a number, a slice or an array of indices, traced ones included.
+
+        Raises:
+            IndexError: a number that no window has.
+        """
+        # JAX would take the last window instead, and a loop over the windows would not end.
+        if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
+            raise IndexError(f"window {index} of {len(self)}")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectories:
-    """Return trajectories unchanged after checking shapes, dt and that every number is finite.
+    """Return trajectories unchanged after checking shapes, dt and, where it is known, that every number is finite.
 
     Raises:
         ValueError: which array of `name` is wrong, where, and what was expected.
     """
+    if not isinstance(trajectories, Trajectories):
+        raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
+    for part, array in (("x0", x0), ("u", u), ("x", x)):
+        found = getattr(array, "dtype", type(array).__name__)
+        if not isinstance(array, checks.Numbers) or found not in (np.float32, np.float64):
+            raise ValueError(f"{name}: {part} must be an array of float32 or float64, got {found}")
     if x0.ndim != 2 or u.ndim != 3 or x.ndim != 3:
         raise ValueError(
             f"{name}: x0, u, x must have 2, 3, 3 axes (n, d), (n, t, m), (n, t, d), got {x0.ndim}, {u.ndim}, {x.ndim}"
@@ -50,13 +66,23 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
         raise ValueError(f"{name}: shapes of x0 {x0.shape}, u {u.shape} and x {x.shape} do not agree")
     if min(n, d, u.shape[1]) == 0:
         raise ValueError(f"{name}: is empty: x0 {x0.shape}, u {u.shape}")
-    if not (np.isfinite(trajectories.dt) and trajectories.dt > 0):
-        raise ValueError(f"{name}: dt must be a positive number of seconds, got {trajectories.dt!r}")
-    for field, array in (("x0", x0), ("u", u), ("x", x)):
-        bad = ~np.isfinite(np.asarray(array))
-        if bad.any():
-            raise ValueError(f"{name}: {field}{np.argwhere(bad)[0].tolist()} is not finite")
+    if isinstance(trajectories.dt, np.ndarray | jax.Array):
+        raise ValueError(f"{name}: dt must be a number and no array, such as float(dt)")
+    checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
+    for part, array in (("x0", x0), ("u", u), ("x", x)):
+        checks.finite(f"{name}: {part}", array)
     return trajectories
+
+
+def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> None:
+    """Refuse windows of a multirotor (state.py) whose quaternions are no rotations; of other states, nothing is known.
+
+    Raises:
+        ValueError: the place of the first and its norm.
+    """
+    for part in ("x0", "x"):
+        if trajectories.x0.shape[-1] == STATE_SIZE:
+            checks.unit_quaternions(f"{name}: {part}", getattr(trajectories, part))
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
@@ -65,7 +91,8 @@ def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectori
     Raises:
         ValueError: a part would be empty.
     """
-    if not 0 < at < trajectories.horizon:
+    checks.count("at", at)
+    if not at < trajectories.horizon:
         raise ValueError(f"at must lie between 0 and the horizon {trajectories.horizon}, got {at}")
     x0, u, x, dt = trajectories.x0, trajectories.u, trajectories.x, trajectories.dt
     head = Trajectories(x0, u[..., :at, :], x[..., :at, :], dt)
@@ -82,14 +109,22 @@ def windows_of(
 ) -> Trajectories:
     """Cut one flight, states[i] → states[i + 1] under inputs[i], into windows of `steps` intervals.
 
+    Its numbers are not looked at, so that windows with gaps can be left out afterwards; `check` does that.
+
     Args:
         stride: intervals between the starts of two windows; by default `steps`: windows touch but do not overlap.
 
     Raises:
-        ValueError: the flight is shorter than one window.
+        ValueError: arrays of the wrong shape or type, a dt that is not positive, or a flight shorter than one window.
     """
+    states, inputs = np.asarray(checks.real_array("states", states)), np.asarray(checks.real_array("inputs", inputs))
+    if states.ndim != 2 or inputs.ndim != 2 or len(states) != len(inputs) + 1:
+        raise ValueError(f"states (t + 1, d) and inputs (t, m) expected, got shapes {states.shape} and {inputs.shape}")
+    checks.positive("dt", dt, "a positive number of seconds")
     stride = steps if stride is None else stride
-    if steps < 1 or stride < 1 or len(inputs) < steps:
+    checks.count("steps", steps)
+    checks.count("stride", stride)
+    if len(inputs) < steps:
         raise ValueError(f"a flight of {len(inputs)} intervals has no window of steps={steps}, stride={stride}")
     starts = np.arange(0, len(inputs) - steps + 1, stride)
     inside = starts[:, None] + np.arange(steps)
@@ -100,8 +135,9 @@ def concatenate(parts: list[Trajectories]) -> Trajectories:
     """All windows of the parts, in order.
 
     Raises:
-        ValueError: no parts, or parts of different dt or horizon.
+        ValueError: no parts, or parts of different dt, horizon, state or input.
     """
-    if not parts or len({(part.dt, part.horizon) for part in parts}) != 1:
-        raise ValueError(f"parts must share dt and horizon, got {[(part.dt, part.horizon) for part in parts]}")
+    if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
+        sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
+        raise ValueError(f"parts must share dt and horizon, and sizes of state and input, got {sizes}")
     return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

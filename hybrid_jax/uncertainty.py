@@ -21,7 +21,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.least_squares import parametrise, physics_of, residual
+from hybrid_jax import checks
+from hybrid_jax.least_squares import check_windows, parametrise, physics_of, residual
 from hybrid_jax.rigid_body import RigidBody
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
@@ -37,7 +38,6 @@ class Interval(NamedTuple):
     high: Float[Array, "*lanes"]
 
 
-@eqx.filter_jit
 def physics_covariance(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -55,14 +55,22 @@ def physics_covariance(
         chunk: windows that are held in memory at a time.
 
     Raises:
-        ValueError: no more windows than parameters, or an unknown kind.
+        ValueError: no more windows than parameters, an unknown kind, or windows that are malformed.
     """
-    theta, rebuild = parametrise(field)
-    n, p = len(windows), theta.size
+    check_windows(field, windows)
+    checks.count("chunk", chunk)
+    n, p = len(windows), parametrise(field)[0].size
     if n <= p:
         raise ValueError(f"windows: {n} are too few for a covariance of {p} parameters, at least {p + 1} are needed")
     if kind not in Kind.__args__:
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
+    return _physics_covariance(field, windows, kind, solver, chunk)
+
+
+@eqx.filter_jit
+def _physics_covariance(field, windows: Trajectories, kind: Kind, solver, chunk: int) -> Float[Array, "p p"]:
+    theta, rebuild = parametrise(field)
+    n, p = len(windows), theta.size
 
     def one(window: Trajectories):
         def error(theta):
@@ -81,9 +89,17 @@ def physics_covariance(
 
 
 def standard_errors(field: AbstractVectorField, covariance: Float[Array, "p p"]) -> AbstractVectorField:
-    """A tree like the physics with the standard error of each parameter in its place."""
-    _, rebuild = parametrise(physics_of(field))
-    return rebuild(jnp.sqrt(jnp.diagonal(covariance)))
+    """A tree like the physics with the standard error of each parameter in its place.
+
+    Raises:
+        ValueError: a covariance of another number of parameters, or one that is known and is not finite, as where the
+            windows do not tell the parameters apart, or has a negative variance.
+    """
+    theta, rebuild = parametrise(physics_of(field))
+    variances = jnp.diagonal(_square(covariance, theta.size))
+    if not checks.is_traced(variances) and (variances < 0).any():
+        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
+    return rebuild(jnp.sqrt(variances))
 
 
 def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
@@ -92,10 +108,10 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
     θ_p is held as a logarithm, whose error is taken as normal: the interval is value · exp(±z s).
 
     Raises:
-        ValueError: a level that is not between 0 and 1, or physics that is no `RigidBody`.
+        ValueError: a level that is not between 0 and 1, or physics that is no `RigidBody`; as `standard_errors`.
     """
-    if not 0 < level < 1:
-        raise ValueError(f"level must be between 0 and 1, got {level!r}")
+    if not 0 < (checks.real(level) or 0) < 1:
+        raise ValueError(f"level must be between 0 and 1, got {checks.shown(level)}")
     errors = standard_errors(field, covariance)
     if not isinstance(errors, RigidBody):
         raise ValueError(f"field: its physics must be a RigidBody, got {type(errors).__name__}; see standard_errors")
@@ -105,6 +121,13 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
         return Interval(value, value * jnp.exp(-z * error), value * jnp.exp(z * error))
 
     return {name: interval(value, errors.log_ratios[name]) for name, value in _theta(field).items()}
+
+
+def _square(covariance: Float[Array, "p p"], p: int) -> Float[Array, "p p"]:
+    array = checks.real_array("covariance", covariance)
+    if array.shape != (p, p):
+        raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
+    return checks.floating("covariance", array)
 
 
 def _theta(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:

@@ -7,6 +7,8 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
+from hybrid_jax import checks
+
 
 @dataclass(frozen=True)
 class Vehicle:
@@ -24,7 +26,7 @@ class Vehicle:
         gravity: [m/s²].
 
     Raises:
-        ValueError: a constant that is not finite or not positive, or a list of the wrong length.
+        ValueError: a constant that is not finite or not positive, in single precision too, or a list of another length.
     """
 
     mass: float
@@ -41,16 +43,20 @@ class Vehicle:
     def __post_init__(self):
         for name in ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity"):
             _require_positive(name, getattr(self, name))
-        if not _is_finite(self.rotor_radius) or self.rotor_radius < 0:
-            raise ValueError(f"rotor_radius must be a finite number of at least 0, got {self.rotor_radius!r}")
+        if self.rotor_radius != 0 or isinstance(self.rotor_radius, bool):
+            _require_positive("rotor_radius", self.rotor_radius, "a finite number of at least 0")
         if not isinstance(self.inertia, tuple) or len(self.inertia) != 3:
-            raise ValueError(f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {self.inertia!r}")
+            raise ValueError(f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {checks.shown(self.inertia)}")
         for name, moment in zip(("Ix", "Iy", "Iz"), self.inertia, strict=True):
             _require_positive(f"inertia {name}", moment)
         if not _is_four(self.rotor_positions, _is_point):
-            raise ValueError(f"rotor_positions must be a tuple of four pairs (x, y) [m], got {self.rotor_positions!r}")
-        if not _is_four(self.spin, lambda sign: sign in (-1, 1)):
-            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {self.spin!r}")
+            raise ValueError(
+                f"rotor_positions must be a tuple of four pairs (x, y) [m], got {checks.shown(self.rotor_positions)}"
+            )
+        if not _is_four(self.spin, lambda sign: _is_finite(sign) and abs(sign) == 1):
+            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {checks.shown(self.spin)}")
+        if not isinstance(self.name, str):
+            raise ValueError(f"name must be text, got {checks.shown(self.name)}")
 
     @property
     def hover_speed(self) -> float:
@@ -65,29 +71,31 @@ def load_vehicle(path: str | Path) -> Vehicle:
         ValueError: the file, the key and what was expected, in one line.
     """
     try:
-        table = tomllib.loads(Path(path).read_text())["vehicle"]
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"{path}: not a readable TOML file: {error}") from error
-    except KeyError as error:
-        raise ValueError(f"{path}: has no table [vehicle]") from error
+        table = tomllib.loads(Path(path).read_bytes().decode()).get("vehicle")
+    except (OSError, ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not a readable TOML file: {checks.one_line(error)}") from error
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
-    unknown = sorted(table.keys() - {field.name for field in fields(Vehicle)})
+    unknown = sorted(repr(key) for key in table.keys() - {field.name for field in fields(Vehicle)})
     if unknown:
         raise ValueError(f"{path}: [vehicle]: {', '.join(unknown)}: no constant of a vehicle")
     try:
         return Vehicle(**{key: _as_tuple(value) for key, value in table.items()})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{path}: [vehicle]: {str(error).replace('Vehicle.__init__()', 'table')}") from error
+        raise ValueError(
+            f"{path}: [vehicle]: {checks.one_line(error).replace('Vehicle.__init__()', 'table')}"
+        ) from error
 
 
-def _require_positive(name: str, value: float) -> None:
-    if not _is_finite(value) or value <= 0:
-        raise ValueError(f"{name} must be a positive finite number, got {value!r}")
+def _require_positive(name: str, value: Any, what: str = "a positive finite number") -> None:
+    if not isinstance(value, int | float):  # a vehicle is hashed and written to files: its numbers are Python's own
+        raise ValueError(f"{name} must be {what}, got {checks.shown(value)}")
+    checks.positive(name, value, what)
 
 
 def _is_finite(value: Any) -> bool:
-    return isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    number = checks.real(value) if isinstance(value, int | float) else None
+    return number is not None and abs(number) <= checks.LARGEST
 
 
 def _is_point(value: Any) -> bool:

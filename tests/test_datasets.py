@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax.datasets import Dataset, config_hash, content_hash, load_dataset, save_dataset
+from hybrid_jax.state import QUATERNION
 from hybrid_jax.trajectories import Trajectories
 
 CONFIG = {"domain": "source", "seed": 0, "vehicle": {"mass": 1.5, "inertia": (0.1, 0.2, 0.3)}}
@@ -18,7 +19,10 @@ CONFIG = {"domain": "source", "seed": 0, "vehicle": {"mass": 1.5, "inertia": (0.
 def windows(count, steps=10, seed=0):
     rng = np.random.default_rng(seed)
     shapes = (count, 13), (count, steps, 4), (count, steps, 13)
-    return Trajectories(*(rng.normal(size=shape).astype(np.float32) for shape in shapes), dt=0.01)
+    x0, u, x = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    for states in (x0, x):
+        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
+    return Trajectories(x0, u, x, dt=0.01)
 
 
 @pytest.fixture

@@ -9,6 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 FLOORS = (
     "state rotation files lanes runtime",
+    "checks",
     "vehicle archive trajectories rows",
     "vector_field datasets summary",
     "rigid_body residual rollout environment",
@@ -20,7 +21,9 @@ FLOORS = (
     "report comparison_figures ablations",
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
-SIMULATOR_NEEDS = {"state", "rotation", "files", "vehicle", "trajectories", "datasets"}  # no learning, no reporting
+FLIGHTS_NEEDS = {"state", "vehicle", "trajectories"}
+# No learning, no reporting.
+SIMULATOR_NEEDS = {"state", "rotation", "files", "checks", "vehicle", "trajectories", "datasets"}
 
 
 def imported(path):
@@ -42,8 +45,9 @@ def modules(package):
 
 
 LIBRARY = {name: needs for name, needs in modules("hybrid_jax").items() if not name.endswith("__init__")}
-CORE = {name.split(".")[1]: needs for name, needs in LIBRARY.items() if not name.startswith("hybrid_jax.sim.")}
+CORE = {name.split(".")[1]: needs for name, needs in LIBRARY.items() if name.count(".") == 1}
 SIM = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.sim.")}
+FLIGHTS = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.flights.")}
 
 
 def test_every_module_has_a_floor():
@@ -54,7 +58,7 @@ def test_every_module_has_a_floor():
 def test_imports_point_down(name):
     for needed in CORE[name]:
         assert needed.startswith("hybrid_jax.")
-        assert not needed.startswith("hybrid_jax.sim")
+        assert not needed.startswith(("hybrid_jax.sim", "hybrid_jax.flights"))
         assert FLOOR[needed.split(".")[1]] < FLOOR[name], f"{name} imports {needed}"
 
 
@@ -63,6 +67,15 @@ def test_the_simulator_knows_nothing_of_learning(name):
     for needed in SIM[name]:
         assert needed.startswith("hybrid_jax.")
         assert needed.startswith("hybrid_jax.sim") or needed.split(".")[1] in SIMULATOR_NEEDS, (
+            f"{name} imports {needed}"
+        )
+
+
+@pytest.mark.parametrize("name", sorted(FLIGHTS))
+def test_logs_are_read_without_learning_and_simulator(name):
+    for needed in FLIGHTS[name]:
+        assert needed.startswith("hybrid_jax.")
+        assert needed.startswith("hybrid_jax.flights") or needed.split(".")[1] in FLIGHTS_NEEDS, (
             f"{name} imports {needed}"
         )
 

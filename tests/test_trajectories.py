@@ -45,7 +45,7 @@ def test_with_a_stride_windows_overlap():
 
 @pytest.mark.parametrize(("intervals", "steps", "stride"), [(4, 5, None), (23, 0, None), (23, 5, 0), (23, 5, -1)])
 def test_a_flight_without_a_window_is_refused(intervals, steps, stride):
-    with pytest.raises(ValueError, match="has no window of steps"):
+    with pytest.raises(ValueError, match=r"has no window of steps|st(eps|ride) must be an integer of at least 1"):
         windows_of(*flight(intervals), 0.01, steps=steps, stride=stride)
 
 

@@ -3,6 +3,7 @@
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+from hybrid_jax import checks
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.vehicle import IRIS, Vehicle
@@ -10,12 +11,23 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 
 @dataclass(frozen=True)
 class Domain:
-    """A true system: the vehicle, its drag C_D [kg/s] and the forces on it beyond thrust and gravity."""
+    """A true system: the vehicle, its drag C_D [kg/s] and the forces on it beyond thrust and gravity.
+
+    Raises:
+        ValueError: no vehicle, a drag that is negative or not finite, or a force that is no function.
+    """
 
     name: str
     vehicle: Vehicle = IRIS
     drag_coefficient: float = DRAG_COEFFICIENT
     forces: tuple[Force, ...] = (drag, ground_effect)
+
+    def __post_init__(self):
+        if not isinstance(self.vehicle, Vehicle):
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.shown(self.vehicle)}")
+        checks.not_negative("drag_coefficient", self.drag_coefficient)
+        if not isinstance(self.forces, tuple) or not all(callable(force) for force in self.forces):
+            raise ValueError(f"forces must be a tuple of functions, got {checks.shown(self.forces)}")
 
     def parameters(self) -> Parameters:
         """Its numbers, in the precision that is on when this is called."""

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
+from hybrid_jax import checks
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -44,11 +45,13 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
     Flight i depends on the key and i alone.
 
     Raises:
-        ValueError: no flights or no time.
+        ValueError: no flights, no time or no key.
     """
+    checks.count("flights", flights)
+    checks.positive("seconds", seconds)
+    checks.key("key", key)
     steps = round(seconds / DT)
-    if flights < 1 or steps < 1:
-        raise ValueError(f"flights and seconds must be positive, got flights={flights}, seconds={seconds}")
+    checks.count(f"intervals of {DT} s in seconds={seconds}", steps)
     cpu = jax.devices("cpu")[0]
     with jax.enable_x64(True), jax.default_device(cpu):
         truth = domain.quadrotor()

@@ -10,11 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from mujoco import mjx
 
+from hybrid_jax import checks
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import Force, Parameters, Scalar
 from hybrid_jax.sim.model import bare_model, with_parameters
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
+from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
 
 CHUNK = 64  # flights integrated side by side: the widest that stays in one core's cache
 
@@ -52,7 +53,13 @@ class Quadrotor(eqx.Module):
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
 
     def rollout(self, x0: State, u: Float[Array, "t 4"], t0: Scalar, dt: float) -> Float[Array, "t 13"]:
-        """The states at the end of each interval, from x0 at time t0 [s] with u[i] held over interval i."""
+        """The states at the end of each interval, from x0 at time t0 [s] with u[i] held over interval i.
+
+        Raises:
+            ValueError: shapes that do not agree, or what is known before it is compiled: a number that is not finite,
+                dt that is not positive, x0 without a unit quaternion.
+        """
+        x0, u = self._checked(x0, u, dt, windows=())
 
         def advance(carry, held):
             x, t = carry
@@ -64,8 +71,27 @@ class Quadrotor(eqx.Module):
     def rollouts(
         self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
     ) -> Float[Array, "n t 13"]:
-        """`rollout` of n flights, `chunk` of them side by side."""
+        """`rollout` of n flights, `chunk` of them side by side.
+
+        Raises:
+            ValueError: as `rollout`.
+        """
+        x0, u = self._checked(x0, u, dt, windows=jnp.shape(t0))
+        checks.count("chunk", chunk)
         return jax.lax.map(lambda one: self.rollout(one[0], one[1], one[2], dt), (x0, u, t0), batch_size=chunk)
+
+    def _checked(self, x0, u, dt, windows: tuple[int, ...]) -> tuple[Float[Array, "*n 13"], Float[Array, "*n t 4"]]:
+        """x0 and u as JAX arrays, of so many windows."""
+        x0, u = checks.floating("x0", x0), checks.floating("u", u)
+        if (
+            x0.shape != (*windows, STATE_SIZE)
+            or u.ndim != x0.ndim + 1
+            or u.shape != (*windows, u.shape[-2], INPUT_SIZE)
+        ):
+            raise ValueError(f"x0 (13,) and u (t, 4), or n of each and of t0, expected, got {x0.shape} and {u.shape}")
+        checks.positive("dt", dt, "a positive number of seconds")
+        checks.unit_quaternions("x0", x0)
+        return x0, u
 
     def _acceleration(self, x: State, u: Input, t: Scalar) -> Float[Array, "6"]:
         """[v̇, ω̇]: world frame [m/s²], body frame [rad/s²]."""

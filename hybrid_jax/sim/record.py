@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
+from hybrid_jax import checks
 from hybrid_jax.datasets import Dataset, versions
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, Flights, fly, gone_wrong
@@ -29,11 +30,10 @@ class SplitSpec:
     steps: int
 
     def __post_init__(self):
-        if self.windows < 1 or not 1 <= self.steps <= round(SECONDS / DT):
-            raise ValueError(
-                f"a split needs windows >= 1 and 1 <= steps <= {round(SECONDS / DT)}, "
-                f"got windows={self.windows}, steps={self.steps}"
-            )
+        checks.count("windows", self.windows)
+        checks.count("steps", self.steps)
+        if self.steps > round(SECONDS / DT):
+            raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
 
 # The paper's sets. The target's train split is the pool that nested subsets are the first N of; test_with_past holds
@@ -132,7 +132,12 @@ def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) ->
 def make_dataset(
     domain: Domain, splits: Mapping[str, SplitSpec], seed: int, progress: Progress = lambda share: None
 ) -> Dataset:
-    """Record a domain and write down how: configuration, versions, what was left out, statistics of the windows."""
+    """Record a domain and write down how: configuration, versions, what was left out, statistics of the windows.
+
+    Raises:
+        ValueError: a negative seed, or a domain whose flights all go wrong.
+    """
+    checks.count("seed", seed, least=0)
     windows, tallies = record(domain, splits, jax.random.key(seed), progress)
     metadata = {
         "config": configuration(domain, splits, seed),

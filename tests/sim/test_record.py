@@ -139,7 +139,7 @@ def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
 
 @pytest.mark.parametrize(("windows", "steps"), [(0, 10), (5, 0), (5, 1101)])
 def test_impossible_splits_are_refused(windows, steps):
-    with pytest.raises(ValueError, match="windows >= 1"):
+    with pytest.raises(ValueError, match=r"(windows|steps) must be"):
         SplitSpec(windows, steps)
 
 

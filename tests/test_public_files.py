@@ -1,0 +1,251 @@
+"""A file is data: read whole or refused in one line that names it, and never run; whatever stands in it.
+
+The cases are those of test_public_surface.py, of files.
+"""
+
+import dataclasses
+import io
+import json
+import os
+import pickle
+import zipfile
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pendulum import pendulum, swings
+from surface import cases, is_finite, outcome, spoiled
+
+import hybrid_jax as hj
+from hybrid_jax.archive import named_leaves, save_archive
+from hybrid_jax.datasets import FORMAT as DATASET
+from hybrid_jax.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.models import FORMAT as MODEL
+from hybrid_jax.models import portable
+
+KEY = jax.random.key(0)
+MIXED = hj.Hybrid(pendulum(), hj.residual_network(2, 1, KEY, hidden=4))
+WINDOWS = jax.tree.map(np.asarray, swings(12, steps=3))
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("files")
+
+
+TOML_VALUES = st.one_of(
+    st.sampled_from(
+        ["1.0", "-1", "nan", "inf", "0", "1e400", "9" * 5000, '"text"', "true", "2026-01-01", "{a = 1}", "[]"]
+    ),
+    st.sampled_from(
+        ["[1, 1, 1]", "[-1, 1, -1, 1]", "[" * 3000, "[[1, 1], [1, 1], [1, 1], [1, 1]]", "1 1", '"\\ud800"']
+    ),
+    st.text(max_size=20),
+)
+
+
+@cases(0.08)
+@given(
+    values=st.dictionaries(
+        st.one_of(st.sampled_from([field.name for field in dataclasses.fields(hj.Vehicle)]), st.text(max_size=5)),
+        TOML_VALUES,
+    ),
+    name=st.text(max_size=8),
+)
+def test_a_vehicle_file_is_read_or_refused_by_its_name(folder, values, name):
+    base = {"mass": "1.5", "inertia": "[1, 1, 1]", "thrust_coefficient": "1e-5", "torque_coefficient": "1e-6"}
+    base |= {
+        "rotor_positions": "[[1, 1], [-1, 1], [1, -1], [-1, -1]]",
+        "spin": "[1, -1, 1, -1]",
+        "max_rotor_speed": "9",
+    }
+    text = f"[{'vehicle' if len(name) < 6 else name}]\n" + "".join(
+        f"{key} = {value}\n" for key, value in (base | values).items()
+    )
+    path = folder / "vehicle.toml"
+    path.write_bytes(text.encode("utf-8", "surrogatepass"))
+    found = outcome(hj.load_vehicle, path, naming=str(path))
+    assert found is None or found.mass > 0
+
+
+ABOUT = st.recursive(
+    st.one_of(
+        st.none(), st.booleans(), st.integers(), st.floats(), st.text(max_size=5), st.just(b"1"), st.just(np.ones(2))
+    ),
+    lambda inner: st.one_of(st.lists(inner, max_size=3), st.dictionaries(st.text(max_size=5), inner, max_size=3)),
+    max_leaves=5,
+)
+
+
+@portable
+class Anything(hj.AbstractVectorField):
+    """A field that holds what it is given."""
+
+    held: object
+
+    def __call__(self, x, u):
+        return x
+
+
+HELD = st.one_of(
+    ABOUT,
+    st.sampled_from([KEY, jnp.ones(2, jnp.bfloat16), np.array(["a"]), np.array([{}]), {1: np.ones(2)}, {"a/b": 1}, 1j]),
+    st.just({"a": {"b": np.ones(2)}, "a/b": np.zeros(2)}),
+)
+
+
+@cases(0.05)
+@given(held=HELD, about=st.dictionaries(st.text(max_size=5), ABOUT, max_size=3))
+def test_what_is_saved_is_what_is_loaded_or_is_refused(folder, held, about):
+    path = folder / "saved.npz"
+    path.unlink(missing_ok=True)
+    outcome(hj.save, path, Anything(held), about)
+    if path.exists():
+        loaded, saved = (
+            jax.tree.map(lambda leaf: jnp.asarray(leaf) if eqx.is_array(leaf) else leaf, field)
+            for field in (hj.load(path).field, Anything(held))
+        )
+        assert eqx.tree_equal(loaded, saved)
+
+
+@pytest.fixture(scope="module")
+def files(folder):
+    """Loader → the bytes of a sound file."""
+    hj.save(folder / "model.npz", MIXED, {"n": 1})
+    save_dataset(folder / "set.npz", Dataset({"train": WINDOWS}, {"config": {"seed": 1}}))
+    return {hj.load: (folder / "model.npz").read_bytes(), load_dataset: (folder / "set.npz").read_bytes()}
+
+
+def content(found):
+    return named_leaves(found.field if isinstance(found, hj.Model) else dict(found.splits))
+
+
+@cases(0.05)
+@given(
+    load=st.sampled_from([hj.load, load_dataset]),
+    damage=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=40)), min_size=1, max_size=3),
+)
+def test_a_damaged_file_is_refused_by_its_name_or_gives_what_was_saved(folder, files, load, damage):
+    path, damaged = folder / "damaged.npz", files[load]
+    path.write_bytes(damaged)
+    sound = content(load(path))
+    for share, length, bytes_there in damage:
+        place = int(share * len(damaged))
+        damaged = damaged[:place] + bytes_there + damaged[place + length :]
+    path.write_bytes(damaged)
+    found = outcome(load, path, naming=str(path))
+    assert found is None or eqx.tree_equal(content(found), sound)
+
+
+# What a header may hold that has the right checksum and was not written by `save`.
+KINDS = st.sampled_from(["Hybrid", "RigidBody", "Vehicle", "InputScaling", "BatchNorm", "Frozen", "os.system", "Model"])
+NAMES = st.sampled_from(
+    ["physics", "residual", "log_ratios", "vehicle", "mass", "field", "scale", "k", "Ix", "Iy", "about"]
+)
+FORGED = st.recursive(
+    st.one_of(st.none(), st.integers(-2, 2), st.text(max_size=3), st.just({"array": "a"}), st.just({"array": "gone"})),
+    lambda inner: st.one_of(
+        st.fixed_dictionaries({"kind": KINDS, "fields": st.dictionaries(NAMES, inner, max_size=3)}),
+        st.fixed_dictionaries({"items": st.dictionaries(NAMES, inner, max_size=3)}),
+        st.fixed_dictionaries({"tuple": st.lists(inner, max_size=3)}),
+        st.fixed_dictionaries({"field": inner, "about": inner, "splits": st.dictionaries(NAMES, inner, max_size=2)}),
+        st.fixed_dictionaries(
+            {"kind": st.just("Hybrid"), "fields": st.fixed_dictionaries({"physics": inner, "residual": inner})}
+        ),
+    ),
+    max_leaves=8,
+)
+
+
+@cases(0.05)
+@given(
+    header=st.one_of(FORGED, st.fixed_dictionaries({"field": FORGED, "about": FORGED})), array=spoiled(np.ones((2, 3)))
+)
+def test_a_forged_file_is_refused_or_gives_what_refuses_to_fly(folder, header, array):
+    path, arrays = folder / "forged.npz", {"a": array} if isinstance(array, np.ndarray) else {}
+    for form, load in ((MODEL, hj.load), (DATASET, load_dataset)):
+        path.unlink(missing_ok=True)
+        outcome(save_archive, path, form, header, arrays)
+        if not path.exists():
+            continue
+        found = outcome(load, path, naming=str(path))
+        if isinstance(found, hj.Model):
+            prediction = outcome(found.predict, np.zeros(2), np.zeros((3, 1)), 0.01)
+            assert prediction is None or is_finite(prediction)
+
+
+def npy(descr="<f8", shape="(2,)", data=bytes(16), version=1):
+    """The bytes of a .npy whose header says what it likes."""
+    header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+    return b"\x93NUMPY" + bytes([version, 0]) + len(header).to_bytes(2, "little") + header + data
+
+
+class Trap:
+    """Makes a folder when it is unpickled."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.folder),)
+
+
+def pickled(folder):
+    file = io.BytesIO()
+    np.lib.format.write_array(file, np.array([Trap(folder)], dtype=object), allow_pickle=True)
+    return file.getvalue()
+
+
+HOSTILE = {
+    "absolute name": lambda folder: {str(folder / "sprung"): npy()},
+    "name that climbs": lambda folder: {"../sprung.npy": npy()},
+    "name that climbs from inside": lambda folder: {"a/../../sprung.npy": npy()},
+    "name that climbs on Windows": lambda folder: {"..\\sprung.npy": npy()},
+    "pickle in a .npy": lambda folder: {"a.npy": pickled(folder / "sprung")},
+    "pickle": lambda folder: {"a.npy": pickle.dumps(Trap(folder / "sprung"))},
+    "pickle as header": lambda folder: {"header.json": pickle.dumps(Trap(folder / "sprung"))},
+    "array of terabytes": lambda folder: {"a.npy": npy(shape=f"({10**13},)")},
+    "array whose size overflows": lambda folder: {"a.npy": npy(shape=f"({2**32}, {2**32})")},
+    "array of negative size": lambda folder: {"a.npy": npy(shape="(-1, -2)")},
+    "shape that is code": lambda folder: {"a.npy": npy(shape=f"(__import__('os').mkdir('{folder / 'sprung'}'),)")},
+    "array of objects": lambda folder: {"a.npy": npy(descr="|O")},
+    "array of records": lambda folder: {"a.npy": npy(descr=[("a", "<f8")])},
+    "array of text": lambda folder: {"a.npy": npy(descr="<U2")},
+    "another version of .npy": lambda folder: {"a.npy": npy(version=3)},
+    "wrong magic": lambda folder: {"a.npy": b"\x94" + npy()[1:]},
+    "nested header": lambda folder: {"header.json": b"[" * 100_000},
+    "header with NaN": lambda folder: {"header.json": b'{"format": "%s", "metadata": NaN}'},
+    "header without end": lambda folder: {"header.json": b'{"format": "%s", "metadata": '},
+}
+
+
+@pytest.mark.parametrize("load", [hj.load, load_dataset])
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_file_is_refused_and_nothing_of_it_is_run_or_written(name, load, tmp_path):
+    form = {hj.load: MODEL, load_dataset: DATASET}[load]
+    path = tmp_path / "inside" / "hostile.npz"
+    path.parent.mkdir()
+    with zipfile.ZipFile(path, "w") as archive:
+        entries = {"header.json": json.dumps({"format": form}).encode()} | HOSTILE[name](tmp_path)
+        for entry, content in entries.items():
+            archive.writestr(entry, content.replace(b"%s", form.encode()))
+    assert outcome(load, path, naming=str(path)) is None
+    assert list(tmp_path.rglob("*")) == [path.parent, path]
+
+
+def test_the_trap_would_spring(tmp_path):
+    """Or the test before would prove nothing."""
+    np.load(io.BytesIO(pickled(tmp_path / "sprung")), allow_pickle=True)
+    assert (tmp_path / "sprung").exists()
+
+
+def test_a_small_file_that_grows_is_refused(tmp_path):
+    path = tmp_path / "bomb.npz"
+    with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("header.json", bytes(10**7))
+    with pytest.raises(ValueError, match="is compressed"):
+        hj.load(path)

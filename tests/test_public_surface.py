@@ -1,0 +1,234 @@
+"""Whatever the public functions are given, they give a finite result or refuse it in one line, as a ValueError.
+
+`CASES=full pytest -n 0 tests/test_public_surface.py tests/test_public_files.py` tries 10 000 cases; without it it is
+some 300, in seconds. Both are the same every time.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from pendulum import pendulum, swings
+from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
+
+import hybrid_jax as hj
+from hybrid_jax import linear_adaptation, metrics, uncertainty
+from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.residual import InputScaling
+from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sim.flight import fly
+from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.training import DIVERGED
+from hybrid_jax.trajectories import check, concatenate, split, windows_of
+
+KEY = jax.random.key(0)
+BODY, SWING = hj.rigid_body(hj.IRIS), pendulum()
+NETWORK = hj.residual_network(2, 1, KEY, hidden=4)
+MIXED = hj.Hybrid(SWING, NETWORK)
+WINDOWS = jax.tree.map(np.asarray, swings(12, steps=3))
+COVARIANCE = np.diag([1e-4, 4e-4, 9e-4])
+
+
+def states(kind, shape):
+    """Sound states and inputs of a rigid body or a pendulum."""
+    rng = np.random.default_rng(0)
+    n, m = {"body": (13, 4), "swing": (2, 1)}[kind]
+    x0 = rng.normal(size=(*shape, n)).astype(np.float32)
+    u = rng.normal(size=(*shape, 3, m)).astype(np.float32)
+    if kind == "body":
+        x0[..., 3:7] /= np.linalg.norm(x0[..., 3:7], axis=-1, keepdims=True)
+        u = 20 * u + np.float32(hj.IRIS.hover_speed)
+    return x0, u
+
+
+FLOWN = {"body": BODY, "swing": SWING}
+
+
+@st.composite
+def flights(draw, shapes=((), (3,))):
+    """A kind of field, and x0 and u for it, of n windows or of one, both perhaps spoiled."""
+    kind = draw(st.sampled_from(sorted(FLOWN)))
+    x0, u = states(kind, draw(st.sampled_from(shapes)))
+    harm = draw(st.sampled_from([0.0, 0.6]))
+    return kind, draw(spoiled(x0, harm)), draw(spoiled(u, harm))
+
+
+@cases(0.17)
+@given(flights(), odd(0.01, 0.01, np.float32(0.01), np.array(0.01)), st.sampled_from([*FLOWN, None]))
+def test_a_prediction_is_finite_or_refused(flight, dt, other):
+    """`other`: the field of another system than that of the flight, half of the time."""
+    kind, x0, u = flight
+    found = outcome(hj.Model(FLOWN[other or kind]).predict, x0, u, dt)
+    assert found is None or is_finite(found)
+
+
+@cases(0.05)
+@given(
+    flights(),
+    odd(0.01),
+    odd(1, 2),
+    st.sampled_from([None, hj.RK4(), "rk4", 4]),
+    st.sampled_from([hj.rollout, hj.rollout_batch]),
+)
+def test_a_rollout_is_finite_or_refused(flight, dt, substeps, solver, function):
+    kind, x0, u = flight
+    found = outcome(function, FLOWN[kind], x0, u, dt, solver, substeps)
+    # One that leaves the numbers from a finite start is carried on: see its documentation, and `Model.predict`.
+    assert found is None or is_finite(found) or max(np.abs(x0).max(), np.abs(u).max()) > 1e4
+
+
+@st.composite
+def windows(draw):
+    """Windows of a pendulum, perhaps spoiled."""
+    harm = draw(st.sampled_from([0.0, 0.0, 0.4]))
+    parts = (draw(spoiled(part, harm)) for part in (WINDOWS.x0, WINDOWS.u, WINDOWS.x))
+    return hj.Trajectories(*parts, draw(odd(0.05)) if harm else 0.05)
+
+
+@cases(0.1)
+@given(windows())
+def test_windows_that_pass_the_check_are_whole(found):
+    if outcome(check, found) is None:
+        return
+    assert found.x.shape == (len(found), found.horizon, found.x0.shape[1])
+    assert is_finite(jax.tree.map(lambda part: jnp.asarray(part, np.float32), found))
+    assert hash(found.dt) is not None
+    assert len(list(found)) == len(found)  # a loop over them ends
+
+
+@cases(0.08)
+@given(
+    windows(),
+    windows(),
+    odd(0.01),
+    st.fixed_dictionaries(
+        {},
+        optional={
+            "min_epochs": odd(0, 2),
+            "patience": odd(0, 2),
+            "max_epochs": odd(1, 3),
+            "regulariser_weight": odd(0.0, 1e-3),
+            "settings": st.sampled_from([hj.Settings(size) for size in (4, 13, 0, -1, 2.5, "4", None)]),
+        },
+    ),
+    st.sampled_from([KEY, jax.random.PRNGKey(0), 0, None, jax.random.split(KEY, 2), "key"]),
+    st.sampled_from([MIXED, SWING, BODY]),
+)
+def test_a_fit_leaves_a_finite_field_or_is_refused(train, validation, rate, rules, key, field):
+    rules = {"max_epochs": 2, "settings": hj.Settings(4)} | rules
+    found = outcome(hj.fit, field, train, validation, key, rates=rate, **rules)
+    assert found is None or (is_finite(found.best) and (found.status == DIVERGED or np.isfinite(found.best_mse)))
+
+
+@pytest.mark.parametrize("rates", [(1, 2), hj.Hybrid(1.0, "fast"), hj.Hybrid(np.nan, 1.0), {"physics": 1.0}, None])
+def test_rates_that_do_not_go_with_the_field_are_refused(rates):
+    with pytest.raises(ValueError, match=r"^rates must be"):
+        hj.fit(MIXED, WINDOWS, WINDOWS, KEY, rates=rates, settings=hj.Settings(4))
+
+
+# Name → a function of windows; each finite or refused, if the windows are those of a pendulum of moderate speed.
+OF_WINDOWS = {
+    "fit_physics": lambda w, n: fit_physics(SWING, w, max_steps=n).field,
+    "covariance": lambda w, n: uncertainty.physics_covariance(SWING, w, chunk=n),
+    "linear": lambda w, n: linear_adaptation.linear_residual(SWING, w, n),
+    "last layer": lambda w, n: linear_adaptation.last_layer(MIXED, w, n),
+    "adapted": lambda w, n: linear_adaptation.adapted(linear_adaptation.last_layer, MIXED, w, WINDOWS, (1.0, n)),
+    "mse": lambda w, n: metrics.deployed_mse(SWING, w, n),
+    "split": lambda w, n: split(check(w), n),
+    "windows_of": lambda w, n: check(windows_of(w.u[0], w.u[0, :-1], w.dt, steps=n)),
+    "concatenate": lambda w, n: check(concatenate([w, WINDOWS])),
+    "subset": lambda w, n: check(w[:2]),
+}
+
+
+@cases(0.1)
+@given(windows(), odd(1, 2), st.sampled_from(sorted(OF_WINDOWS)))
+def test_what_is_made_of_windows_is_finite_or_refused(found, number, name):
+    whole = outcome(check, found) is not None
+    if name in ("windows_of", "concatenate", "subset") and not whole:
+        return  # these rearrange arrays of any content; `check` is what looks at it
+    made = outcome(OF_WINDOWS[name], found, number)
+    moderate = whole and max(np.abs(part).max(initial=0) for part in (found.x0, found.u, found.x)) < 1e4
+    assert made is None or is_finite(made) or not moderate
+
+
+@cases(0.04)
+@given(spoiled(COVARIANCE), odd(0.95, 0.5), st.sampled_from([BODY, hj.Hybrid(BODY, BODY), SWING]))
+def test_intervals_are_finite_or_refused(covariance, level, field):
+    found = outcome(uncertainty.intervals, field, covariance, level)
+    assert found is None or all(is_finite(interval) or interval.high == np.inf for interval in found.values())
+
+
+@cases(0.04)
+@given(spoiled(WINDOWS.x), spoiled(WINDOWS.x), odd(1.0), odd(0.5))
+def test_errors_and_gains_are_finite_or_refused(predicted, truth, before, after):
+    pair = [np.asarray(a, float) for a in (predicted, truth) if isinstance(a, np.ndarray) and a.dtype.kind in "fiu"]
+    if len(pair) == 2:  # these two are called in compiled code: arrays they are, of numbers of any size
+        found = outcome(metrics.mse, *map(jnp.asarray, pair))
+        assert found is None or is_finite(found) or not all(np.abs(a).max(initial=0) < 1e4 for a in pair)
+    if isinstance(before, float) and isinstance(after, float):
+        gain = outcome(metrics.improvement, before, after)
+        assert gain is None or is_finite(gain) or not (np.isfinite(before) and np.isfinite(after))
+
+
+CONSTANTS = {
+    field.name: st.one_of(st.just(getattr(hj.IRIS, field.name)), odd(1.0, 2, 1e-6))
+    for field in dataclasses.fields(hj.Vehicle)
+} | {
+    "inertia": st.one_of(st.just(hj.IRIS.inertia), st.tuples(*3 * [odd(0.1)]), odd(1.0)),
+    "spin": st.one_of(st.just(hj.IRIS.spin), st.tuples(*4 * [odd(1, -1.0)]), odd(1.0)),
+    "rotor_positions": st.one_of(st.just(hj.IRIS.rotor_positions), st.tuples(*4 * [st.tuples(*2 * [odd(0.1, -0.2)])])),
+}
+
+
+@cases(0.08)
+@given(st.fixed_dictionaries({}, optional=CONSTANTS))
+def test_a_vehicle_flies_or_is_refused(changed):
+    vehicle = outcome(lambda: dataclasses.replace(hj.IRIS, **changed))
+    if vehicle is not None:
+        assert 0 < vehicle.hover_speed < np.inf
+        assert hash(vehicle) == hash(dataclasses.replace(vehicle))
+        assert is_finite(hj.rigid_body(vehicle).theta())
+
+
+@cases(0.05)
+@given(
+    odd(1, 2),
+    odd(1, 2),
+    odd(1, 3),
+    st.sampled_from(["batch", "layer", "none", "group", None, 1, []]),
+    odd(1.0),
+    odd(0.0),
+)
+def test_a_network_is_made_or_refused(state_size, input_size, hidden, norm, scale, offset):
+    scaling = outcome(InputScaling, offset, scale)
+    network = outcome(hj.residual_network, state_size, input_size, KEY, hidden=hidden, norm=norm, scaling=scaling)
+    if network is not None:
+        assert is_finite(network)
+        assert is_finite(network(jnp.ones(state_size), jnp.ones(input_size)))
+
+
+@cases(0.04)
+@given(odd(1, 2.0), odd(0.4), st.sampled_from([(), None, "drag", (1,)]), odd(1, 5), odd(10), odd(0), odd(1.0))
+def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
+    vehicle, drag, forces, windows, steps, flights, seconds
+):
+    assert outcome(Domain, "mine", vehicle) is None
+    domain = outcome(Domain, "mine", drag_coefficient=drag, forces=forces)
+    assert domain is None or is_finite(domain.parameters())
+    spec = outcome(SplitSpec, windows, steps)
+    assert spec is None or spec.windows * spec.steps > 0
+    assert outcome(fly, SOURCE, flights, seconds, "no key") is None
+
+
+@cases(0.04)
+@given(flights(shapes=((2,),)), odd(0.01), odd(1), st.sampled_from(sorted(set(SPOILED) - {"itself", "jax", "list"})))
+def test_the_simulator_refuses_states_that_cannot_fly(flight, dt, chunk, name):
+    """Sound ones are compiled for seconds and flown elsewhere, in tests/sim."""
+    _, _, u = flight
+    x0 = SPOILED["nan" if name in ("f8", "f2", "1e+25", "-100000.0", "i4", "u1") else name](np.zeros((2, 13)), 3)
+    assert outcome(SOURCE.quadrotor().rollouts, x0, u, jnp.zeros(2), dt, chunk) is None
