@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import rotation
 from hybrid_jax.residual import InputScaling, residual_network
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch, observe
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe
 
 Features = Float[Array, " n *b"]
 
@@ -93,6 +93,11 @@ class Accelerations(View):
 @evaluate_batch.register
 def _(field: View, x, u):
     return field.write(x, evaluate_batch(field.field, field.read(x), u))
+
+
+@deploy_batch.register
+def _(field: View, x, u):
+    return field.write(x, deploy_batch(field.field, field.read(x), u))
 
 
 @observe.register

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, evaluate_batch, observe
+from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, deploy_batch, evaluate_batch, observe
 
 
 class InputScaling(eqx.Module):
@@ -39,8 +39,8 @@ class Normalisation(eqx.Module):
     """What is done to the hidden pre-activations h = W z before the ReLU."""
 
     @abstractmethod
-    def deployed(self, weight: Float[Array, "h m"], z: Float[Array, " m"]) -> Float[Array, " h"]:
-        """The normalised W z of one sample, as in deployment."""
+    def deployed(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
+        """The normalised W z of each sample, as in deployment."""
 
     @abstractmethod
     def layers(
@@ -72,7 +72,8 @@ class BatchNorm(Normalisation):
 
     def deployed(self, weight, z):
         weight, bias = self.fold(weight)
-        return weight @ z + bias
+        hidden = weight @ z
+        return hidden + _beside(bias, hidden)
 
     def layers(self, weight_in, weight_out, bias_out, z):
         return _normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
@@ -133,11 +134,12 @@ class ResidualNetwork(AbstractVectorField):
     bias_out: Float[Array, " d"]
     scaling: InputScaling = eqx.field(default_factory=InputScaling)
 
-    def __call__(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+    def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         """Deployment: normalised by the running statistics."""
-        return self.weight_out @ self.activations(x, u) + self.bias_out
+        product = self.weight_out @ self.activations(x, u)
+        return product + _beside(self.bias_out, product)
 
-    def activations(self, x: Float[Array, " n"], u: Float[Array, " m"]) -> Float[Array, " h"]:
+    def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units as deployed: what the output layer is linear in."""
         return jax.nn.relu(self.norm.deployed(self.weight_in, self.inputs(x, u)))
 
@@ -222,6 +224,12 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
 def _(field: ResidualNetwork, x, u) -> Array:
     """Training: where the norm is the batch's, each evaluation normalises by its own minibatch."""
     return field.norm.layers(field.weight_in, field.weight_out, field.bias_out, field.inputs(x, u))
+
+
+@deploy_batch.register(ResidualNetwork)
+@deploy_batch.register(LinearResidual)
+def _(field, x, u):
+    return field(x, u)
 
 
 @observe.register

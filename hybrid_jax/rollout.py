@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.vector_field import AbstractVectorField, evaluate_batch
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 
@@ -116,7 +116,11 @@ def rollout_batch(
         ValueError: as `rollout`.
     """
     x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
-    return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
+    if isinstance(solver, diffrax.AbstractImplicitSolver):  # all windows at once would be one large system to it
+        return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
+    columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
+    states = integrate(lambda x, held: deploy_batch(field, x, held), columns, held, dt, solver, substeps)
+    return jnp.moveaxis(states, -1, 0)
 
 
 def checked(

@@ -49,7 +49,10 @@ def pure(v: Vector) -> Quaternion:
 
 def derivative(q: Quaternion, body_rates: Vector) -> Quaternion:
     """q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
-    return 0.5 * multiply(q, pure(body_rates))
+    (w, x, y, z), (a, b, c) = q, body_rates
+    return 0.5 * jnp.stack(
+        [-x * a - y * b - z * c, w * a + y * c - z * b, w * b + z * a - x * c, w * c + x * b - y * a]
+    )
 
 
 def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:

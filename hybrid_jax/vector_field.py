@@ -1,9 +1,10 @@
 """Vector fields ẋ = f(x, u): what a model is. Physics, a network, their sum and a user's own are all values of it.
 
-A field is any Equinox module that maps one state x (d,) and one input u (m,) to ẋ (d,). Training evaluates a field on a
-whole minibatch, features first: x (d, b), u (m, b). `evaluate_batch` does that by `vmap`, so a user writes code for one
-sample and is done. A field registers its own version when the batch means something to it (batch normalisation), or
-when its code, in terms of x[0], x[1], …, serves a batch as it stands and is twice as fast without the transposes.
+A field is any Equinox module that maps one state x (d,) and one input u (m,) to ẋ (d,). Many samples are evaluated at
+once, features first: x (d, b), u (m, b); by `evaluate_batch` in training, by `deploy_batch` in deployment. Both do it
+by `vmap`, so a user writes code for one sample and is done. A field registers its own version when the batch means
+something to it (batch normalisation), or when its code, in terms of x[0], x[1], …, serves a batch as it stands and is
+twice as fast without the transposes.
 """
 
 from abc import abstractmethod
@@ -61,6 +62,22 @@ def evaluate_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"])
 @evaluate_batch.register
 def _(field: Hybrid, x, u):
     return evaluate_batch(field.physics, x, u) + evaluate_batch(field.residual, x, u)
+
+
+@singledispatch
+def deploy_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+    """ẋ of many samples, each as in deployment: features first, one column a sample."""
+    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+
+
+@deploy_batch.register
+def _(field: Hybrid, x, u):
+    return deploy_batch(field.physics, x, u) + deploy_batch(field.residual, x, u)
+
+
+@deploy_batch.register
+def _(field: Frozen, x, u):
+    return deploy_batch(field.field, x, u)
 
 
 @singledispatch

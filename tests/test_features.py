@@ -12,7 +12,15 @@ from hybrid_jax import Hybrid, features, load, residual_network, rigid_body, rot
 from hybrid_jax.features import BodyFrame, restricted
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, Statistics, evaluate_batch, observe, trainable
+from hybrid_jax.vector_field import (
+    AbstractVectorField,
+    Frozen,
+    Statistics,
+    deploy_batch,
+    evaluate_batch,
+    observe,
+    trainable,
+)
 from hybrid_jax.vehicle import IRIS
 
 KEY = jax.random.key(0)
@@ -153,6 +161,16 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     running = network_of(observe(field, x, u)).norm.running
     np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
+    x, u = samples()
+    for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
+        one_by_one = jax.vmap(field, -1, -1)(x, u)
+        np.testing.assert_allclose(deploy_batch(field, x, u), one_by_one, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(deploy_batch(Frozen(field), x, u), one_by_one, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)

@@ -140,6 +140,19 @@ def test_a_batch_is_its_columns():
     np.testing.assert_allclose(columns.T, jax.vmap(field)(x, u), rtol=1e-13, atol=1e-12)  # another order of sums
 
 
+def test_the_gradient_of_a_minibatch_is_that_of_its_samples():
+    """With respect to θ_p, states and inputs alike."""
+    field, (x, u) = guess(IRIS, jax.random.key(1)), (jnp.asarray(part) for part in samples(6, seed=1))
+    weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
+
+    def slope(evaluate):
+        return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x.T, u.T)
+
+    plain = slope(lambda field, x, u: jax.vmap(field, -1, -1)(x, u))
+    for ours, theirs in zip(jax.tree.leaves(slope(evaluate_batch)), jax.tree.leaves(plain), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
+
+
 def test_single_precision_stays_single():
     x, u = samples(1)
     field = jax.tree.map(lambda leaf: leaf.astype(np.float32), rigid_body(IRIS))
