@@ -74,8 +74,8 @@ def integrate(
 def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
     """The solver with its stages in a loop of bounded length.
 
-    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`, in
-    which the lanes of a sweep run on several devices.
+    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`,
+    which is where the lanes of a sweep run.
     """
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
         return dataclasses.replace(solver, scan_kind="bounded")
