@@ -7,12 +7,12 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
+from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch
 from hybrid_jax.vehicle import Vehicle
 
 LEARNED = ("Ix", "Iy", "k")
-Rows = tuple[Float[Array, " *b"], ...]  # the entries of a vector
 
 
 class RigidBody(AbstractVectorField):

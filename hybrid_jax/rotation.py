@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 
 Quaternion = Float[Array, "4"]
 Vector = Float[Array, "3"]
+Rows = tuple[Float[Array, " *b"], ...]  # the entries of a vector, of one sample or of many
 
 
 def multiply(a: Quaternion, b: Quaternion) -> Quaternion:
@@ -35,7 +36,7 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
     return multiply(multiply(q, pure(v)), conjugate(q))[1:]
 
 
-def body_z(q: Quaternion) -> Vector:
+def body_z(q: Quaternion | Rows) -> Vector:
     """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
     w, x, y, z = q
     return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
@@ -47,7 +48,7 @@ def pure(v: Vector) -> Quaternion:
     return jnp.stack([jnp.zeros_like(x), x, y, z])
 
 
-def derivative(q: Quaternion, body_rates: Vector) -> Quaternion:
+def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:
     """q̇ = ½ q ⊗ [0, ω]  [1/s] for body rates ω [rad/s]."""
     (w, x, y, z), (a, b, c) = q, body_rates
     return 0.5 * jnp.stack(
