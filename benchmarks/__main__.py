@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import tyro
 from rich.console import Console
@@ -15,13 +15,13 @@ from benchmarks.timing import Ratio, ratio_table
 from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.files import json_text, read_json, write_whole
 
-Benchmark = Literal["training_step", "rollout", "sweep", "environment"]
+Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "growth"]
 PEERS = "training_peers", "environment_peers"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Run every benchmark, each in a process of its own, and print one table of ratios: about five minutes on two quiet
+    """Run every benchmark, each in a process of its own, and print one table of ratios: about ten minutes on two quiet
     cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
     """
 
@@ -29,7 +29,7 @@ class Options:
     """full: what is reported. smoke: does it work; its numbers say nothing."""
     out: Path | None = None
     """Also write the numbers of all benchmarks to this file as JSON."""
-    only: tuple[Benchmark, ...] = ("training_step", "rollout", "sweep", "environment")
+    only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
     """Also run those against rivals, training_peers and environment_peers, on one core: some eight minutes more, mostly

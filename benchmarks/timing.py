@@ -17,11 +17,13 @@ import jax
 import numpy as np
 import tyro
 from jaxtyping import PyTree
+from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
 from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.environment import environment
+from hybrid_jax.figures import save_figure
 from hybrid_jax.files import json_text, write_whole
 from hybrid_jax.runtime import configure, cores
 
@@ -40,7 +42,7 @@ class Options:
     preset: str = "full"
     """full: what is reported. smoke: does it work, in seconds; its numbers say nothing."""
     out: Path | None = None
-    """Also write the numbers to this file as JSON."""
+    """Also write the numbers to this file as JSON, and a figure, if there is one, beside it."""
 
 
 @dataclass(frozen=True)
@@ -64,11 +66,12 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a benchmark measured: rows of JSON values, the same for reading, and the ratios that matter."""
+    """What a benchmark measured: rows of JSON values, the same for reading, the ratios that matter, and a figure."""
 
     rows: list[dict[str, Any]]
     tables: list[Table]
     ratios: list[Ratio] = field(default_factory=list)
+    figure: Figure | None = None
 
 
 @dataclass(frozen=True)
@@ -108,9 +111,24 @@ def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
 
 def compiled(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
     """A call of the compiled function on arguments that lie on the device, and the seconds of tracing and compiling."""
+    call, seconds, _ = compiled_with_memory(function, *arguments)
+    return call, seconds
+
+
+def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float, int]:
+    """As `compiled`, and the bytes that the program needs beside its arguments and results."""
     arguments = jax.device_put(arguments)
     program, seconds = stopwatch(lambda: jax.jit(function).lower(*arguments).compile())
-    return lambda: program(*arguments), seconds
+    return lambda: program(*arguments), seconds, program.memory_analysis().temp_size_in_bytes
+
+
+def repeated(call: Call, turns: int, budget: float) -> float:
+    """The median seconds of a call, after one that warms up; fewer turns, but three, once the budget [s] is spent."""
+    call()
+    taken: list[float] = []
+    while len(taken) < turns and (len(taken) < 3 or sum(taken) < budget):
+        taken.append(stopwatch(call)[1])
+    return statistics.median(taken)
 
 
 def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
@@ -146,6 +164,8 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     if options.out is not None:
         report = _report(name, options.preset, findings, time.perf_counter() - began)
         write_whole(options.out, json_text(report))
+        if findings.figure is not None:
+            save_figure(findings.figure, options.out.with_suffix(""))
 
 
 def _check(options: Options, presets: Mapping[str, Any]) -> None:

@@ -21,6 +21,10 @@ from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 
 
+# A program is traced once for all stages of a step, not once for each; the compiler puts it in line again.
+_evaluate, _deploy = eqx.filter_jit(evaluate_batch), eqx.filter_jit(deploy_batch)
+
+
 class RK4(diffrax.AbstractSolver):
     """The classical fourth-order Runge–Kutta method (Kutta 1901), which diffrax does not ship; fixed steps only."""
 
@@ -119,7 +123,7 @@ def rollout_batch(
     if isinstance(solver, diffrax.AbstractImplicitSolver):  # all windows at once would be one large system to it
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
-    states = integrate(lambda x, held: deploy_batch(field, x, held), columns, held, dt, solver, substeps)
+    states = integrate(lambda x, held: _deploy(field, x, held), columns, held, dt, solver, substeps)
     return jnp.moveaxis(states, -1, 0)
 
 
@@ -174,7 +178,7 @@ def rollout_minibatch(
     substeps: int = 1,
 ) -> Float[Array, "t d b"]:
     """The trajectories of a minibatch as in training, features first: each evaluation sees the whole minibatch."""
-    return integrate(lambda x, held: evaluate_batch(field, x, held), x0, u, dt, solver, substeps)
+    return integrate(lambda x, held: _evaluate(field, x, held), x0, u, dt, solver, substeps)
 
 
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):

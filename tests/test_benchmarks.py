@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import environment, rollout, sweep, timing, training_step
+from benchmarks import compilation, environment, growth, rollout, sweep, timing, training_step
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
 
@@ -60,7 +60,7 @@ def test_three_integrators_predict_alike_and_have_the_same_gradient(tmp_path):
         for entry in ("seconds", "compile_seconds", "times_by_hand", "difference"):
             assert set(row[entry]) == {"hybrid_jax", "by_hand", "diffeqsolve"}
         assert max(row["difference"].values()) < 1e-5
-    assert set(forward["windows_per_second"]) == {"at_once", "chunks"}
+    assert set(forward["windows_per_second"]) == {"rollout_batch", "rollout, vmapped"}
     assert {ratio["at_most"] for ratio in report["ratios"]} == {1.05, None}
 
 
@@ -82,6 +82,28 @@ def test_widths_of_chunks_train_alike(tmp_path):
     assert all(row["seconds_per_lane_epoch"] > 0 for row in cells)
     assert (stopped["active"], stopped["stopped"]) == (1, 1)
     assert choice["best_width"] in (1, 2)
+
+
+def test_growth_is_measured_along_every_axis_and_drawn(tmp_path):
+    report, printed = smoke("growth", tmp_path)
+    rows = {axis: [row for row in report["rows"] if row["axis"] == axis] for axis in growth.AXES}
+    assert [len(points) for points in rows.values()] == [2, 2, 2, 2]
+    for first, second in rows.values():
+        assert second["bytes"] >= first["bytes"] > 0
+        assert second["slope"] == pytest.approx(growth.slope(first, second))
+    assert "hidden units" in printed
+    assert (tmp_path / "report.png").stat().st_size > 10_000
+
+
+def test_a_slope_is_the_exponent():
+    assert growth.slope({"number": 10, "seconds": 3.0}, {"number": 40, "seconds": 48.0}) == pytest.approx(2)
+
+
+def test_no_moment_of_compilation_is_counted_twice():
+    # Tracing within tracing, two threads at once, a pause.
+    stages = [("outer", 5.0, 5.0), ("inner", 3.0, 2.0), ("beside", 6.0, 2.0), ("later", 10.0, 1.0)]
+    assert compilation.waited(stages) == pytest.approx(7)
+    assert compilation.waited([]) == 0
 
 
 @pytest.mark.parametrize(
@@ -135,4 +157,4 @@ def test_operations_are_counted_in_loops_and_calls():
 
 
 def test_the_preset_that_is_reported_times_each_call_ten_times():
-    assert all(module.PRESETS["full"].turns >= 10 for module in (environment, rollout, sweep, training_step))
+    assert all(module.PRESETS["full"].turns >= 10 for module in (environment, growth, rollout, sweep, training_step))

@@ -1,0 +1,117 @@
+"""How long does an experiment wait for its programs: from nothing, and with the programs that the last run kept?
+
+An experiment in its smoke preset, which runs every program of the whole one on little data, in a process of its own and
+with an empty cache; then once more with the cache of programs that the first one left, and nothing else of it. Counted
+is the time in which JAX traces, lowers, compiles or reads a program from the cache, on any thread, and no moment twice.
+"""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rich.table import Table
+
+from benchmarks.timing import Findings, Ratio, run
+
+COLD, CACHED = 15.0, 2.0  # s, to reach
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The experiment and what of it is left out."""
+
+    experiment: str
+    options: tuple[str, ...] = ()
+
+
+PRESETS = {
+    "full": Preset("param_shift"),
+    "smoke": Preset("param_shift", ("--models", "physics_only")),
+}
+
+# Runs in the process that is measured: notes when each stage of compilation ended and how long it took.
+PROBE = """
+import json, os, runpy, time
+import jax
+stages = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, seconds, **_: stages.append((name, time.monotonic(), seconds)) if "/compile/" in name else None
+)
+began = time.monotonic()
+try:
+    runpy.run_module(MODULE, run_name="__main__")
+finally:
+    with open(os.environ["HYBRID_JAX_PROBE"], "w") as file:
+        json.dump({"seconds": time.monotonic() - began, "stages": stages}, file)
+"""
+
+
+def waited(stages: list[tuple[str, float, float]]) -> float:
+    """Seconds covered by at least one stage, each given as name, end and length: stages nest, and threads overlap."""
+    total, reached = 0.0, float("-inf")
+    for start, end in sorted((end - seconds, end) for _, end, seconds in stages):
+        total += max(0.0, end - max(start, reached))
+        reached = max(reached, end)
+    return total
+
+
+def measure_run(preset: Preset, cache: Path, folder: Path) -> dict[str, Any]:
+    """One run of the experiment.
+
+    Raises:
+        RuntimeError: it failed.
+    """
+    probe = folder / "probe.json"
+    arguments = [f"experiments.{preset.experiment}", "--preset", "smoke", "--out", str(folder), "--cache", str(cache)]
+    finished = subprocess.run(
+        [sys.executable, "-c", PROBE.replace("MODULE", repr(arguments[0])), *arguments[1:], *preset.options],
+        env=os.environ | {"HYBRID_JAX_PROBE": str(probe)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    if finished.returncode:
+        raise RuntimeError(f"{preset.experiment} failed: {finished.stderr[-500:]}")
+    found = json.loads(probe.read_text())
+    programs = sum(name.endswith("backend_compile_duration") for name, *_ in found["stages"])
+    return {"programs": programs, "waited_seconds": waited(found["stages"]), "run_seconds": found["seconds"]}
+
+
+def measure(preset: Preset) -> Findings:
+    """From nothing, then with the programs alone."""
+    rows = []
+    with TemporaryDirectory() as folder:
+        cache = Path(folder) / "cache"
+        for case in ("cold", "cached"):
+            out = Path(folder) / case
+            out.mkdir()
+            rows.append({"case": case, "experiment": preset.experiment, **measure_run(preset, cache, out)})
+            for found in cache.iterdir():
+                if found.is_file():
+                    found.unlink()
+                elif found.name != "programs":
+                    shutil.rmtree(found)
+    cold, cached = (row["waited_seconds"] for row in rows)
+    ratios = [
+        Ratio(f"seconds for all programs of {preset.experiment}, from nothing", cold, at_most=COLD),
+        Ratio("the same with the cache", cached, at_most=CACHED),
+    ]
+    return Findings(rows, [table_of(rows)], ratios)
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The runs for reading."""
+    table = Table("", "programs", "waited for them [s]", "whole run [s]", title=f"programs of {rows[0]['experiment']}")
+    for row in rows:
+        table.add_row(row["case"], str(row["programs"]), f"{row['waited_seconds']:.1f}", f"{row['run_seconds']:.1f}")
+    return table
+
+
+if __name__ == "__main__":
+    run("compilation", __doc__, PRESETS, measure)

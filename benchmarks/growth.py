@@ -1,0 +1,163 @@
+"""How do time and memory grow with seeds, with windows, with the horizon and with the width of the network?
+
+Seeds: one epoch of so many lanes, each of 100 windows, on all devices. Windows: one epoch of one lane over so many
+windows, which are copied to the devices in this time too. Horizon and width: one gradient step on 100 windows. All are
+hybrids as in the protocol. The slope is that of log time against log number between the two largest: 1 means that
+twice as much takes twice as long. Memory is what a program asks for beside its arguments, from its compilation; for
+lanes and windows, what they hold themselves.
+
+smoke: two small numbers each. full: 1 to 1000 seeds, 1e3 to 1e6 windows, 10 to 1000 steps, 16 to 1024 hidden units, in
+some five minutes.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from rich.table import Table
+
+from benchmarks.subjects import make_windows, protocol
+from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run
+from experiments.conditions import pretraining, settings
+from hybrid_jax import training
+from hybrid_jax.lanes import LaneMap, lane
+from hybrid_jax.residual import residual_network
+from hybrid_jax.training import gradient_step
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import Hybrid
+from hybrid_jax.vehicle import IRIS
+
+BATCH = 100
+VALIDATION = 100
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The numbers to measure at, each rising, and how long a call may be repeated.
+
+    Attributes:
+        turns: repetitions of a call at the most.
+        budget: seconds after which a call is repeated no more, beyond the third time.
+    """
+
+    seeds: tuple[int, ...]
+    windows: tuple[int, ...]
+    steps: tuple[int, ...]
+    hidden: tuple[int, ...]
+    turns: int
+    budget: float
+
+
+PRESETS = {
+    "full": Preset(
+        (1, 10, 100, 1000), (1_000, 10_000, 100_000, 1_000_000), (10, 30, 100, 300, 1000), (16, 64, 256, 1024), 10, 10.0
+    ),
+    "smoke": Preset((1, 2), (100, 200), (2, 4), (4, 8), turns=2, budget=1.0),
+}
+Case = tuple[Call, int]  # what is timed, and the bytes that it needs
+
+
+def epoch_of(seeds: int, windows: int) -> Case:
+    """One epoch of so many lanes over so many windows each, as `hybrid_jax.sweep` runs it."""
+    config = protocol(seeds, windows)
+    chosen = settings(config)
+
+    def epoch(lane, train, validation):
+        state, plan = lane
+        return training.run(state, plan, train, validation, chosen, state.epoch + 1)
+
+    mapped, lanes = LaneMap(epoch), pretraining("hybrid", IRIS, config)
+    shared = many_windows(windows), many_windows(VALIDATION)
+    return lambda: mapped(lanes, shared, [1.0] * seeds, range(seeds)), bytes_of((lanes, shared))
+
+
+def many_windows(count: int) -> Trajectories:
+    """So many windows of 10 intervals; a thousand flown ones, over and over."""
+    flown = make_windows(min(count, 1000), 10)
+    return flown[np.arange(count) % len(flown)]
+
+
+def step_of(steps: int, hidden: int) -> Case:
+    """One gradient step on windows of so many intervals, of a hybrid with so many hidden units."""
+    config = protocol(1, BATCH)
+    state, plan = (lane(stacked, 0) for stacked in pretraining("hybrid", IRIS, config))
+    wide = residual_network(13, 4, jax.random.key(0), hidden=hidden, scaling=state.field.residual.scaling)
+    start = training.start(Hybrid(state.field.physics, wide), jax.random.key(1))
+    arguments = start.field, start.adam, plan, make_windows(BATCH, steps)
+    call, _, needed = compiled_with_memory(partial(gradient_step, settings=settings(config)), *arguments)
+    return call, needed
+
+
+def bytes_of(tree) -> int:
+    """What the arrays of a tree hold."""
+    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf))
+
+
+AXES: dict[str, tuple[str, Callable[[int], Case]]] = {
+    "seeds": ("one epoch of 100 windows a seed", lambda seeds: epoch_of(seeds, BATCH)),
+    "windows": ("one epoch of one seed", lambda windows: epoch_of(1, windows)),
+    "steps": ("one gradient step on 100 windows", lambda steps: step_of(steps, 64)),
+    "hidden": ("one gradient step on 100 windows of 10 steps", lambda hidden: step_of(10, hidden)),
+}
+LABELS = {"seeds": "seeds", "windows": "windows", "steps": "steps of horizon", "hidden": "hidden units"}
+
+
+def measure_axis(axis: str, preset: Preset) -> list[dict[str, Any]]:
+    """A row for each number along an axis, from the smallest, with the slope of time from the number before."""
+    work, make = AXES[axis]
+    rows: list[dict[str, Any]] = []
+    for number in getattr(preset, axis):
+        call, needed = make(number)
+        seconds = repeated(call, preset.turns, preset.budget)
+        rows.append({"axis": axis, "work": work, "number": number, "seconds": seconds, "bytes": needed})
+        rows[-1]["slope"] = slope(rows[-2], rows[-1]) if len(rows) > 1 else None
+    return rows
+
+
+def slope(before: dict[str, Any], after: dict[str, Any]) -> float:
+    """d log seconds / d log number."""
+    return math.log(after["seconds"] / before["seconds"]) / math.log(after["number"] / before["number"])
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The measurements for reading."""
+    table = Table("", "", "s", "slope", "MiB", title="growth")
+    for row in rows:
+        grown = "" if row["slope"] is None else f"{row['slope']:.2f}"
+        size = f"{row['number']:,} {LABELS[row['axis']]}"
+        table.add_row(row["work"], size, f"{row['seconds']:.4g}", grown, f"{row['bytes'] / 2**20:,.1f}")
+    return table
+
+
+def figure_of(rows: list[dict[str, Any]]) -> Figure:
+    """Time against each number, with the slope of the last stretch and a line of slope 1."""
+    figure, panels = plt.subplots(1, len(AXES), figsize=(13, 3.2), layout="constrained")
+    for panel, axis in zip(panels, AXES, strict=True):
+        points = [row for row in rows if row["axis"] == axis]
+        numbers = np.array([row["number"] for row in points], float)
+        seconds = np.array([row["seconds"] for row in points])
+        panel.loglog(numbers, seconds, "o-", color="C0", label="measured")
+        panel.loglog(numbers, seconds[-1] * numbers / numbers[-1], "--", color="0.6", label="slope 1")
+        panel.set(xlabel=LABELS[axis], title=f"{points[0]['work']}\nslope at the end {points[-1]['slope']:.2f}")
+        panel.title.set_fontsize("medium")
+        panel.grid(alpha=0.3)
+    panels[0].set_ylabel("time [s]")
+    panels[0].legend(frameon=False)
+    return figure
+
+
+def measure(preset: Preset) -> Findings:
+    """Every axis in turn."""
+    rows = [row for axis in AXES for row in measure_axis(axis, preset)]
+    return Findings(rows, [table_of(rows)], figure=figure_of(rows))
+
+
+if __name__ == "__main__":
+    run("growth", __doc__, PRESETS, measure)
