@@ -56,7 +56,7 @@ class Preset:
 
 
 PRESETS = {
-    "full": Preset("hybrid", True, (1, 2, 5, 10), (1, 2, 5, 10, 20), active=5, n_train=500, validation=1000, turns=10),
+    "full": Preset("hybrid", True, (1, 2, 5, 10), (1, 2, 5, 10, 50), active=5, n_train=500, validation=1000, turns=10),
     "smoke": Preset("no_physics", False, (1, 2), (1, 2), active=1, n_train=100, validation=10, turns=2),
 }
 Program = Callable[[int], FitState]
