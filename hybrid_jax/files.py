@@ -1,9 +1,11 @@
 """Files that are written whole or not at all, and JSON that any reader accepts."""
 
+import itertools
 import json
 import math
 import os
 from collections.abc import Mapping, Sequence
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
     """Write a neighbour of the file, then put it in the file's place in one step; text is UTF-8.
 
     Raises:
-        OSError: the folder cannot be made or written; what stood at `path` is untouched.
+        OSError: the folder cannot be made or written, or is full; what stood at `path` is untouched.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,8 +27,17 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
             file.flush()
             os.fsync(file.fileno())  # or a power cut could leave the new name on no content
         os.replace(temporary, path)
+    except OSError as error:
+        raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def aside(path: Path, reason: str) -> Path:
+    """A free name beside `path` with the reason and the time (UTC), for what must give way and not be deleted."""
+    stem = f"{path.name}.{reason}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
+    names = itertools.chain([stem], (f"{stem}-{i}" for i in itertools.count(2)))
+    return next(free for free in map(path.with_name, names) if not free.exists())
 
 
 def json_text(value: Any) -> str:
