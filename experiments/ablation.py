@@ -15,7 +15,7 @@ from experiments.conditions import adaptation, pretraining, settings
 from experiments.external_force import sine_floor
 from experiments.protocol import QUICK, SMOKE, Config, distinct, preset_like
 from experiments.results import Lanes, rows_of, trained
-from experiments.stages import Stages
+from experiments.stages import Stages, stages_of
 from experiments.study import EVERY, flown, places, source_splits, target_splits
 from hybrid_jax.ablations import Trial, by_choice, figure, records, tables, to_csv
 from hybrid_jax.environment import environment
@@ -115,7 +115,7 @@ def experiment(config: AblationConfig, console: Console) -> None:
     for choice in config.over:
         for value, changes in variations(choice, config).items():
             console.print(f"{choice}: {value}", style="bold", highlight=False)
-            stages = Stages(config.cache / "sweeps", console)
+            stages = stages_of(config, console)
             trials.append(tried(choice, value, replace(config, **changes), config, stages))
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
         write(config, trials, seconds)

@@ -5,6 +5,7 @@ import io
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,7 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.protocol import PRESETS, Config
+from experiments.run_record import OtherRun, recorded
 from hybrid_jax.runtime import configure
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
@@ -40,13 +42,19 @@ def run(
         check_folder("--out", config.out)
         configure(config.cache)
         signal.signal(signal.SIGTERM, _terminate)
-        with alone(config.out / name):
-            experiment(config, Console(stderr=True))
+        console = Console(stderr=True)
+        folder = config.out / name
+        with alone(folder), recorded(folder, config, partial(console.print, highlight=False, soft_wrap=True)):
+            experiment(config, console)
+    except OtherRun as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
     except (ValueError, OSError) as error:
         print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(BAD_INPUT)
     except KeyboardInterrupt as stop:
-        print(f"{name}: interrupted; the same command goes on from here", file=sys.stderr)
+        fresh = " without --fresh" if "--fresh" in arguments else ""
+        print(f"{name}: interrupted; the same command{fresh} goes on from here", file=sys.stderr)
         sys.exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED)
 
 

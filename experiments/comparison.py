@@ -18,7 +18,7 @@ from experiments.external_force import sine_floor
 from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, distinct, preset_like
 from experiments.results import Lanes, rows_of, save_models
 from experiments.rivals import METHODS, PAST, Case, Method, source_only
-from experiments.stages import Stages
+from experiments.stages import Stages, stages_of
 from experiments.study import adaptation_splits, flown, source_splits
 from hybrid_jax.claims import COMPARISON, claims
 from hybrid_jax.comparison_figures import standings
@@ -76,7 +76,7 @@ PRESETS = {
 
 def experiment(config: ComparisonConfig, console: Console) -> None:
     """Run all methods in both domains and write what came of it."""
-    stages = Stages(config.cache / "sweeps", console)
+    stages = stages_of(config, console)
     pretrained, experts = source_models(config, stages)
     out, rows, datasets = config.out / NAME, list[Row](), dict[str, Any]()
     for domain in DOMAINS:

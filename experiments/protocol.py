@@ -10,6 +10,7 @@ import platformdirs
 from hybrid_jax.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
+UNFIXED = ("out", "cache", "fresh", "saving")
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
@@ -81,6 +82,10 @@ class Config:
     """Folder for the report, the figures and the models; a folder of the experiment's name is made in it."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
     """Folder for flights, finished stages and compiled programs."""
+    fresh: bool = False
+    """Start anew: what a run has left in --out, and sweeps that were begun, are moved aside; nothing is deleted."""
+    saving: float = 0.02
+    """Share of a sweep's time that saving its state may take; what a kill can cost grows as this shrinks."""
     seeds: int = 10
     """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
     sizes: tuple[int, ...] = TABLE_SIZES
@@ -138,6 +143,8 @@ class Config:
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
         if self.noise < 0 or (self.guess_off is not None and self.guess_off <= 0):
             raise ValueError(f"--noise must be >= 0, --guess-off > 0, got {self.noise} and {self.guess_off}")
+        if not 0 < self.saving <= 1:
+            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
         if not 0 < self.guess[0] < self.guess[1]:
             raise ValueError(f"--guess must be two factors, low < high, above 0, got {self.guess}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
@@ -146,8 +153,8 @@ class Config:
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def described(self) -> dict[str, Any]:
-        """All that fixes the results: where files lie does not."""
-        return {name: value for name, value in asdict(self).items() if name not in ("out", "cache")}
+        """All that fixes the results: where files lie and how often state is saved do not."""
+        return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
     def pooled(self) -> int:
         """The number of target trajectories from which a seed draws."""

@@ -2,16 +2,21 @@
 
 import time
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
 
+from experiments.checkpoints import Checkpoints
+from experiments.interrupts import Held
 from experiments.progress import SweepLine, clock
+from experiments.protocol import Config
+from experiments.run_record import require_same
 from hybrid_jax.archive import digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.datasets import Dataset, content_hash, versions
+from hybrid_jax.environment import PACKAGES
+from hybrid_jax.files import aside
 from hybrid_jax.models import describe
 from hybrid_jax.objective import Prediction, Settings
 from hybrid_jax.sweep import Progress, sweep
@@ -19,7 +24,8 @@ from hybrid_jax.training import FitState, Plan
 
 FORMAT = "hybrid_jax sweep 1"
 RECIPE = 1  # raise it when the same start, plan and data no longer give the same result
-SAVE_EVERY = 30.0  # s
+FIRST_COST = 0.3  # s to save a state, before it is known
+FINISHED_BY = ("jax", "hybrid_jax")
 
 Result = TypeVar("Result")
 
@@ -30,37 +36,45 @@ class Stages:
     Args:
         folder: where sweeps are kept, finished or not.
         console: where progress is drawn.
+        saving: share of a sweep's time that saving its state may take.
+        fresh: move aside sweeps that were begun, and finished ones of other versions, and run them anew.
     """
 
-    def __init__(self, folder: Path, console: Console):
-        self._folder, self._console = folder, console
+    def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
+        self._folder, self._console, self._share, self._fresh = folder, console, saving, fresh
         self.seconds: dict[str, float] = {}
         self.reused: list[str] = []
+        self._ran = self._saving = 0.0
 
     def run(self, name: str, states: FitState, plans: Plan, settings: Settings, data: Dataset) -> FitState:
         """The final states of a sweep on the train and validation splits of a dataset.
 
         Raises:
-            ValueError: what is kept of this sweep is damaged; names the file, so that it can be deleted.
+            OtherRun: it was begun by other versions of the libraries.
+            ValueError: what is kept of this sweep when finished is damaged; names the file, so that it can be deleted.
+            OSError: the state cannot be saved.
         """
         identity = _identity(states, plans, settings, data)
         finished = self._folder / f"{name.replace(' ', '-')}-{identity[:16]}.npz"
-        begun = finished.with_suffix(".begun.npz")
+        begun = finished.with_suffix(".begun")
+        if self._fresh:
+            self._make_way(finished, begun)
         if finished.exists():
             states, self.seconds[name] = _load(finished, states)
             self.reused.append(name)
             self._say(f"{name}: {summary(states)}, as found in the cache")
             return states
-        spent = 0.0
-        if begun.exists():
-            states, spent = _load(begun, states)
-            self._say(f"{name}: goes on where it was interrupted, after {clock(spent)}")
-        final = self._sweep(name, states, plans, settings, data, _Keeper(begun, name, spent))
-        self.seconds[name] = final[1]
-        _save(finished, name, *final)
-        begun.unlink(missing_ok=True)
-        self._say(f"{name}: {summary(final[0])}, {clock(final[1])}")
-        return final[0]
+        with Held() as held:
+            checkpoints = Checkpoints(begun)
+            states, spent = self._goes_on(name, states, checkpoints, begun)
+            keeper = _Keeper(checkpoints, held, name, spent, self._share)
+            states = self._sweep(name, states, plans, settings, data, keeper)
+            self.seconds[name] = keeper.seconds()
+            _save(finished, name, states, self.seconds[name])
+            checkpoints.delete()
+        self._ran, self._saving = self._ran + keeper.seconds() - spent, self._saving + keeper.saving
+        self._say(f"{name}: {summary(states)}, {clock(self.seconds[name])}")
+        return states
 
     def timed(self, name: str, work: Callable[[], Result]) -> Result:
         """The result of work(), its seconds noted under a name."""
@@ -72,48 +86,73 @@ class Stages:
     def notes(self) -> list[str]:
         """What a reader of the seconds must know."""
         found = ", ".join(self.reused)
-        return [f"Taken from the cache, with the seconds that they took when they ran: {found}."] if found else []
+        reused = [f"Taken from the cache, with the seconds that they took when they ran: {found}."] if found else []
+        saved = [f"Saving the state of sweeps took {self._saving / self._ran:.2%} of their time."] if self._ran else []
+        return reused + saved
 
-    def _sweep(self, name, states, plans, settings, data: Dataset, keeper: "_Keeper") -> tuple[FitState, float]:
-        with SweepLine(name, self._console) as line, keeper:
+    def _make_way(self, finished: Path, begun: Path) -> None:
+        stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
+        for path in [begun] * begun.exists() + [finished] * stale:
+            self._say(f"{path}: moved aside to {path.rename(aside(path, 'before')).name}")
+
+    def _goes_on(self, name: str, states: FitState, checkpoints: Checkpoints, begun: Path) -> tuple[FitState, float]:
+        """The states from which to start, and the seconds already spent on them."""
+        found = checkpoints.load(self._say)
+        if found is None:
+            return states, 0.0
+        arrays, about = found
+        require_same(f"{begun}: was begun with versions", about, {"versions": versions(*PACKAGES)})
+        states, spent = with_leaves(states, arrays, begun), about["seconds"]
+        self._say(f"{name}: goes on where it was interrupted, at epoch {states.epoch.max()}, after {clock(spent)}")
+        return states, spent
+
+    def _sweep(self, name, states, plans, settings, data: Dataset, keeper: "_Keeper") -> FitState:
+        with SweepLine(name, self._console) as line:
 
             def on_block(states: FitState, progress: Progress) -> None:
                 line.show(progress)
                 keeper.keep(states)
 
-            final = sweep(states, plans, data.splits["train"], data.splits["validation"], settings, on_block=on_block)
-        return final, keeper.seconds()
+            return sweep(states, plans, data.splits["train"], data.splits["validation"], settings, on_block=on_block)
 
     def _say(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
 
 
-class _Keeper(AbstractContextManager):
-    """Saves a sweep now and then, and when it is interrupted, with the seconds that it has taken in all."""
+def stages_of(config: Config, console: Console) -> Stages:
+    """The stages of an experiment, in its cache folder."""
+    return Stages(config.cache / "sweeps", console, config.saving, config.fresh)
 
-    def __init__(self, path: Path, name: str, spent: float):
-        self._path, self._name, self._spent = path, name, spent
-        self._began = self._saved = time.perf_counter()
-        self._latest: FitState | None = None
 
-    def __exit__(self, kind, error, trace) -> None:
-        if kind is not None and issubclass(kind, KeyboardInterrupt):
-            self._save()
+class _Keeper:
+    """Saves a sweep after a block, as often as its share of the time allows, and when a signal waits.
+
+    Attributes:
+        saving: seconds spent on saving.
+    """
+
+    def __init__(self, checkpoints: Checkpoints, held: Held, name: str, spent: float, share: float):
+        self._checkpoints, self._held, self._name, self._spent, self._share = checkpoints, held, name, spent, share
+        self._began = time.perf_counter()
+        self._cost = FIRST_COST
+        self.saving = 0.0
 
     def seconds(self) -> float:
         """What the sweep has taken so far, earlier runs included."""
         return self._spent + time.perf_counter() - self._began
 
     def keep(self, states: FitState) -> None:
-        """Remember the states after a block; save them if the last time is a while ago."""
-        self._latest = states
-        if time.perf_counter() - self._saved > SAVE_EVERY:
-            self._save()
+        """Save the states after a block if it is time; let a signal act that came during the block."""
+        if self._held.waiting or self.saving + self._cost < self._share * (self.seconds() - self._spent):
+            self._save(states)
+        self._held.deliver()
 
-    def _save(self) -> None:
-        if self._latest is not None:
-            _save(self._path, self._name, self._latest, self.seconds())
-        self._saved = time.perf_counter()
+    def _save(self, states: FitState) -> None:
+        began = time.perf_counter()
+        about = {"name": self._name, "seconds": self.seconds(), "versions": versions(*PACKAGES)}
+        self._checkpoints.save(named_leaves(states), about)
+        self._cost = time.perf_counter() - began
+        self.saving += self._cost
 
 
 def summary(states: FitState) -> str:
@@ -136,7 +175,7 @@ def _described(objective: Any) -> list[Any]:
 
 
 def _save(path: Path, name: str, states: FitState, seconds: float) -> None:
-    about = {"name": name, "seconds": seconds, "versions": versions("jax", "hybrid_jax")}
+    about = {"name": name, "seconds": seconds, "versions": versions(*FINISHED_BY)}
     save_archive(path, FORMAT, about, named_leaves(states))
 
 

@@ -11,7 +11,7 @@ from experiments.make_flights import chosen_flights, flights
 from experiments.protocol import AdaptationConfig, Config
 from experiments.results import Lanes, rows_of, trained
 from experiments.sensors import measured
-from experiments.stages import Stages
+from experiments.stages import Stages, stages_of
 from hybrid_jax.datasets import Dataset
 from hybrid_jax.rows import Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
@@ -42,7 +42,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     Args:
         vehicle: what the engineer knows of the vehicle; its nominal θ_p is where the models start from.
     """
-    stages = Stages(config.cache / "sweeps", console)
+    stages = stages_of(config, console)
 
     def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
         if file is not None:

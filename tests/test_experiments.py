@@ -3,6 +3,7 @@
 import csv
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -157,8 +158,8 @@ def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent
         finally:
             process.kill()
     assert "the same command goes on from here" in rest
-    (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun.npz")
-    begun.unlink()
+    (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun")
+    shutil.rmtree(begun)
 
 
 def refused(run, name):

@@ -1,5 +1,6 @@
 """A sweep is run once, is not lost when interrupted, and is found again only by what it was."""
 
+import signal
 from dataclasses import replace
 
 import jax
@@ -9,11 +10,13 @@ from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
 
 from experiments.progress import SweepLine
+from experiments.results import rows_of, trained
 from experiments.stages import Stages
 from hybrid_jax.archive import named_leaves
 from hybrid_jax.datasets import Dataset
-from hybrid_jax.lanes import stack
+from hybrid_jax.lanes import lane, stack
 from hybrid_jax.objective import Settings
+from hybrid_jax.report_tables import lane_notes
 from hybrid_jax.training import make_plan, start
 
 SETTINGS = Settings(batch_size=10)
@@ -58,13 +61,13 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
     def interrupt(self, progress):
         seen.append(progress.epochs)
         if len(seen) == 2:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
         patch.setattr(SweepLine, "show", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path)
-    assert [path.name.endswith(".begun.npz") for path in tmp_path.iterdir()] == [True]
+    assert [path.name.endswith(".begun") for path in tmp_path.iterdir()] == [True]  # the block was finished, and saved
     later = []
     with monkeypatch.context() as patch:
         patch.setattr(SweepLine, "show", lambda self, progress: later.append(progress.epochs))
@@ -72,7 +75,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
     assert later[0] > seen[0]  # it did not start anew
     assert found.reused == []
     assert same(resumed, whole)
-    assert not list(tmp_path.glob("*.begun.npz"))
+    assert not list(tmp_path.glob("*.begun"))
 
 
 @pytest.mark.parametrize(
@@ -87,6 +90,16 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
 )
 def test_anything_else_is_another_sweep(folder, whole, other):
     assert run(folder, **other)[1].reused == []
+
+
+def test_a_diverged_lane_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
+    """A learning rate of 1e3 in one lane: the other keeps every bit."""
+    final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
+    assert same(lane(final, 0), lane(whole, 0))
+    rows = rows_of(trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2)), "parameter_shift")
+    assert [row.status == "diverged" for row in rows] == [False, True]
+    assert rows[1].epochs == final.epoch[1] < 30
+    assert any("1 of 2 runs met a non-finite loss" in note for note in lane_notes(rows))
 
 
 def test_a_damaged_file_is_named(tmp_path, whole):
