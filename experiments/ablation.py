@@ -17,6 +17,7 @@ from experiments.protocol import QUICK, SMOKE, Config, distinct, preset_like
 from experiments.results import Lanes, rows_of, trained
 from experiments.stages import Stages, stages_of
 from experiments.study import EVERY, flown, places, source_splits, target_splits
+from hybrid_jax import hosts
 from hybrid_jax.ablations import Trial, by_choice, figure, records, tables, to_csv
 from hybrid_jax.environment import environment
 from hybrid_jax.figures import save_figure
@@ -118,8 +119,10 @@ def experiment(config: AblationConfig, console: Console) -> None:
             stages = stages_of(config, console)
             trials.append(tried(choice, value, replace(config, **changes), config, stages))
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
-        write(config, trials, seconds)
-    print_tables(Console(), tables(trials, truth()))
+        if hosts.first():
+            write(config, trials, seconds)
+    if hosts.first():
+        print_tables(Console(), tables(trials, truth()))
 
 
 def tried(choice: str, value: str, config: AblationConfig, default: AblationConfig, stages: Stages) -> Trial:

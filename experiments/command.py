@@ -2,6 +2,7 @@
 
 import contextlib
 import io
+import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -15,6 +16,7 @@ from rich.console import Console
 
 from experiments.protocol import PRESETS, Config
 from experiments.run_record import OtherRun, recorded
+from hybrid_jax import hosts
 from hybrid_jax.runtime import configure
 
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
@@ -41,10 +43,16 @@ def run(
         config = read(name, about, arguments, presets)
         check_folder("--out", config.out)
         configure(config.cache)
+        if config.distributed:
+            hosts.join(config.coordinator, config.processes, config.process_id)
         signal.signal(signal.SIGTERM, _terminate)
-        console = Console(stderr=True)
-        folder = config.out / name
-        with alone(folder), recorded(folder, config, partial(console.print, highlight=False, soft_wrap=True)):
+        quiet = not hosts.first()  # process 0 alone speaks and writes
+        console, folder = Console(stderr=True, quiet=quiet), config.out / name
+        say = partial(console.print, highlight=False, soft_wrap=True)
+        with contextlib.ExitStack() as held:
+            if hosts.first():
+                held.enter_context(alone(folder))
+                held.enter_context(recorded(folder, config, say))
             experiment(config, console)
     except OtherRun as error:
         print(f"{name}: {error}", file=sys.stderr)
@@ -115,7 +123,7 @@ def check_folder(option: str, folder: Path) -> None:
     Raises:
         ValueError: it cannot be made, or not be written.
     """
-    probe = folder / ".writable"
+    probe = folder / f".writable.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)
         probe.touch()

@@ -20,6 +20,7 @@ from experiments.results import Lanes, rows_of, save_models
 from experiments.rivals import METHODS, PAST, Case, Method, source_only
 from experiments.stages import Stages, stages_of
 from experiments.study import adaptation_splits, flown, source_splits
+from hybrid_jax import hosts
 from hybrid_jax.claims import COMPARISON, claims
 from hybrid_jax.comparison_figures import standings
 from hybrid_jax.datasets import Dataset
@@ -83,8 +84,11 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
         lanes = compared(Case(config, stages, pretrained, experts, target), config.methods)
         found = with_rho([row for group in lanes for row in rows_of(group, domain.name)])
-        save_models(out / "models" / domain.name, lanes, found)
+        if hosts.first():
+            save_models(out / "models" / domain.name, lanes, found)
         rows, datasets = rows + found, datasets | {domain.name: target.metadata}
+    if not hosts.first():
+        return
     covered = stages.timed(
         "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]))
     )

@@ -10,6 +10,7 @@ from experiments import command
 from experiments.outcome import write_outcome
 from experiments.protocol import AdaptationConfig
 from experiments.study import EVERY, study
+from hybrid_jax import hosts
 from hybrid_jax.sim.domain import EXTERNAL_FORCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
@@ -23,7 +24,8 @@ def experiment(config: AdaptationConfig, console: Console) -> None:
     found = study(EXTERNAL_FORCE, IRIS, config, console)
     times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)
     floor = sine_floor(IRIS.mass, times)
-    write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, Console(), floor)
+    if hosts.first():
+        write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, Console(), floor)
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:

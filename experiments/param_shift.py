@@ -9,6 +9,7 @@ from experiments import command
 from experiments.outcome import write_outcome
 from experiments.protocol import AdaptationConfig
 from experiments.study import study
+from hybrid_jax import hosts
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.vehicle import IRIS
 
@@ -18,7 +19,8 @@ NAME, TITLE = "param_shift", "Parameter shift"
 def experiment(config: AdaptationConfig, console: Console) -> None:
     """Run the protocol on the shifted vehicle and write what came of it."""
     found = study(PARAMETER_SHIFT, IRIS, config, console)
-    write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())
+    if hosts.first():
+        write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())
 
 
 def main() -> None:

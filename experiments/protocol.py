@@ -10,7 +10,8 @@ import platformdirs
 from hybrid_jax.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
-UNFIXED = ("out", "cache", "fresh", "saving")
+# Options that change no result: where files lie, how often state is saved, on what machines it runs.
+UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
@@ -128,8 +129,19 @@ class Config:
     """Cap; a run that hits it is marked in the report."""
     rates: Rates = Rates()
     patience: Patience = Patience()
+    distributed: bool = False
+    """Be one of several processes, on one machine or many, that share the lanes: start the same command for each.
+    Process 0 writes. Who is who says the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU) or the next three options."""
+    coordinator: str | None = None
+    """With --distributed: host:port of process 0, a port that is free there and that all can reach."""
+    processes: int | None = None
+    """With --distributed: how many there are."""
+    process_id: int | None = None
+    """With --distributed: which of them this is, from 0."""
 
     def __post_init__(self):
+        if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
+            raise ValueError("--coordinator, --processes and --process-id need --distributed")
         for name in ("seeds", "source_train", "validation", "test", "hidden", "batch_size", "max_epochs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
@@ -153,7 +165,7 @@ class Config:
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def described(self) -> dict[str, Any]:
-        """All that fixes the results: where files lie and how often state is saved do not."""
+        """All that fixes the results: where files lie, how often state is saved and where it runs do not."""
         return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
     def pooled(self) -> int:

@@ -13,7 +13,8 @@ from experiments.interrupts import Held
 from experiments.progress import SweepLine, clock
 from experiments.protocol import Config
 from experiments.run_record import require_same
-from hybrid_jax.archive import digest, load_archive, named_leaves, save_archive, with_leaves
+from hybrid_jax import hosts
+from hybrid_jax.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.datasets import Dataset, content_hash, versions
 from hybrid_jax.environment import PACKAGES
 from hybrid_jax.files import aside
@@ -57,21 +58,22 @@ class Stages:
         identity = _identity(states, plans, settings, data)
         finished = self._folder / f"{name.replace(' ', '-')}-{identity[:16]}.npz"
         begun = finished.with_suffix(".begun")
-        if self._fresh:
+        if self._fresh and hosts.first():
             self._make_way(finished, begun)
-        if finished.exists():
-            states, self.seconds[name] = _load(finished, states)
+        checkpoints = Checkpoints(begun)
+        done, spent, states = self._found(name, states, finished, checkpoints, begun)
+        if done:
+            self.seconds[name] = spent
             self.reused.append(name)
             self._say(f"{name}: {summary(states)}, as found in the cache")
             return states
         with Held() as held:
-            checkpoints = Checkpoints(begun)
-            states, spent = self._goes_on(name, states, checkpoints, begun)
             keeper = _Keeper(checkpoints, held, name, spent, self._share)
             states = self._sweep(name, states, plans, settings, data, keeper)
             self.seconds[name] = keeper.seconds()
-            _save(finished, name, states, self.seconds[name])
-            checkpoints.delete()
+            if hosts.first():
+                _save(finished, name, states, self.seconds[name])
+                checkpoints.delete()
         self._ran, self._saving = self._ran + keeper.seconds() - spent, self._saving + keeper.saving
         self._say(f"{name}: {summary(states)}, {clock(self.seconds[name])}")
         return states
@@ -95,6 +97,19 @@ class Stages:
         for path in [begun] * begun.exists() + [finished] * stale:
             self._say(f"{path}: moved aside to {path.rename(aside(path, 'before')).name}")
 
+    def _found(
+        self, name: str, start: FitState, finished: Path, checkpoints: Checkpoints, begun: Path
+    ) -> tuple[bool, float, FitState]:
+        """Whether the sweep is done, the seconds spent on it and its states, as process 0 has them."""
+
+        def look() -> tuple[tuple[bool, float], Arrays]:
+            done = finished.exists()
+            states, spent = _load(finished, start) if done else self._goes_on(name, start, checkpoints, begun)
+            return (done, spent), named_leaves(states)
+
+        (done, spent), leaves = hosts.from_first(look)
+        return done, spent, with_leaves(start, leaves, "process 0")
+
     def _goes_on(self, name: str, states: FitState, checkpoints: Checkpoints, begun: Path) -> tuple[FitState, float]:
         """The states from which to start, and the seconds already spent on them."""
         found = checkpoints.load(self._say)
@@ -113,7 +128,12 @@ class Stages:
                 line.show(progress)
                 keeper.keep(states)
 
-            return sweep(states, plans, data.splits["train"], data.splits["validation"], settings, on_block=on_block)
+            train, validation = data.splits["train"], data.splits["validation"]
+            try:
+                return sweep(states, plans, train, validation, settings, on_block=on_block)
+            except hosts.Gone:
+                keeper.rescue()
+                raise
 
     def _say(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
@@ -136,6 +156,7 @@ class _Keeper:
         self._began = time.perf_counter()
         self._cost = FIRST_COST
         self.saving = 0.0
+        self._unsaved: FitState | None = None
 
     def seconds(self) -> float:
         """What the sweep has taken so far, earlier runs included."""
@@ -143,9 +164,16 @@ class _Keeper:
 
     def keep(self, states: FitState) -> None:
         """Save the states after a block if it is time; let a signal act that came during the block."""
-        if self._held.waiting or self.saving + self._cost < self._share * (self.seconds() - self._spent):
+        self._unsaved = states
+        due = self.saving + self._cost < self._share * (self.seconds() - self._spent)
+        if hosts.first() and (due or self._held.waiting):
             self._save(states)
         self._held.deliver()
+
+    def rescue(self) -> None:
+        """Save the last block, if it was not: another process has ended."""
+        if self._unsaved is not None and hosts.first():
+            self._save(self._unsaved)
 
     def _save(self, states: FitState) -> None:
         began = time.perf_counter()
@@ -153,6 +181,7 @@ class _Keeper:
         self._checkpoints.save(named_leaves(states), about)
         self._cost = time.perf_counter() - began
         self.saving += self._cost
+        self._unsaved = None
 
 
 def summary(states: FitState) -> str:

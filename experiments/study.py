@@ -1,8 +1,9 @@
 """The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 
@@ -12,12 +13,15 @@ from experiments.protocol import AdaptationConfig, Config
 from experiments.results import Lanes, rows_of, trained
 from experiments.sensors import measured
 from experiments.stages import Stages, stages_of
-from hybrid_jax.datasets import Dataset
+from hybrid_jax import hosts
+from hybrid_jax.archive import Arrays
+from hybrid_jax.datasets import ARRAYS, Dataset
 from hybrid_jax.rows import Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import evaluate
 from hybrid_jax.training import FitState
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
@@ -46,7 +50,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
     def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
         if file is not None:
-            return measured(chosen_flights(file, of, splits), config.noise, config.data_seed)
+            return measured(from_first(lambda: chosen_flights(file, of, splits)), config.noise, config.data_seed)
         return flown(of, splits, config, stages)
 
     source = get(config.source_flights, SOURCE, source_splits(config))
@@ -60,8 +64,28 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
     """The flights of a domain, from the cache or the simulator, as sensors of the configured noise see them."""
-    found = stages.timed(f"flights {domain.name}", lambda: flights(domain, splits, config.data_seed, config.cache))
+    found = stages.timed(
+        f"flights {domain.name}",
+        lambda: from_first(lambda: flights(domain, splits, config.data_seed, config.cache)),
+    )
     return measured(found, config.noise, config.data_seed)
+
+
+def from_first(read: Callable[[], Dataset]) -> Dataset:
+    """The dataset that `read` gives on process 0: the others need no file, and all learn from the same bits."""
+
+    def parts() -> tuple[Any, Arrays]:
+        found = read()
+        arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
+        return [
+            dict(found.metadata),
+            {name: windows.dt for name, windows in found.splits.items()},
+            found.origin,
+        ], arrays
+
+    (metadata, steps, origin), arrays = hosts.from_first(parts)
+    splits = {name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=dt) for name, dt in steps.items()}
+    return Dataset(splits, metadata, origin)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:

@@ -1,9 +1,13 @@
 """Map one function over many independent lanes: chunks of lanes under `vmap`, chunks in a loop, loops on all devices.
 
+The devices are those of all processes of a run (see hosts.py): each hands its own lanes to its own devices, and all get
+all results.
+
 A lane is a slice of a pytree along its first axis. On a CPU a chunk of one lane is fastest, because one lane fills the
 cache; on a GPU a chunk holds all lanes. Which lanes run is data, not shape: one compilation serves a sweep to its end.
 """
 
+import heapq
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -13,6 +17,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Int, PyTree
+
+from hybrid_jax import hosts
 
 Numbers = Sequence[Any] | np.ndarray
 AXIS = "lanes"
@@ -35,8 +41,8 @@ def count(lanes: PyTree) -> int:
     return next(leaf.shape[0] for leaf in jax.tree.leaves(lanes) if eqx.is_array(leaf))
 
 
-def deal(costs: Numbers, active: Numbers, devices: int, width: int) -> list[np.ndarray]:
-    """For each device, which of the active lanes it runs and in which order.
+def deal(costs: Numbers, active: Numbers, devices: int, width: int, most: int) -> list[np.ndarray]:
+    """For each device, which of the active lanes it runs and in which order; at most so many chunks.
 
     The dearest chunk goes first, to the device that has least to do; lanes of equal cost share a chunk, so that none of
     them waits long for another.
@@ -44,11 +50,12 @@ def deal(costs: Numbers, active: Numbers, devices: int, width: int) -> list[np.n
     ordered = sorted(active, key=lambda i: -costs[i])
     chunks = [ordered[i : i + width] for i in range(0, len(ordered), width)]
     hands: list[list[int]] = [[] for _ in range(devices)]
-    loads = [0.0] * devices
+    loads = [(0.0, device) for device in range(devices)]  # a heap of the devices that can take more
     for chunk in chunks:
-        device = int(np.argmin(loads))
+        load, device = heapq.heappop(loads)
         hands[device] += chunk
-        loads[device] += float(max(costs[i] for i in chunk))
+        if len(hands[device]) < most * width:
+            heapq.heappush(loads, (load + float(max(costs[i] for i in chunk)), device))
     return [np.array(hand, int) for hand in hands]
 
 
@@ -58,11 +65,11 @@ class LaneMap:
     Args:
         function: from one lane and the shared arguments to a pytree of arrays.
         width: lanes in a chunk; by default what was measured for the backend.
-        devices: where chunks run; by default all devices of this process.
+        devices: where chunks run, ordered by process; by default all devices of all processes.
     """
 
     def __init__(self, function: Callable[..., PyTree], width: int | None = None, devices: Any = None):
-        self.devices = jax.local_devices() if devices is None else list(devices)
+        self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._mesh = Mesh(np.array(self.devices), (AXIS,))
         self._run = jax.jit(self._on_mesh(function), static_argnums=0)
@@ -70,20 +77,23 @@ class LaneMap:
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
         total, width = count(lanes), self.width or count(lanes)
-        hands = deal(costs, active, len(self.devices), width)
-        capacity = -(-total // width) * width
+        # Room for twice the even share: enough to balance costs, and what a device holds shrinks with their number.
+        most = min(-(-total // width), 2 * -(-total // (width * len(self.devices))))
+        hands = deal(costs, active, len(self.devices), width, most)
+        capacity = most * width
         places = np.stack([np.resize(np.concatenate([hand, [0]]), capacity) for hand in hands])
         chunks = np.array([-(-len(hand) // width) for hand in hands])
-        results = self._launch(width, lane(lanes, places.ravel()), chunks, shared)
+        own = [d for d, device in enumerate(self.devices) if device.process_index == jax.process_index()]
+        results = self._launch(width, lane(lanes, places[own].ravel()), chunks[own], shared)
         where = {i: capacity * d + j for d, hand in enumerate(hands) for j, i in enumerate(hand)}
         return lane(results, np.array([where[i] for i in active], int))
 
     def _launch(self, width: int, lanes: PyTree, chunks: Int[np.ndarray, " d"], shared: tuple) -> PyTree:
+        """Results for the places of all devices; lanes and chunks are those of this process's devices."""
         split, whole = NamedSharding(self._mesh, PartitionSpec(AXIS)), NamedSharding(self._mesh, PartitionSpec())
         arrays, rest = eqx.partition((lanes, shared), eqx.is_array)
-        lanes, shared = jax.device_put(arrays[0], split), jax.device_put(arrays[1], whole)
-        static = _Static(width, rest)
-        return jax.device_get(self._run(static, lanes, jax.device_put(chunks, split), shared))
+        lanes, shared = hosts.put(arrays[0], split), hosts.put(arrays[1], whole)
+        return hosts.collect(self._run(_Static(width, rest), lanes, hosts.put(chunks, split), shared))
 
     def _on_mesh(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
         split, whole = PartitionSpec(AXIS), PartitionSpec()

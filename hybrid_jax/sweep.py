@@ -14,7 +14,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
-from hybrid_jax import training
+from hybrid_jax import hosts, training
 from hybrid_jax.lanes import LaneMap, count
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
@@ -88,7 +88,7 @@ def sweep(
         states = _merge(states, active, block((states, plans), (*shared, np.int32(more)), costs, active))
         if on_block is not None:
             on_block(states, _progress(states, plans, time.perf_counter() - began))
-        more = int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more))
+        more = hosts.agreed(int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more)))
     return states
 
 

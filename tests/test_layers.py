@@ -8,9 +8,9 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    "state rotation files lanes runtime",
+    "state rotation files hosts runtime",
     "checks",
-    "vehicle archive trajectories rows",
+    "vehicle archive lanes trajectories rows",
     "vector_field datasets summary",
     "rigid_body residual rollout environment",
     "features",

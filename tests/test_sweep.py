@@ -211,7 +211,7 @@ def test_lanes_are_stacked_and_picked():
 def test_dealing_gives_every_lane_once_and_balances(devices, width):
     rng = np.random.default_rng(0)
     costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
-    hands = deal(costs, active, devices, width)
+    hands = deal(costs, active, devices, width, 40)
     assert len(hands) == devices
     assert sorted(np.concatenate(hands).tolist()) == active
     chunks = [[hand[i : i + width] for i in range(0, len(hand), width)] for hand in hands]
@@ -222,7 +222,14 @@ def test_dealing_gives_every_lane_once_and_balances(devices, width):
 
 
 def test_more_devices_than_lanes_leave_some_idle():
-    assert [hand.tolist() for hand in deal([3.0, 1.0], [1], 3, 1)] == [[1], [], []]
+    assert [hand.tolist() for hand in deal([3.0, 1.0], [1], 3, 1, 1)] == [[1], [], []]
+
+
+def test_no_device_is_dealt_more_chunks_than_it_has_room_for():
+    costs = [100.0, *[1.0] * 9]
+    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 10)] == [1, 9]
+    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 6)] == [4, 6]
+    assert [len(hand) for hand in deal(costs, range(10), 2, 2, 3)] == [4, 6]
 
 
 DEVICES = """

@@ -1,0 +1,150 @@
+"""Several processes are one run: the same rows as one process, and none is waited for when it is gone."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXPERIMENT = ["-m", "experiments.param_shift", "--preset", "smoke", "--seeds", "3", "--models", "hybrid", "no_physics"]
+FAST = 20.0  # s, within which the others must end when one is gone; what they do between two exchanges is part of it
+
+# A sweep of three pendulums as a stage, on two devices for each process: its arguments are a folder, then who is who.
+SWEEP = """
+import sys
+from pathlib import Path
+sys.path.insert(0, "tests")
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+from hybrid_jax import hosts
+if len(sys.argv) > 2:
+    hosts.join(sys.argv[2], 2, int(sys.argv[3]))
+import numpy as np
+from pendulum import DAMPING, pendulum, swings
+from rich.console import Console
+from experiments import progress
+from experiments.stages import Stages
+from hybrid_jax.archive import digest, named_leaves
+from hybrid_jax.datasets import Dataset
+from hybrid_jax.lanes import stack
+from hybrid_jax.objective import Settings
+from hybrid_jax.training import make_plan, start
+progress.FIRST = 0.0
+states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.7, 0.6))])
+plans = stack([make_plan(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
+               ((0.03, 6000), (0.01, 4000), (0.02, 5000))])
+data = Dataset({"train": swings(40), "validation": swings(20, seed=1)}, {"config": {}})
+stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.first()))
+try:
+    final = stages.run("a sweep", states, plans, Settings(batch_size=10), data)
+except hosts.Gone as error:
+    sys.exit(f"gone: {error}")
+print("bytes", len(jax.devices()), digest("", named_leaves(final)))
+"""
+
+
+def address():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def begin(arguments):
+    return subprocess.Popen([sys.executable, *arguments], cwd=ROOT, text=True, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, env=os.environ | {"MPLBACKEND": "agg"})  # fmt: skip
+
+
+def ended(processes):
+    """Standard output and error of each, once all have ended well."""
+    texts = [process.communicate(timeout=300) for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), texts
+    return texts
+
+
+def pair(folder):
+    where = address()
+    return [begin(["-c", SWEEP, str(folder), where, str(i)]) for i in range(2)]
+
+
+def experiment(out, cache, *options):
+    return begin([*EXPERIMENT, "--out", str(out), "--cache", str(cache), *options])
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The experiment by one process, on as many devices as there are cores: its folder, with its cache."""
+    folder = tmp_path_factory.mktemp("alone")
+    ended([experiment(folder / "out", folder / "cache")])
+    return folder
+
+
+def rows(out):
+    return json.loads((out / "param_shift" / "report.json").read_text())["rows"]
+
+
+def with_flights(alone, folder):
+    """A cache with the flights and programs of the other run, but none of its sweeps."""
+    shutil.copytree(alone / "cache", folder, ignore=shutil.ignore_patterns("sweeps"))
+    return folder
+
+
+def test_two_processes_find_the_rows_of_one_and_only_the_first_writes(alone, tmp_path):
+    """Bit for bit; the second has neither the flights nor a sweep in its cache, nor makes any."""
+    where = address()
+    caches = with_flights(alone, tmp_path / "cache"), tmp_path / "other"
+    both = [
+        experiment(tmp_path / f"out{i}", caches[i], "--distributed", "--coordinator", where, "--processes", "2",
+                   "--process-id", str(i)) for i in range(2)
+    ]  # fmt: skip
+    texts = ended(both)
+    assert rows(tmp_path / "out0") == rows(alone / "out")
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["programs"]
+    assert not list((tmp_path / "out1").iterdir())
+    assert "lanes" in texts[0][1]
+    assert "lanes" not in texts[1][1]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cannot choose the cores of a process")
+def test_one_device_finds_the_rows_of_all(alone, tmp_path):
+    """The law of the experiments: the same seed gives the same bytes on the same machine, on any number of devices."""
+    with_flights(alone, tmp_path / "cache")
+    core = min(os.sched_getaffinity(0))
+    one = f"import os, runpy, sys; os.sched_setaffinity(0, [{core}]); sys.argv = sys.argv[1:]; " + (
+        "runpy.run_module('experiments.param_shift', run_name='__main__', alter_sys=True)"
+    )
+    options = [*EXPERIMENT[1:], "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]
+    ended([begin(["-c", one, *options])])
+    assert rows(tmp_path / "out") == rows(alone / "out")
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What the pendulums' sweep ends in, by one process and never interrupted."""
+    ((said, _),) = ended([begin(["-c", SWEEP, str(tmp_path_factory.mktemp("whole"))])])
+    return said.split()[-1]
+
+
+@pytest.mark.parametrize("victim", [0, 1])
+@pytest.mark.parametrize("later", [1, 2])
+def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, later, whole, tmp_path):
+    both = pair(tmp_path)
+    assert any("lanes active" in line for line in both[0].stderr)
+    killed, other = both[victim], both[1 - victim]
+    killed.send_signal(signal.SIGKILL)
+    since = time.monotonic()
+    _, said = other.communicate(timeout=60)
+    assert time.monotonic() - since < FAST
+    assert other.returncode == 1
+    assert said.strip().splitlines()[-1].startswith("gone: another process of this run has ended; the same command")
+    assert len(list(tmp_path.glob("*.begun.npz"))) == (victim == 1)  # process 0 saves when another is lost
+    texts = ended(pair(tmp_path) if later == 2 else [begin(["-c", SWEEP, str(tmp_path)])])
+    assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
+    assert {said.split()[-1] for said, _ in texts} == {whole}
+    assert all(said.split()[-2] == str(2 * later) for said, _ in texts)
