@@ -39,6 +39,8 @@ def join(coordinator: str | None = None, processes: int | None = None, process: 
     jax.config.update("jax_enable_preemption_service", False)  # the host loop has its own ways to stop
     try:
         jax.distributed.initialize(coordinator, processes, process)
+    except ValueError as error:
+        raise ValueError(f"--distributed: {error}") from error
     except RuntimeError as error:
         raise Gone(f"the processes did not find each other: {error}") from error
     devices = gather(np.array([jax.local_device_count()]))

@@ -7,7 +7,7 @@ so that these cost nothing, reports progress, and is where a run can be interrup
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cache
+from functools import lru_cache
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
+PROGRAMS = 16  # of a kind that are kept: more than an experiment needs, and a bound on a long process's memory
 
 
 @dataclass(frozen=True)
@@ -78,9 +79,9 @@ def sweep(
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
     _check(plans, train, settings)
-    block = _block(settings, width)
-    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
     shared = (train, validation)
+    block = _block(settings, width, _shapes((states, plans), shared))
+    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
     block((states, plans), (*shared, np.int32(0)), costs, range(len(costs)))  # compiles, trains nothing
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == training.RUNNING)):
@@ -97,12 +98,19 @@ def evaluate(
 ) -> Float[np.ndarray, " lanes"]:
     """L_MSE of each lane's field as deployed, on windows that all lanes share."""
     lanes = count(fields)
-    errors = _evaluation(settings, every)
+    errors = _evaluation(settings, every, _shapes(fields, windows))
     return errors(jax.device_get(fields), (windows,), np.ones(lanes), range(lanes))
 
 
-@cache  # a sweep of the same shapes, later in the same process, compiles nothing
-def _block(settings: Settings, width: int | None) -> LaneMap:
+def _shapes(*trees: PyTree) -> tuple:
+    """What a program is compiled for."""
+    leaves = [leaf for leaf in jax.tree.leaves(trees) if eqx.is_array(leaf)]
+    return (*((leaf.shape, leaf.dtype) for leaf in leaves), jax.tree.structure(trees))
+
+
+# A sweep of the same shapes, later in the same process, compiles nothing; one map a shape, so that old programs go.
+@lru_cache(PROGRAMS)
+def _block(settings: Settings, width: int | None, shapes: tuple) -> LaneMap:
     def block(lane: tuple[FitState, Plan], train, validation, more) -> FitState:
         state, plan = lane
         return training.run(state, plan, train, validation, settings, state.epoch + more)
@@ -110,8 +118,8 @@ def _block(settings: Settings, width: int | None) -> LaneMap:
     return LaneMap(block, width)
 
 
-@cache
-def _evaluation(settings: Settings, every: int) -> LaneMap:
+@lru_cache(PROGRAMS)
+def _evaluation(settings: Settings, every: int, shapes: tuple) -> LaneMap:
     return LaneMap(lambda field, windows: deployed_mse(field, windows, every, settings.solver))
 
 
