@@ -53,10 +53,18 @@ def lane_notes(rows: Sequence[Row]) -> list[str]:
     """A sentence on runs that hit the epoch cap, one on those that diverged, one on errors that are not finite."""
     kinds: tuple[tuple[str, Callable[[Row], bool]], ...] = (
         ("hit the cap on epochs before early stopping ended them", lambda row: row.status == "capped"),
-        ("met a non-finite loss and count with their best epoch before it", lambda row: row.status == "diverged"),
+        (
+            f"met a non-finite loss{_epochs_of_divergence(rows)} and count with their best epoch before it",
+            lambda row: row.status == "diverged",
+        ),
         ("have a test error that is not finite; it counts as infinite (∞)", lambda row: row.test_mse is None),
     )
     return [_tally(rows, words, chosen) for words, chosen in kinds]
+
+
+def _epochs_of_divergence(rows: Sequence[Row]) -> str:
+    epochs = sorted({row.epochs for row in rows if row.status == "diverged"})
+    return f", in epoch {', '.join(map(str, epochs))}," if epochs else ""
 
 
 def over_seeds(rows: Sequence[Row]) -> str:

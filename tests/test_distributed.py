@@ -124,7 +124,7 @@ def test_two_processes_find_the_rows_of_one_and_only_the_first_writes(alone, tmp
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cannot choose the cores of a process")
 def test_one_device_finds_the_rows_of_all(alone, tmp_path):
-    """To within round-off: XLA compiles for one device along another path, and float32 sums differ in their last bit."""
+    """To within round-off: XLA compiles for one device along another path, and sums differ in their last bit."""
     with_flights(alone, tmp_path / "cache")
     core = min(os.sched_getaffinity(0))
     one = f"import os, runpy, sys; os.sched_setaffinity(0, [{core}]); sys.argv = sys.argv[1:]; " + (

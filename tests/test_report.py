@@ -15,7 +15,7 @@ from rich.console import Console
 from hybrid_jax.claims import EXPERIMENTS
 from hybrid_jax.environment import PACKAGES
 from hybrid_jax.report import FLOOR, load_report, print_report, write_report
-from hybrid_jax.report_tables import parameters
+from hybrid_jax.report_tables import lane_notes, parameters
 from hybrid_jax.rows import (
     DOMAINS,
     THETA,
@@ -104,6 +104,13 @@ def test_the_page_says_everything_once(tmp_path):
     assert "∞ (3 of 3 seeds not finite" in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
     assert all(line.endswith("|") for line in tables)
+
+
+def test_the_notes_count_the_diverged_and_name_their_epochs():
+    rows = changed(make_rows(), "no_physics", "fine_tuned", 500, status="diverged", epochs=7)
+    notes = lane_notes(changed(rows, "hybrid", "fine_tuned", 100, status="diverged", epochs=1))
+    assert notes[1].startswith(f"6 of {len(rows)} runs met a non-finite loss, in epoch 1, 7, and count with their best")
+    assert lane_notes(make_rows())[1].startswith(f"0 of {len(rows)} runs met a non-finite loss and count")
 
 
 def test_the_terminal_shows_each_verdict_and_unit():
