@@ -2,8 +2,10 @@
 
 import logging
 import shutil
+import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -102,7 +104,22 @@ class Checkpoints:
             shutil.rmtree(path, ignore_errors=True)
 
 
+@cache
+def _expect_late_futures() -> None:
+    """Say nothing of what else ends in the same error after orbax has raised the first; nothing else here is async."""
+    otherwise = sys.unraisablehook
+
+    def hook(late) -> None:
+        if not (isinstance(late.exc_value, RuntimeError) and str(late.exc_value) == "Event loop is closed"):
+            otherwise(late)
+
+    sys.unraisablehook = hook
+    asyncio_log = logging.getLogger("asyncio")
+    asyncio_log.addFilter(lambda record: not record.getMessage().startswith("Task exception was never retrieved"))
+
+
 def _orbax() -> ocp.Checkpointer:
+    _expect_late_futures()
     here = jax.process_index()  # of several hosts, each that saves does so alone, and waits for no other
     alone = ocp.options.MultiprocessingOptions(
         primary_host=here, active_processes={here}, barrier_sync_key_prefix=f"process{here}"
