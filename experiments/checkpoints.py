@@ -12,6 +12,7 @@ from typing import Any
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
+from orbax.checkpoint._src.futures import signaling_client
 
 from hybrid_jax.archive import Arrays, digest
 from hybrid_jax.files import aside
@@ -118,8 +119,21 @@ def _expect_late_futures() -> None:
     asyncio_log.addFilter(lambda record: not record.getMessage().startswith("Task exception was never retrieved"))
 
 
+@cache
+def _signal_here() -> None:
+    """Let orbax's threads signal each other within this process.
+
+    It would do so through JAX's coordination service as soon as there are several processes, but `hosts.join` has shut
+    that down, and each process that saves here saves alone. Orbax has no option for it.
+    """
+    client = signaling_client.ThreadSafeKeyValueSignalingClient()
+    signaling_client.get_signaling_client = lambda: client
+
+
 def _orbax() -> ocp.Checkpointer:
     _expect_late_futures()
+    if jax.process_count() > 1:
+        _signal_here()
     here = jax.process_index()  # of several hosts, each that saves does so alone, and waits for no other
     alone = ocp.options.MultiprocessingOptions(
         primary_host=here, active_processes={here}, barrier_sync_key_prefix=f"process{here}"

@@ -158,7 +158,7 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     assert time.monotonic() - since < FAST
     assert other.returncode == 1
     assert said.strip().splitlines()[-1].startswith("gone: another process of this run has ended; the same command")
-    assert len(list(tmp_path.glob("*.begun.npz"))) == (victim == 1)  # process 0 saves when another is lost
+    assert len(list(tmp_path.glob("*.begun"))) == (victim == 1)  # process 0 saves when another is lost
     texts = ended(pair(programs, tmp_path) if later == 2 else [sweep(programs, tmp_path)])
     assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
     assert {said.split()[-1] for said, _ in texts} == {digest}
