@@ -22,7 +22,8 @@ from hybrid_jax import hosts
 
 Numbers = Sequence[Any] | np.ndarray
 AXIS = "lanes"
-WIDTH = {"cpu": 1}  # measured by benchmarks/sweep.py; a backend that is not listed takes all lanes at once
+WIDTH = {"cpu": 1}  # measured by benchmarks/sweep.py; a backend that is not listed takes as many lanes as fit
+USABLE = 0.8  # share of a device's free memory that a program may ask for; the rest is for what cannot be foreseen
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
@@ -64,21 +65,29 @@ class LaneMap:
 
     Args:
         function: from one lane and the shared arguments to a pytree of arrays.
-        width: lanes in a chunk; by default what was measured for the backend.
+        width: lanes in a chunk; by default what was measured for the backend; 0 for as many as fit into memory.
         devices: where chunks run, ordered by process; by default all devices of all processes.
+        memory: bytes that a program may take on a device; by default most of what the device says is free.
     """
 
-    def __init__(self, function: Callable[..., PyTree], width: int | None = None, devices: Any = None):
+    def __init__(
+        self,
+        function: Callable[..., PyTree],
+        width: int | None = None,
+        devices: Any = None,
+        memory: int | None = None,
+    ):
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
+        self._memory = memory
+        self._fitting: dict[int, int] = {}  # number of lanes → width
         self._mesh = Mesh(np.array(self.devices), (AXIS,))
         self._run = jax.jit(self._on_mesh(function), static_argnums=0)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
-        total, width = count(lanes), self.width or count(lanes)
-        # Room for twice the even share: enough to balance costs, and what a device holds shrinks with their number.
-        most = min(-(-total // width), 2 * -(-total // (width * len(self.devices))))
+        total, width = count(lanes), self._width(lanes, shared)
+        most = self._most(total, width)
         hands = deal(costs, active, len(self.devices), width, most)
         capacity = most * width
         places = np.stack([np.resize(np.concatenate([hand, [0]]), capacity) for hand in hands])
@@ -87,6 +96,43 @@ class LaneMap:
         results = self._launch(width, lane(lanes, places[own].ravel()), chunks[own], shared)
         where = {i: capacity * d + j for d, hand in enumerate(hands) for j, i in enumerate(hand)}
         return lane(results, np.array([where[i] for i in active], int))
+
+    def _most(self, total: int, width: int) -> int:
+        """Chunks that a device has room for: twice the even share, enough to balance costs, and all if it is alone."""
+        return min(-(-total // width), 2 * -(-total // (width * len(self.devices))))
+
+    def _width(self, lanes: PyTree, shared: tuple) -> int:
+        """The width that was asked for, or an even share of the lanes, halved until the program fits into memory."""
+        total = count(lanes)
+        if not self.width and total not in self._fitting:
+            width = -(-total // len(self.devices))
+            while width > 1 and self._needed(width, lanes, shared) > self._usable():
+                width = -(-width // 2)
+            self._fitting[total] = hosts.agreed(width)
+        return self.width or self._fitting[total]
+
+    def _needed(self, width: int, lanes: PyTree, shared: tuple) -> int:
+        """Bytes of each device that the program for chunks of this width takes: asked of the compiler, nothing runs."""
+        split, whole = NamedSharding(self._mesh, PartitionSpec(AXIS)), NamedSharding(self._mesh, PartitionSpec())
+        places = len(self.devices) * self._most(count(lanes), width) * width
+
+        def like(leaf, shape, sharding):
+            return jax.ShapeDtypeStruct(shape, jax.dtypes.canonicalize_dtype(leaf.dtype), sharding=sharding)
+
+        (lanes, shared), rest = eqx.partition((lanes, shared), eqx.is_array)
+        lanes = jax.tree.map(lambda leaf: like(leaf, (places, *leaf.shape[1:]), split), lanes)
+        shared = jax.tree.map(lambda leaf: like(leaf, leaf.shape, whole), shared)
+        chunks = jax.ShapeDtypeStruct((len(self.devices),), jax.dtypes.canonicalize_dtype(int), sharding=split)
+        found = self._run.lower(_Static(width, rest), lanes, chunks, shared).compile().memory_analysis()
+        if found is None:  # a backend that cannot tell
+            return 0
+        return found.temp_size_in_bytes + found.argument_size_in_bytes + found.output_size_in_bytes
+
+    def _usable(self) -> float:
+        said = self.devices[0].memory_stats() if self._memory is None else None
+        if said is None:  # a CPU does not say
+            return float("inf") if self._memory is None else self._memory
+        return USABLE * (said["bytes_limit"] - said["bytes_in_use"])
 
     def _launch(self, width: int, lanes: PyTree, chunks: Int[np.ndarray, " d"], shared: tuple) -> PyTree:
         """Results for the places of all devices; lanes and chunks are those of this process's devices."""

@@ -14,7 +14,7 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax import training
-from hybrid_jax.lanes import count, deal, lane, stack
+from hybrid_jax.lanes import LaneMap, count, deal, lane, stack
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
 from hybrid_jax.sweep import evaluate, sweep
@@ -230,6 +230,21 @@ def test_no_device_is_dealt_more_chunks_than_it_has_room_for():
     assert [len(hand) for hand in deal(costs, range(10), 2, 1, 10)] == [1, 9]
     assert [len(hand) for hand in deal(costs, range(10), 2, 1, 6)] == [4, 6]
     assert [len(hand) for hand in deal(costs, range(10), 2, 2, 3)] == [4, 6]
+
+
+def test_a_chunk_is_halved_until_its_program_fits_into_memory():
+    """A lane sorts a megabyte on its way; the programs of both widths give the same."""
+    lanes, shared = {"x": np.arange(8, dtype=np.float32)}, (np.ones(2**18, np.float32),)
+
+    def function(lane, ones):
+        return jnp.sum(jnp.sort(ones * lane["x"]))
+
+    whole = LaneMap(function, width=0)
+    assert whole._needed(8, lanes, shared) > whole._needed(2, lanes, shared) > 2 * shared[0].nbytes
+    narrow = LaneMap(function, width=0, memory=int(whole._needed(2, lanes, shared)))
+    results = [mapped(lanes, shared, [1.0] * 8, range(8)) for mapped in (whole, narrow)]
+    assert [mapped._width(lanes, shared) for mapped in (whole, narrow)] == [8, 2]
+    np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
 DEVICES = """
