@@ -64,27 +64,59 @@ class Vehicle:
         return math.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient))
 
 
-def load_vehicle(path: str | Path) -> Vehicle:
+def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
+
+    Args:
+        variant: the vehicle as changed by a table `[vehicle.VARIANT]`, which gives some of its constants anew, such as
+            the mass with a payload. Variants that are not asked for are checked as well.
 
     Raises:
         ValueError: the file, the key and what was expected, in one line.
     """
+    return vehicle_of(read_tables(path), path, variant)
+
+
+def read_tables(path: str | Path) -> dict[str, Any]:
+    """The tables of a TOML file.
+
+    Raises:
+        ValueError: the file and why it is not readable, in one line.
+    """
     try:
-        table = tomllib.loads(Path(path).read_bytes().decode()).get("vehicle")
+        return tomllib.loads(Path(path).read_bytes().decode())
     except (OSError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: not a readable TOML file: {checks.one_line(error)}") from error
+
+
+def vehicle_of(tables: dict[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
+    """The vehicle that the tables of a file describe.
+
+    Raises:
+        ValueError: as `load_vehicle`.
+    """
+    table = tables.get("vehicle")
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
-    unknown = sorted(repr(key) for key in table.keys() - {field.name for field in fields(Vehicle)})
+    known = {field.name for field in fields(Vehicle)}
+    changes = {key: table[key] for key in table.keys() - known if isinstance(table[key], dict)}
+    if variant is not None and variant not in changes:
+        found = ", ".join(sorted(map(repr, changes))) or "none"
+        raise ValueError(f"{path}: has no table [vehicle.{variant}]; its variants are {found}")
+    common = {key: value for key, value in table.items() if key not in changes}
+    vehicle = _made(common, known, f"{path}: [vehicle]")
+    variants = {name: _made(common | changes[name], known, f"{path}: [vehicle.{name}]") for name in sorted(changes)}
+    return vehicle if variant is None else variants[variant]
+
+
+def _made(table: dict[str, Any], known: set[str], where: str) -> Vehicle:
+    unknown = sorted(repr(key) for key in table.keys() - known)
     if unknown:
-        raise ValueError(f"{path}: [vehicle]: {', '.join(unknown)}: no constant of a vehicle")
+        raise ValueError(f"{where}: {', '.join(unknown)}: no constant of a vehicle")
     try:
-        return Vehicle(**{key: _as_tuple(value) for key, value in table.items()})
+        return Vehicle(**{key: as_tuple(value) for key, value in table.items()})
     except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"{path}: [vehicle]: {checks.one_line(error).replace('Vehicle.__init__()', 'table')}"
-        ) from error
+        raise ValueError(f"{where}: {checks.one_line(error).replace('Vehicle.__init__()', 'table')}") from error
 
 
 def _require_positive(name: str, value: Any, what: str = "a positive finite number") -> None:
@@ -106,8 +138,9 @@ def _is_four(values: Any, is_right: Callable[[Any], bool]) -> bool:
     return isinstance(values, tuple) and len(values) == 4 and all(is_right(value) for value in values)
 
 
-def _as_tuple(value: Any) -> Any:
-    return tuple(_as_tuple(item) for item in value) if isinstance(value, list) else value
+def as_tuple(value: Any) -> Any:
+    """A list of TOML, and lists in it, as tuples, which can be hashed."""
+    return tuple(as_tuple(item) for item in value) if isinstance(value, list) else value
 
 
 # Pegasus Simulator's 3DR Iris, as the paper uses it.

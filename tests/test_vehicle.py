@@ -1,6 +1,7 @@
 """A vehicle file is read whole or refused in one line that names what is wrong."""
 
 import math
+from dataclasses import replace
 
 import pytest
 
@@ -88,6 +89,32 @@ def test_a_constant_that_is_no_positive_number_is_named(written, key, value):
 )
 def test_a_malformed_constant_is_named(written, key, value):
     assert key in refusal(written(**{key: value}))
+
+
+@pytest.fixture
+def with_payload(written):
+    def write(text):
+        path = written()
+        path.write_text(path.read_text() + f"[vehicle.payload]\n{text}\n")
+        return path
+
+    return write
+
+
+def test_a_variant_is_the_vehicle_but_for_what_it_changes(with_payload):
+    path = with_payload("mass = 2.0")
+    assert load_vehicle(path).mass == 1.5
+    assert load_vehicle(path, "payload") == replace(load_vehicle(path), mass=2.0)
+
+
+@pytest.mark.parametrize("text", ["mas = 2.0", "mass = -2.0", "[vehicle.payload.heavy]"])
+def test_a_wrong_variant_is_refused_whether_it_is_asked_for_or_not(with_payload, text):
+    assert "[vehicle.payload]" in refusal(with_payload(text))
+
+
+def test_a_variant_that_is_not_there_is_named_with_those_that_are(with_payload):
+    with pytest.raises(ValueError, match=r"no table \[vehicle.load\]; its variants are 'payload'"):
+        load_vehicle(with_payload("mass = 2.0"), "load")
 
 
 def test_the_moment_that_is_wrong_is_named(written):
