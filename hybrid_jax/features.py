@@ -2,7 +2,8 @@
 
 A view is a vector field that hands features of x to the field inside and turns its answer into ẋ. Views nest: the outer
 one chooses what is read, the inner one what is written. What is not read cannot be overfitted: drag knows no place, and
-neither drag nor ground effect knows north. What is not written stays physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact.
+neither drag nor ground effect knows north. What is not written stays physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact;
+in a log, where an estimator's p and v disagree, or a gyro has a bias, they need not be (see `Motion`).
 
 The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
 """
@@ -11,11 +12,12 @@ from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import rotation
-from hybrid_jax.residual import InputScaling, residual_network
+from hybrid_jax import checks, rotation
+from hybrid_jax.residual import InputScaling, ResidualNetwork, residual_network
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe
 
@@ -67,15 +69,34 @@ class BodyFrame(View):
         return jnp.concatenate([x[2:3], gravity, rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES]])
 
     def write(self, x, inside):
-        q = x[QUATERNION]
-        return jnp.concatenate(
-            [
-                rotation.rotate(q, inside[POSITION]),
-                rotation.multiply(q, inside[QUATERNION]),
-                rotation.rotate(q, inside[VELOCITY]),
-                inside[BODY_RATES],
-            ]
-        )
+        return _to_world(x[QUATERNION], inside)
+
+
+class BodyMotion(View):
+    """Blind to p and yaw: `BodyFrame` without the height, for flight away from the ground.
+
+    The field inside reads the velocity Rᵀv [m/s], the body rates [rad/s] and the direction of the world's up Rᵀe_z (9).
+    """
+
+    field: AbstractVectorField
+
+    def read(self, x):
+        to_body = rotation.conjugate(x[QUATERNION])
+        return jnp.concatenate([rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES], rotation.body_z(to_body)])
+
+    def write(self, x, inside):
+        return _to_world(x[QUATERNION], inside)
+
+
+def _to_world(q: Float[Array, " 4 *b"], inside: Features) -> Float[Array, " 13 *b"]:
+    return jnp.concatenate(
+        [
+            rotation.rotate(q, inside[POSITION]),
+            rotation.multiply(q, inside[QUATERNION]),
+            rotation.rotate(q, inside[VELOCITY]),
+            inside[BODY_RATES],
+        ]
+    )
 
 
 class Accelerations(View):
@@ -88,6 +109,22 @@ class Accelerations(View):
 
     def write(self, x, inside):
         return jnp.concatenate([jnp.zeros((VELOCITY.start, *inside.shape[1:]), inside.dtype), inside])
+
+
+class Motion(View):
+    """The field inside returns corrections of ṗ, of the body rates that turn q, and v̇ and ω̇ (12), seen from the body.
+
+    Only inside a view that turns it into the world: there r = ½ [0, δω], so that |q| stays 1.
+    """
+
+    field: AbstractVectorField
+
+    def read(self, x):
+        return x
+
+    def write(self, x, inside):
+        turning = jnp.concatenate([jnp.zeros((1, *inside.shape[1:]), inside.dtype), inside[3:6] / 2])
+        return jnp.concatenate([inside[:3], turning, inside[6:]])
 
 
 @evaluate_batch.register
@@ -116,8 +153,14 @@ INPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "no_xy": (STATE_SIZE - 2, Placeless),
     "body": (10, BodyFrame),
+    "body_motion": (9, BodyMotion),
 }
-OUTPUTS: dict[str, tuple[int, Wrapper]] = {"all": (STATE_SIZE, _as_it_is), "accelerations": (6, Accelerations)}
+OUTPUTS: dict[str, tuple[int, Wrapper]] = {
+    "all": (STATE_SIZE, _as_it_is),
+    "accelerations": (6, Accelerations),
+    "motion": (12, Motion),
+}
+FROM_THE_BODY = ("body", "body_motion")  # the inputs that "motion" goes with
 
 
 def restricted(
@@ -132,16 +175,41 @@ def restricted(
     """A network that reads and writes only part of a multirotor's state; by default all of it, as the paper's.
 
     Args:
-        inputs: "all" of x; "no_xy", without p_x and p_y; "body", seen from the body (see `BodyFrame`).
-        outputs: "all" 13 derivatives, or the "accelerations" v̇ and ω̇.
+        inputs: "all" of x; "no_xy", without p_x and p_y; "body", seen from the body (see `BodyFrame`); "body_motion",
+            that without the height.
+        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "motion", with ṗ and body rates as well (`Motion`).
         norm: as in `residual_network`.
 
     Raises:
-        ValueError: another name.
+        ValueError: another name, or "motion" of what is not seen from the body.
     """
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if outputs == "motion" and inputs not in FROM_THE_BODY:
+        raise ValueError(f"outputs 'motion' needs inputs of {' or '.join(FROM_THE_BODY)}, got {inputs!r}")
     (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
     return seen(written(network))
+
+
+def silenced(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with the output layer of every network in it at zero: training begins at what physics says.
+
+    Raises:
+        ValueError: there is no network in it.
+    """
+
+    def is_network(node) -> bool:
+        return isinstance(node, ResidualNetwork)
+
+    if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
+        raise ValueError(f"field: there is no ResidualNetwork in {checks.shown(field)}")
+
+    def silent(node):
+        if not is_network(node):
+            return node
+        zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
+        return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
+
+    return jax.tree.map(silent, field, is_leaf=is_network)

@@ -14,7 +14,9 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
-from hybrid_jax.features import Accelerations, BodyFrame, Placeless
+from hybrid_jax.baselines import FrozenRates, HoldState
+from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless
+from hybrid_jax.multirotor import Multirotor, Terms
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch
@@ -34,9 +36,10 @@ def portable(kind: type) -> type:
     return kind
 
 
-_FIELDS = (Accelerations, BodyFrame, Frozen, Hybrid, LinearResidual, Placeless, ResidualNetwork, RigidBody)
-_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Vehicle)
-for _kind in _FIELDS + _PARTS:
+_FIELDS = (Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor, ResidualNetwork, RigidBody)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless)
+_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
+for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)
 
 

@@ -1,5 +1,7 @@
 """f_p: the Newton–Euler equations of a quadrotor with unknown Ix, Iy and k (paper, Eq. 10)."""
 
+from abc import abstractmethod
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -15,7 +17,15 @@ from hybrid_jax.vehicle import Vehicle
 LEARNED = ("Ix", "Iy", "k")
 
 
-class RigidBody(AbstractVectorField):
+class AbstractRigidBody(AbstractVectorField):
+    """A field whose state of 13 is that of state.py and whose parameters have physical units."""
+
+    @abstractmethod
+    def theta(self) -> dict[str, Array]:
+        """The learned parameters in SI units, by name."""
+
+
+class RigidBody(AbstractRigidBody):
     """A rigid body carried by four rotors, with no drag, ground effect or wind.
 
     θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
@@ -54,7 +64,7 @@ class RigidBody(AbstractVectorField):
         acceleration = (thrust / self.vehicle.mass) * rotation.body_z(q) + gravity
         inertia = (theta["Ix"], theta["Iy"], self.vehicle.inertia[2])
         return jnp.concatenate(
-            [jnp.stack(v), rotation.derivative(q, omega), acceleration, _euler(inertia, torque, omega)]
+            [jnp.stack(v), rotation.derivative(q, omega), acceleration, euler(inertia, torque, omega)]
         )
 
 
@@ -83,8 +93,8 @@ def guess_off(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
 
 def moves_a_rigid_body(field) -> bool:
     """Whether a rigid body is anywhere in a field, so that a state of 13 is that of state.py."""
-    parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, RigidBody))
-    return any(isinstance(part, RigidBody) for part in parts)
+    parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
+    return any(isinstance(part, AbstractRigidBody) for part in parts)
 
 
 def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
@@ -114,7 +124,7 @@ def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Rows):
     return k * sum(squares), torque
 
 
-def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
+def euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
     return jnp.stack(

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax import Hybrid, features, load, residual_network, rigid_body, rotation, save
-from hybrid_jax.features import BodyFrame, restricted
+from hybrid_jax.features import BodyFrame, BodyMotion, restricted, silenced
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vector_field import (
@@ -25,7 +25,12 @@ from hybrid_jax.vehicle import IRIS
 
 KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
-VIEWS = list(itertools.product(features.INPUTS, features.OUTPUTS))
+VIEWS = [
+    (inputs, outputs)
+    for inputs, outputs in itertools.product(features.INPUTS, features.OUTPUTS)
+    if outputs != "motion" or inputs in features.FROM_THE_BODY
+]
+FROM_THE_BODY = list(itertools.product(features.FROM_THE_BODY, features.OUTPUTS))
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -82,18 +87,18 @@ def test_an_unknown_name_is_refused(options):
         restricted(KEY, **options)
 
 
-@pytest.mark.parametrize("outputs", features.OUTPUTS)
-@pytest.mark.parametrize("inputs", ["no_xy", "body"])
-def test_where_the_vehicle_is_does_not_matter_and_how_high_does(inputs, outputs):
+@pytest.mark.parametrize(("inputs", "outputs"), [pair for pair in VIEWS if pair[0] != "all"])
+def test_where_the_vehicle_is_does_not_matter_and_how_high_may(inputs, outputs):
     field, (x, u) = view(inputs, outputs), samples()
     here = deployed(field, x, u)
     np.testing.assert_array_equal(deployed(field, x.at[:2].add(100.0), u), here)
-    assert (jnp.abs(deployed(field, x.at[2].add(1.0), u) - here).max(0) > 1e-3).all()
+    moves = jnp.abs(deployed(field, x.at[2].add(1.0), u) - here).max(0)
+    assert (moves == 0).all() if inputs == "body_motion" else (moves > 1e-3).all()
 
 
-@pytest.mark.parametrize("outputs", features.OUTPUTS)
-def test_seen_from_the_body_a_turned_vehicle_has_the_turned_derivative(outputs):
-    field, (x, u) = view("body", outputs), samples()
+@pytest.mark.parametrize(("inputs", "outputs"), FROM_THE_BODY)
+def test_seen_from_the_body_a_turned_vehicle_has_the_turned_derivative(inputs, outputs):
+    field, (x, u) = view(inputs, outputs), samples()
     for yaw in (0.3, 2.0, -3.0):
         np.testing.assert_allclose(deployed(field, turned(x, yaw), u), turned(deployed(field, x, u), yaw), atol=1e-12)
     tilt = rotation.from_axis_angle(jnp.array([1.0, 0.0, 0.0]), jnp.asarray(0.3))
@@ -114,6 +119,32 @@ def test_the_body_s_view_of_a_state():
     x = jnp.concatenate([jnp.array([5.0, 6.0, 7.0]), q, jnp.array([2.0, 3.0, 0.0]), jnp.array([0.1, 0.2, 0.3])])
     expected = [7, 1, 0, 0, 0, 3, 2, 0.1, 0.2, 0.3]
     np.testing.assert_allclose(BodyFrame(rigid_body(IRIS)).read(x), expected, atol=1e-12)
+    motion = [0, 3, 2, 0.1, 0.2, 0.3, -1, 0, 0]
+    np.testing.assert_allclose(BodyMotion(rigid_body(IRIS)).read(x), motion, atol=1e-12)
+
+
+@pytest.mark.parametrize("inputs", features.FROM_THE_BODY)
+def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
+    """All of ṗ, q̇, v̇ and ω̇ are moved, and q̇ is perpendicular to q."""
+    field, (x, u) = view(inputs, "motion"), samples()
+    derivative = deployed(field, x, u)
+    assert (jnp.abs(derivative).max(1) > 1e-3).all()
+    np.testing.assert_allclose((x[QUATERNION] * derivative[QUATERNION]).sum(0), 0, atol=1e-12)
+
+
+def test_motion_is_not_written_in_the_world():
+    with pytest.raises(ValueError, match="outputs 'motion' needs inputs of body or body_motion, got 'all'"):
+        view("all", "motion")
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
+    field, (x, u) = silenced(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
+    np.testing.assert_array_equal(deployed(field, x, u), deployed(rigid_body(IRIS), x, u))
+    slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field.residual)
+    assert (network_of(slope).weight_out != 0).any()
+    with pytest.raises(ValueError, match="no ResidualNetwork"):
+        silenced(rigid_body(IRIS))
 
 
 @pytest.mark.parametrize("inputs", features.INPUTS)

@@ -1,0 +1,294 @@
+"""f_p of a real multirotor: the rigid body with what else physics knows of it, and with what is learned chosen by name.
+
+    m v̇ = R (T e_z − D Rᵀv) − m g e_z,    J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+
+T and τ are thrust and torque of the four rotors about a centre of mass that need not be the origin of their positions;
+a rotor's thrust is k_i u_i², with one k or four. Linear rotor drag D, the moment A that grows with the velocity in the
+body frame and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
+dynamics subject to rotor drag for accurate tracking of high-speed trajectories", 2018 (A there has the other sign). The
+gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it.
+
+The rotors' lag behind what a log says of them is no part of the field but a change to the log: as four more states they
+would start each window unknown, and a window is about as long as the lag. A log knows their past; see
+`hybrid_jax.flights.rotor_lag`.
+"""
+
+import math
+from dataclasses import dataclass
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks, rotation
+from hybrid_jax.rigid_body import LEARNED, AbstractRigidBody, euler
+from hybrid_jax.rotation import Rows
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.vector_field import deploy_batch, evaluate_batch
+from hybrid_jax.vehicle import Vehicle
+
+SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
+POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
+SIGNED = {
+    "torque_gain": (3,),
+    "centre_of_mass": (2,),
+    "drag": (3,),
+    "aerodynamic_moment": (3, 3),
+    "rate_damping": (3,),
+}
+SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
+
+Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
+Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Nominal values of what a rigid body leaves out; by default there is none of it. Body frame, SI units.
+
+    Attributes:
+        torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
+        centre_of_mass: (x, y) in the frame of the rotors' positions [m].
+        drag: D [N s/m].
+        aerodynamic_moment: A, one row for each of the three moments [N s].
+        rate_damping: B [N m s].
+        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
+
+    Raises:
+        ValueError: a term of another shape, or that is not finite.
+    """
+
+    torque_gain: Three = (1.0, 1.0, 1.0)
+    centre_of_mass: tuple[float, float] = (0.0, 0.0)
+    drag: Three = (0.0, 0.0, 0.0)
+    aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rate_damping: Three = (0.0, 0.0, 0.0)
+    motor_time_constant: float = 0.0
+
+    def __post_init__(self):
+        for name, shape in SIGNED.items():
+            object.__setattr__(self, name, _floats(name, getattr(self, name), shape))
+        checks.not_negative("motor_time_constant", self.motor_time_constant)
+
+
+class Multirotor(AbstractRigidBody):
+    """The rigid body with `Terms`; with the default ones and names it is `RigidBody`.
+
+    Parameters are held as deviations from nominal, so that all start at zero and one learning rate fits them all: what
+    is positive as log(value / nominal), the rest in units of the vehicle's weight and arm, taken at 1 m/s and 10 rad/s.
+    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+
+    Attributes:
+        deviations: of each learned parameter, by name; shapes as in `SHAPES`.
+        vehicle: the known constants and the nominal values.
+        terms: the nominal values of what a rigid body has not; those that are zero and not learned cost nothing.
+
+    Raises:
+        ValueError: parameters of another name, k beside k_rotors, or no vehicle or terms.
+    """
+
+    deviations: dict[str, Float[Array, "..."]]
+    vehicle: Vehicle = eqx.field(static=True)
+    terms: Terms = eqx.field(static=True, default_factory=Terms)
+
+    def __check_init__(self):
+        if not isinstance(self.vehicle, Vehicle):
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.shown(self.vehicle)}")
+        if not isinstance(self.terms, Terms):
+            raise ValueError(f"terms must be Terms, got {checks.shown(self.terms)}")
+        if not isinstance(self.deviations, dict):
+            raise ValueError(f"deviations must be a dictionary, got {checks.shown(self.deviations)}")
+        check_names(self.deviations)
+
+    def theta(self) -> dict[str, Float[Array, "..."]]:
+        """The learned parameters in SI units; see `Vehicle` and `Terms`."""
+        nominal, units = nominal_values(self.vehicle, self.terms), _units(self.vehicle)
+
+        def value(name: str, deviation: Array) -> Array:
+            middle = jnp.reshape(jnp.asarray(nominal[name], deviation.dtype), SHAPES[name])
+            return middle * jnp.exp(deviation) if name in POSITIVE else middle + units[name] * deviation
+
+        return {name: value(name, deviation) for name, deviation in self.deviations.items()}
+
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+        return self.of_rows(self.entries(), tuple(x), tuple(u))
+
+    def entries(self) -> dict[str, Rows]:
+        """θ_p number by number."""
+        return {name: tuple(jnp.ravel(value)) for name, value in self.theta().items()}
+
+    def of_rows(self, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+        """ẋ from θ_p, x and u entry by entry, so that nothing is put together to be taken apart again."""
+        known = nominal_values(self.vehicle, self.terms)
+        return _derivative(self.vehicle, {name: theta.get(name, known[name]) for name in SHAPES}, x, u)
+
+
+def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
+    """The multirotor at its nominal values, of which those named in `learn` are learned.
+
+    Raises:
+        ValueError: a name that is not in `SHAPES`, or k beside k_rotors.
+    """
+    check_names(learn)
+    return Multirotor({name: jnp.zeros(SHAPES[name]) for name in learn}, vehicle, Terms() if terms is None else terms)
+
+
+def carried_to(field: Multirotor, vehicle: Vehicle) -> Multirotor:
+    """The field on another vehicle, such as the same one with a payload, with θ_p what it was in SI units.
+
+    The same deviations would not do: they are relative to the vehicle's nominal values, weight and arm.
+    """
+    nominal, units = nominal_values(vehicle, field.terms), _units(vehicle)
+
+    def deviation(name: str, value: Array) -> Array:
+        middle = jnp.reshape(jnp.asarray(nominal[name], value.dtype), SHAPES[name])
+        return jnp.log(value / middle) if name in POSITIVE else (value - middle) / units[name]
+
+    return Multirotor({name: deviation(name, value) for name, value in field.theta().items()}, vehicle, field.terms)
+
+
+def check_names(learn) -> None:
+    """Refuse names of what cannot be learned, or not at once.
+
+    Raises:
+        ValueError: the first such name, and which ones there are.
+    """
+    for name in learn:
+        if name not in tuple(SHAPES):
+            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {checks.shown(name)}")
+    if len(set(learn)) != len(tuple(learn)):
+        raise ValueError(f"learn names something twice: {', '.join(learn)}")
+    if {"k", "k_rotors"} <= set(learn):
+        raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
+
+
+def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
+    """The nominal value of everything in `SHAPES`, number by number; SI units."""
+    ix, iy, iz = ((moment,) for moment in vehicle.inertia)
+    k = vehicle.thrust_coefficient
+    own = {"Ix": ix, "Iy": iy, "Iz": iz, "k": (k,), "k_rotors": (k,) * 4}
+    own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
+    return own | {name: _flat(getattr(terms, name)) for name in SIGNED}
+
+
+def _units(vehicle: Vehicle) -> dict[str, float]:
+    """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
+    weight = vehicle.mass * vehicle.gravity
+    arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / 4
+    return {
+        "torque_gain": 1.0,
+        "centre_of_mass": arm,
+        "drag": weight / SPEED,
+        "aerodynamic_moment": weight * arm / SPEED,
+        "rate_damping": weight * arm / RATE,
+    }
+
+
+def _derivative(vehicle: Vehicle, constants: Constants, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+    q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
+    thrust, torque = _wrench(vehicle, constants, u)
+    gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
+    acceleration = (thrust / vehicle.mass) * rotation.body_z(q) + gravity
+    drag, moment, damping = (constants[name] for name in ("drag", "aerodynamic_moment", "rate_damping"))
+    if _is_present(drag) or _is_present(moment):
+        attitude = _matrix(q)
+        velocity = [_dot(column, v) for column in zip(*attitude, strict=True)]
+        if _is_present(drag):
+            force = [-(coefficient / vehicle.mass) * part for coefficient, part in zip(drag, velocity, strict=True)]
+            acceleration = acceleration + jnp.stack([_dot(row, force) for row in attitude])
+        if _is_present(moment):
+            torque = [part + _dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+    if _is_present(damping):
+        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
+    inertia = tuple(constants[name][0] for name in ("Ix", "Iy", "Iz"))
+    return jnp.concatenate([jnp.stack(v), rotation.derivative(q, omega), acceleration, euler(inertia, torque, omega)])
+
+
+def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
+    """Total thrust [N] and torque [N m] of the rotors about the centre of mass: thrust × arm, and c_m u²."""
+    squares = [speed * speed for speed in u]
+    (k,), of_rotors, gain = constants["k"], constants["k_rotors"], constants["torque_gain"]
+    if isinstance(of_rotors[0], float):
+        loads = squares
+    else:
+        k, loads = 1.0, [one * square for one, square in zip(of_rotors, squares, strict=True)]
+    total = sum(loads[1:], loads[0])
+    x, y = (_dot(arms, loads) for arms in zip(*vehicle.rotor_positions, strict=True))
+    if _is_present(constants["centre_of_mass"]):
+        x, y = (moment - offset * total for moment, offset in zip((x, y), constants["centre_of_mass"], strict=True))
+    torque = [k * y, -k * x, constants["torque_coefficient"][0] * _dot(vehicle.spin, squares)]
+    if _is_present(gain, absent=1.0):
+        torque = [factor * part for factor, part in zip(gain, torque, strict=True)]
+    return k * total, torque
+
+
+def _matrix(q: Rows):
+    """The rows of R, which turns body vectors into world vectors (scaled by |q|², as `rotation.rotate`)."""
+    w, x, y, z = q
+    return (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+
+
+def _dot(a, b) -> Array:
+    return sum(left * right for left, right in zip(a, b, strict=True))  # type: ignore
+
+
+def _is_present(term, absent: float = 0.0) -> bool:
+    """Whether a term is learned, or known and does something."""
+    return any(not isinstance(number, float) or number != absent for number in term)
+
+
+def _flat(value) -> tuple[float, ...]:
+    return tuple(number for row in value for number in (row if isinstance(row, tuple) else (row,)))
+
+
+def _floats(name: str, value, shape: tuple[int, ...]):
+    """Nested tuples of Python's own floats, which can be hashed and written to files."""
+    if not isinstance(value, tuple) or len(value) != shape[0]:
+        raise ValueError(
+            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {checks.shown(value)}"
+        )
+    if shape[1:]:
+        return tuple(_floats(name, row, shape[1:]) for row in value)
+    for number in value:
+        checks.number(name, number)
+    return tuple(map(float, value))
+
+
+@deploy_batch.register
+def _(field: Multirotor, x, u):
+    return field(x, u)
+
+
+@evaluate_batch.register
+def _(field: Multirotor, x, u):
+    return _columns(field, x, u)
+
+
+@jax.custom_vjp
+def _columns(field: Multirotor, x: Float[Array, "13 b"], u: Float[Array, "4 b"]) -> Float[Array, "13 b"]:
+    """The field on a minibatch; x and u alone are kept, and each parameter is summed once, as in rigid_body.py."""
+    return field(x, u)
+
+
+def _columns_forward(field, x, u):
+    return field(x, u), (field, x, u)
+
+
+def _columns_backward(saved, d_derivative: Float[Array, "13 b"]):
+    field, x, u = saved
+    theta, to_deviations = jax.vjp(Multirotor.entries, field)
+    own = jax.tree.map(lambda number: jnp.broadcast_to(number, x.shape[1:]), theta)  # one for each column
+    d_own, d_x, d_u = jax.vjp(partial(Multirotor.of_rows, field), own, tuple(x), tuple(u))[1](d_derivative)
+    leaves, structure = jax.tree.flatten(d_own)
+    if leaves:
+        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype))
+    return *to_deviations(jax.tree.unflatten(structure, leaves)), jnp.stack(d_x), jnp.stack(d_u)
+
+
+_columns.defvjp(_columns_forward, _columns_backward)
