@@ -14,7 +14,7 @@ FLOORS = (
     "vector_field datasets summary",
     "rigid_body residual rollout environment",
     "features multirotor baselines",
-    "loss metrics models claims least_squares vehicle_description",
+    "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation",
     "training expert_augmentation",
     "sweep error_panels report_page flight_figures standings",
