@@ -16,7 +16,7 @@ FLOORS = (
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation",
-    "training expert_augmentation",
+    "training expert_augmentation channels",
     "sweep error_panels report_page flight_figures standings",
     "report comparison_figures ablations",
 )
