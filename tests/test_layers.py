@@ -17,7 +17,7 @@ FLOORS = (
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation",
     "training expert_augmentation channels",
-    "sweep error_panels report_page flight_figures standings",
+    "sweep schedule error_panels report_page flight_figures standings",
     "report comparison_figures ablations",
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
