@@ -1,0 +1,80 @@
+"""What is learned from never judges, and a run in a row is of one flight."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_jax.flights.cleaning import lag_motors
+from hybrid_jax.flights.rotor_lag import choose_time_constant
+from hybrid_jax.flights.splits import contiguous, flight_of, folds, hold_out, manoeuvre_of
+
+NAMES = [f"/logs/{kind}_run{i}.csv.gz" for kind in ("chirp", "square", "random") for i in (1, 2, 3)]
+
+
+@pytest.fixture(scope="module")
+def logs(flight):
+    return [replace(flight[:20], name=name) for name in NAMES]
+
+
+@pytest.mark.parametrize(
+    ("name", "own", "manoeuvre"),
+    [
+        ("/a/b/chirp_run2.csv.gz", "chirp_run2", "chirp"),
+        ("melon-03.csv", "melon-03", "melon"),
+        ("flight_17.csv", "flight_17", "flight_17"),
+        ("17.csv", "17", "17"),
+        ("hover", "hover", "hover"),
+    ],
+)
+def test_names_tell_flights_and_manoeuvres(logs, name, own, manoeuvre):
+    log = replace(logs[0], name=name)
+    assert (flight_of(log), manoeuvre_of(log)) == (own, manoeuvre)
+
+
+@pytest.mark.parametrize("of", [flight_of, manoeuvre_of])
+@pytest.mark.parametrize("count", [None, 2])
+def test_folds_are_disjoint_and_hold_every_flight_out_once(logs, of, count):
+    found = folds(logs, count, of)
+    assert len(found) == (count or len({of(log) for log in logs}))
+    held = [log.name for _, out in found for log in out]
+    assert sorted(held) == sorted(NAMES)
+    for kept, out in found:
+        assert not {of(log) for log in kept} & {of(log) for log in out}
+        assert len(kept) + len(out) == len(logs)
+
+
+def test_a_manoeuvre_is_held_out_whole(logs):
+    kept, out = hold_out(logs, ["random"], manoeuvre_of)
+    assert [flight_of(log) for log in out] == ["random_run1", "random_run2", "random_run3"]
+    assert len(kept) == 6
+
+
+def test_splits_that_cannot_be_are_refused(logs, refusal):
+    refusal(lambda: hold_out(logs, ["melon"], manoeuvre_of), "'melon'", "chirp")
+    refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights to learn from")
+    refusal(lambda: folds(logs, 4, manoeuvre_of), "3 different names")
+    refusal(lambda: contiguous([5, 7], 8, 0), "7 windows")
+
+
+def test_windows_in_a_row_are_of_one_flight_and_any_of_them():
+    begins = set()
+    for seed in range(200):
+        found = contiguous([3, 6, 4], 4, seed)
+        assert (np.diff(found) == 1).all()
+        assert len(found) == 4
+        begins.add(int(found[0]))
+    assert begins == {3, 4, 5, 9}
+
+
+def test_the_time_constant_is_the_candidate_of_least_error(flight):
+    lagging, _ = lag_motors(flight, 0.03)
+
+    def error(logs):
+        return float(np.mean((logs[0].u - lagging.u) ** 2))
+
+    best, errors = choose_time_constant([flight], error, [0.0, 0.01, 0.03, 0.1])
+    assert best == 0.03
+    assert errors[2] == 0 < min(errors[0], errors[3])
+    with pytest.raises(ValueError, match="no candidate"):
+        choose_time_constant([flight], lambda logs: np.nan, [0.01])
