@@ -27,8 +27,8 @@ def flights():
     return jax.tree.map(np.float32, concatenate([windows(read_csv(file), 10) for file in FILES]))
 
 
-# Of the 54 flights that are held out: position [m], velocity [m/s], rotation [rad], body rates [rad/s] after 0.1 s. These
-# here turn less, so of rotation and rates only the order of magnitude is theirs.
+# Published of 54 others: position [m], velocity [m/s], rotation [rad], body rates [rad/s] after 0.1 s. Those here
+# turn less, so of rotation and rates only the order of magnitude is the same.
 HELD_OUT = {"hold": (0.0903, 0.282, 0.145, 1.534), "thrust": (0.0144, 0.0661, 0.0808, 1.534)}
 
 
