@@ -48,13 +48,9 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
 
     a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
     # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle: exact for small ones too.
-    chords = sorted_pair(jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1))
-    return FlightErrors(length(POSITION), length(VELOCITY), 4 * jnp.arctan2(*chords), length(BODY_RATES))
-
-
-def sorted_pair(a: Float[Array, "*n"], b: Float[Array, "*n"]) -> tuple[Float[Array, "*n"], Float[Array, "*n"]]:
-    """The smaller and the larger of each two: q and −q are one rotation."""
-    return jnp.minimum(a, b), jnp.maximum(a, b)
+    chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
+    angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
+    return FlightErrors(length(POSITION), length(VELOCITY), angle, length(BODY_RATES))
 
 
 def flight_errors(

@@ -15,8 +15,9 @@ from jaxtyping import PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.archive import named_leaves
 from hybrid_jax.objective import Learner, Settings
+from hybrid_jax.rigid_body import moves_a_rigid_body
 from hybrid_jax.training import FitState, Plan, make_plan, run, start
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check_attitudes
 from hybrid_jax.vector_field import trainable
 
 
@@ -109,30 +110,34 @@ def fit_in_stages(
     is kept, from the first stage on.
 
     Raises:
-        ValueError: windows that the objective refuses, fewer than a minibatch of them, or shorter ones than a stage
-            asks for; rates of a group that the field has not; or no stages.
+        ValueError: windows that the objective refuses, or of a rigid body without unit quaternions; fewer than a
+            minibatch of them, or shorter ones than a stage asks for; rates of a group that the field has not; or no
+            stages.
     """
     settings = Settings() if settings is None else settings
-    train, validation = (
+    data, judged_on = (
         settings.objective.prepare(windows, name) for windows, name in ((train, "train"), (validation, "validation"))
     )
+    if moves_a_rigid_body(field):
+        check_attitudes(train, "train")
+        check_attitudes(validation, "validation")
     checks.key("key", key)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
-    if len(train) < settings.batch_size:
-        raise ValueError(f"train has {len(train)} windows, fewer than batch_size={settings.batch_size}")
+    if len(data) < settings.batch_size:
+        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
     states = []
     for stage, stage_key in zip(stages, jax.random.split(key, len(stages)), strict=True):
         plan = make_plan(
             rates_by_group(field, stage.rates),
-            jnp.arange(len(train)),
-            len(train),
+            jnp.arange(len(data)),
+            len(data),
             0,
             stage.patience,
             stage.epochs,
             regulariser_weight,
         )
-        states.append(_fit(start(field, stage_key), plan, cut(train, stage.steps), validation, settings))
+        states.append(_fit(start(field, stage_key), plan, cut(data, stage.steps), judged_on, settings))
         field = states[-1].best
     return states
 
