@@ -24,6 +24,8 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.spl
 FLIGHTS_NEEDS = {"state", "vehicle", "trajectories"}
 # No learning, no reporting.
 SIMULATOR_NEEDS = {"state", "rotation", "files", "checks", "vehicle", "trajectories", "datasets"}
+# Any vector field, however it was learned.
+CONTROL_NEEDS = {"state", "rotation", "checks", "vehicle", "vector_field", "rollout"}
 
 
 def imported(path):
@@ -48,6 +50,7 @@ LIBRARY = {name: needs for name, needs in modules("hybrid_jax").items() if not n
 CORE = {name.split(".")[1]: needs for name, needs in LIBRARY.items() if name.count(".") == 1}
 SIM = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.sim.")}
 FLIGHTS = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.flights.")}
+CONTROL = {name: needs for name, needs in LIBRARY.items() if name.startswith("hybrid_jax.control.")}
 
 
 def test_every_module_has_a_floor():
@@ -58,7 +61,7 @@ def test_every_module_has_a_floor():
 def test_imports_point_down(name):
     for needed in CORE[name]:
         assert needed.startswith("hybrid_jax.")
-        assert not needed.startswith(("hybrid_jax.sim", "hybrid_jax.flights"))
+        assert not needed.startswith(("hybrid_jax.sim", "hybrid_jax.flights", "hybrid_jax.control"))
         assert FLOOR[needed.split(".")[1]] < FLOOR[name], f"{name} imports {needed}"
 
 
@@ -76,6 +79,15 @@ def test_logs_are_read_without_learning_and_simulator(name):
     for needed in FLIGHTS[name]:
         assert needed.startswith("hybrid_jax.")
         assert needed.startswith("hybrid_jax.flights") or needed.split(".")[1] in FLIGHTS_NEEDS, (
+            f"{name} imports {needed}"
+        )
+
+
+@pytest.mark.parametrize("name", sorted(CONTROL))
+def test_control_knows_neither_simulator_nor_training(name):
+    for needed in CONTROL[name]:
+        assert needed.startswith("hybrid_jax.")
+        assert needed.startswith("hybrid_jax.control") or needed.split(".")[1] in CONTROL_NEEDS, (
             f"{name} imports {needed}"
         )
 

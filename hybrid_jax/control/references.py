@@ -1,0 +1,118 @@
+"""Paths to follow, sampled as reference states: position, velocity, and the attitude and rates that they ask for.
+
+A path is a function of time [s] to position [m, world] and yaw [rad]. All else follows from it because a multirotor is
+differentially flat (Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011): thrust
+points along a + g, so attitude is known from the acceleration and the yaw, and the rates are its derivative.
+"""
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.control.controller import Controller
+from hybrid_jax.rotation import Quaternion, conjugate, from_axis_angle, multiply
+from hybrid_jax.state import BODY_RATES, State
+
+Scalar = Float[Array, ""]
+Path = Callable[[Scalar], tuple[Float[Array, "3"], Scalar]]
+
+X, Y, Z = jnp.eye(3).tolist()
+
+
+def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
+    """Reference states every period for a flight of so many seconds and the horizon after its last call.
+
+    Raises:
+        ValueError: a duration that is no positive number.
+    """
+    checks.positive("duration", duration, "a positive number of seconds")
+    count = round(duration / controller.period) + controller.steps * controller.stride + 1
+    times = controller.period * jnp.arange(count)
+    return jax.vmap(lambda t: state_on(path, t, controller.vehicle.gravity))(times)
+
+
+def state_on(path: Path, t: Scalar, gravity: float) -> State:
+    """The state at time t of a multirotor that follows the path without drag, its thrust never below the horizon."""
+
+    def moving(t):
+        return jax.jvp(lambda t: path(t)[0], (t,), (jnp.ones_like(t),))
+
+    def attitude(t):
+        acceleration = jax.jvp(lambda t: moving(t)[1], (t,), (jnp.ones_like(t),))[1]
+        return _attitude(acceleration + gravity * jnp.array(Z), path(t)[1])
+
+    (position, velocity), (q, turning) = moving(t), jax.jvp(attitude, (t,), (jnp.ones_like(t),))
+    rates = 2 * multiply(conjugate(q), turning)[1:]  # from q̇ = ½ q ⊗ [0, ω]
+    return jnp.concatenate([position, q, velocity, rates])
+
+
+def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
+    """The attitude of this yaw whose z axis points along thrust: turns about z, then y, then x."""
+    ahead = jnp.cos(yaw) * thrust[0] + jnp.sin(yaw) * thrust[1]
+    left = jnp.cos(yaw) * thrust[1] - jnp.sin(yaw) * thrust[0]
+    pitch = jnp.arctan2(ahead, thrust[2])
+    roll = jnp.arctan2(-left, jnp.hypot(ahead, thrust[2]))
+    turns = [from_axis_angle(jnp.array(axis), angle) for axis, angle in ((Z, yaw), (Y, pitch), (X, roll))]
+    return multiply(multiply(turns[0], turns[1]), turns[2])
+
+
+def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0.0) -> Path:
+    """Stay at a place [m]."""
+    return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
+
+
+def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
+    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, at an even phase; fastest, √2 a φ̇ [m/s], at its centre.
+
+    Raises:
+        ValueError: a speed or a width that is not positive.
+    """
+    checks.positive("top_speed", top_speed)
+    checks.positive("half_width", half_width)
+    turning = top_speed / (math.sqrt(2) * half_width)  # rad/s
+
+    def path(t):
+        phase = turning * t
+        place = jnp.stack([jnp.sin(phase), jnp.sin(2 * phase) / 2, 0 * t])
+        return half_width * place + altitude * jnp.array(Z), yaw + 0 * t
+
+    return path
+
+
+def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, altitude: float = 1.5) -> Path:
+    """Hover over the origin, and from time `at` [s] on further by `to` [m] and turned by yaw [rad], all at once."""
+
+    def path(t):
+        after = jnp.where(t >= at, 1.0, 0.0)
+        return altitude * jnp.array(Z) + after * jnp.array(to), yaw * after
+
+    return path
+
+
+def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: float = 5.0) -> Path:
+    """Ahead along x at this speed [m/s], down to the altitude `low` [m] and up to `high` again, every so many seconds.
+
+    The descent, cos⁴, is flat at the bottom: two fifths of the time are spent in the lowest tenth.
+
+    Raises:
+        ValueError: altitudes that are not 0 < low < high, or a time that is not positive.
+    """
+    checks.positive("low", low)
+    checks.positive("every", every)
+    if not low < high:
+        raise ValueError(f"high must be above low {low}, got {high}")
+
+    def path(t):
+        altitude = low + (high - low) * jnp.cos(jnp.pi * t / every) ** 4
+        return jnp.stack([speed * t, 0 * t, altitude]), 0 * t
+
+    return path
+
+
+def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
+    """The state thrown into a rotation [rad/s, body frame]: a start, from which to recover to hover."""
+    return state.at[BODY_RATES].add(jnp.array(rates))

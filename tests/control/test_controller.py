@@ -1,0 +1,171 @@
+"""Laws of the controller on single calls."""
+
+import dataclasses
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control import Controller, Weights, advance, hover, sample, upset
+from hybrid_jax.control.cost import plan_cost
+from hybrid_jax.rotation import from_axis_angle, normalise
+
+# With equal arms hover needs equal speeds.
+VEHICLE = dataclasses.replace(hj.IRIS, rotor_positions=((0.15, -0.2), (-0.15, 0.2), (0.15, 0.2), (-0.15, -0.2)))
+LOWEST = 100.0  # rad/s
+CONTROLLER = Controller(VEHICLE, min_speed=LOWEST)
+BODY = hj.rigid_body(VEHICLE)
+
+
+@eqx.filter_jit
+def call(model, reference, x, plan, iterations):
+    """One program for any number of iterations, which a controller holds as a plain number otherwise."""
+    return Controller(VEHICLE, min_speed=LOWEST, iterations=iterations)(model, reference, x, plan)
+
+
+def command(x, reference, plan=None, model=BODY, iterations=1):
+    return call(model, reference, x, CONTROLLER.begin() if plan is None else plan, jnp.asarray(iterations))
+
+
+def hybrid(i):
+    return hj.Hybrid(BODY, hj.residual_network(13, 4, jax.random.key(i), hidden=8))
+
+
+@pytest.fixture(scope="module")
+def still():
+    """A state of hover and the reference to stay there."""
+    reference = sample(hover((1.0, -2.0, 3.0)), CONTROLLER, 0.01)
+    return reference[0], CONTROLLER.horizon(reference, 0)
+
+
+def test_hover_is_an_equilibrium(still):
+    """The command is the hover speed, and the shifted plan does not drift off either."""
+    x, reference = still
+    plan = None
+    for _ in range(20):
+        u, plan = command(x, reference, plan)
+        np.testing.assert_allclose(u, VEHICLE.hover_speed, rtol=1e-5)
+        x = advance(BODY, x, u, CONTROLLER.period)
+    np.testing.assert_allclose(x, still[0], rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("model", [BODY, hybrid(0)], ids=["physics", "hybrid"])
+def test_a_start_from_minus_q_gives_the_same_command(model, still):
+    """Even with a network, to which −q is another state, and by the very same numbers."""
+    x, reference = still
+    x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
+    plan = opposite = None
+    for _ in range(3):
+        u, plan = command(x, reference, plan, model)
+        again, opposite = command(x.at[3:7].multiply(-1), reference, opposite, model)
+        np.testing.assert_array_equal(u, again)
+        # The sign of the reference says nothing either; here sums may be rounded otherwise.
+        third, _ = command(x, reference.at[:, 3:7].multiply(-1), plan, model)
+        np.testing.assert_allclose(third, command(x, reference, plan, model)[0], rtol=1e-5)
+
+
+@pytest.mark.parametrize("cosine", [0.0, 1e-7, -1e-7])
+def test_half_a_turn_of_yaw_is_left(still, cosine):
+    x, reference = still
+    x = x.at[3:7].set(jnp.array([cosine, 0.0, 0.0, 1.0]))
+    u, _ = command(x, reference, iterations=6)
+    torque = np.sum(np.array(VEHICLE.spin) * np.asarray(u) ** 2)
+    # More than half of what the rotors can do about z with the thrust of hover, either way.
+    assert abs(torque) > 0.5 * 4 * VEHICLE.hover_speed**2
+
+
+def test_speeds_stay_within_the_limits_and_reach_them(still):
+    x, reference = still
+    plan, found = None, []
+    for away in (30.0, 3000.0, -30.0, -3000.0):
+        _, plan = command(x.at[:3].add(away), reference, plan, iterations=4)
+        found.append(CONTROLLER.speeds(plan))
+    lowest, highest = np.min(found), np.max(found)
+    assert LOWEST <= lowest < LOWEST + 10.0
+    assert VEHICLE.max_rotor_speed - 10.0 < highest <= VEHICLE.max_rotor_speed
+
+
+def test_more_iterations_never_raise_the_cost(still):
+    """From a tumble, a wrong heading and afar, where many a step is no descent."""
+    x, reference = still
+    turned = x.at[3:7].set(from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(2.5)))
+    for start in (upset(x, (5.0, -6.0, 4.0)), turned, x.at[:3].add(3.0)):
+        costs = np.array([command(start, reference, iterations=n)[1].cost for n in range(1, 13)])
+        assert (np.diff(costs) <= 0).all()
+        assert costs[-1] < 0.95 * costs[0]
+
+
+def test_the_cost_of_a_plan_is_that_of_its_rollout_and_has_no_slope_at_the_end(still):
+    """The Jacobians that the controller puts together are those that autodiff finds."""
+    x, reference = still
+    x = x.at[0].add(0.2).at[11].set(1.0)
+    _, plan = command(x, reference, iterations=30)
+
+    @jax.jit
+    @jax.value_and_grad
+    def cost(free):
+        def interval(x, u):
+            x = advance(BODY, x, u, CONTROLLER.interval)
+            return x, x
+
+        speeds = CONTROLLER.speeds(eqx.tree_at(lambda plan: plan.free, plan, free))
+        states = jax.lax.scan(interval, x, speeds)[1]
+        return plan_cost(CONTROLLER.weights, reference, states, jnp.tanh(free))
+
+    value, slope = cost(plan.free)
+    np.testing.assert_allclose(value, plan.cost, rtol=1e-5)
+    begin = np.abs(cost(CONTROLLER.begin().free)[1]).max()
+    assert np.abs(slope).max() < 1e-4 * begin
+
+
+def test_lanes_of_fields_references_and_states_are_single_calls(still):
+    x, reference = still
+    models = [hybrid(i) for i in range(3)]
+    lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
+    starts = x + 0.1 * jax.random.normal(jax.random.key(9), (3, 13))
+    plans = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), CONTROLLER.begin())
+    references = reference + 0.1 * jnp.arange(3.0)[:, None, None] * jnp.eye(13)[0]
+    u, found = eqx.filter_jit(jax.vmap(CONTROLLER))(lanes, references, starts, plans)
+    for i in range(3):
+        alone, plan = command(starts[i], references[i], model=models[i])
+        # The order of sums, in single precision, through an 80 × 80 solve.
+        np.testing.assert_allclose(u[i], alone, rtol=2e-3)
+        np.testing.assert_allclose(found.cost[i], plan.cost, rtol=5e-3)
+
+
+def test_the_quaternion_is_normalised_or_not():
+    long = jnp.zeros(13).at[3].set(1.1)
+    u = jnp.full(4, 600.0)
+    assert np.linalg.norm(advance(BODY, long, u, 0.05)[3:7]) == pytest.approx(1.0, rel=1e-6)
+    assert np.linalg.norm(advance(BODY, long, u, 0.05, unit_quaternion=False)[3:7]) > 1.09
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"steps": 1}, "steps"),
+        ({"iterations": 0}, "iterations"),
+        ({"interval": 0.055}, "interval must be a multiple"),
+        ({"interval": 0.005}, "interval must be a multiple"),
+        ({"damping": 0.0}, "damping"),
+        ({"min_speed": 700.0}, "hover speed"),
+    ],
+)
+def test_what_makes_no_sense_is_refused(wrong, said):
+    with pytest.raises(ValueError, match=said):
+        Controller(hj.IRIS, **wrong)
+
+
+def test_wrong_weights_and_shapes_are_refused(still):
+    x, reference = still
+    with pytest.raises(ValueError, match="yaw"):
+        Weights(yaw=0.0)
+    with pytest.raises(ValueError, match="tilt"):
+        Weights(tilt=-1.0)
+    with pytest.raises(ValueError, match="reference"):
+        CONTROLLER(BODY, reference[:-1], x, CONTROLLER.begin())
+    with pytest.raises(ValueError, match="finite"):
+        CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin())

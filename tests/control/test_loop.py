@@ -1,0 +1,148 @@
+"""Laws of the closed loop, with a rigid body as the plant."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control import (
+    Controller,
+    Disturbed,
+    Flight,
+    advance,
+    figure_eight,
+    fly,
+    hover,
+    low_pass,
+    performance,
+    realised,
+    sample,
+    upset,
+)
+
+CONTROLLER = Controller(hj.IRIS)
+BODY = hj.rigid_body(hj.IRIS)
+WIND = jnp.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0])  # m/s²: the mean of experiment 2's
+
+
+def plant(field):
+    return lambda x, u, t: advance(field, x, u, CONTROLLER.period)
+
+
+def judged(wind, reference, x0, bandwidth):
+    flight = fly(plant(Disturbed(BODY, wind)), BODY, reference, x0, CONTROLLER, bandwidth)
+    return flight, performance(flight, reference, CONTROLLER)
+
+
+alone = jax.jit(judged)
+
+SECONDS = 2.0
+REFERENCES = [sample(path, CONTROLLER, SECONDS) for path in (hover(), figure_eight(3.5), figure_eight(6.0), low_pass())]
+
+
+@pytest.mark.parametrize(("i", "allowed"), [(0, 0.001), (1, 0.001), (2, 0.005), (3, 0.002)])
+def test_the_true_model_keeps_to_its_path(i, allowed):
+    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm low: RK4 of 50 ms plans for a plant of 10 ms."""
+    _, found = alone(jnp.zeros(6), REFERENCES[i], REFERENCES[i][0], 0.0)
+    assert found.position_rmse < allowed
+    assert found.yaw_rmse < 0.002
+    assert not found.crashed
+
+
+def test_an_upset_of_6_rad_per_s_is_recovered_from():
+    reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, SECONDS)
+    flight, found = alone(jnp.zeros(6), reference, upset(reference[0]), 0.0)
+    assert found.largest_error < 0.3
+    assert not found.crashed
+    away = np.abs(flight.x[-1] - reference[0])
+    assert away[:3].max() < 0.02
+    assert away[7:].max() < 0.1
+
+
+def test_the_observer_finds_the_wind_and_takes_its_error_away():
+    reference = REFERENCES[0]
+    _, without = alone(WIND, reference, reference[0], 0.0)
+    flight, found = alone(WIND, reference, reference[0], 10.0)
+    np.testing.assert_allclose(flight.disturbance[-1], WIND, rtol=0, atol=0.01)
+    assert without.position_rmse > 0.1
+    assert found.position_rmse < 0.3 * without.position_rmse
+    assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
+
+
+def test_a_lane_is_the_lone_loop():
+    winds = jnp.stack([0 * WIND, WIND])
+    references = jnp.stack([REFERENCES[0], REFERENCES[1]])[:, : 1 + 100 + 50]
+    bandwidths = jnp.array([0.0, 10.0])
+    lanes, found = jax.jit(jax.vmap(judged))(winds, references, references[:, 0], bandwidths)
+    for i in range(2):
+        flight, single = alone(winds[i], references[i], references[i][0], bandwidths[i])
+        np.testing.assert_allclose(lanes.x[i], flight.x, rtol=0, atol=2e-3)
+        np.testing.assert_allclose(found.position_rmse[i], single.position_rmse, rtol=0, atol=2e-4)
+
+
+def test_a_true_model_keeps_its_promise_and_a_wrong_one_does_not():
+    """What is promised is for steps of 0.05 s, what is realised for the plant's of 0.01 s."""
+    reference = REFERENCES[1]
+
+    @jax.jit
+    def kept(wind):
+        flight = judged(wind, reference, reference[0], 0.0)[0]
+        calls = jnp.arange(50, 200, 25)
+        costs = jax.vmap(lambda i: realised(plant(Disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
+        return costs / flight.plans.cost[calls]
+
+    np.testing.assert_allclose(kept(jnp.zeros(6)), 1.0, rtol=0.01)
+    assert (kept(WIND) > 5.0).all()
+
+
+def still(periods=4):
+    x = jnp.tile(sample(hover(), CONTROLLER, 0.1)[0], (periods + 1, 1))
+    u = jnp.full((periods, 4), hj.IRIS.hover_speed)
+    return Flight(x, u, CONTROLLER.begin(), jnp.zeros((periods, 6)))
+
+
+def test_errors_are_those_of_the_flight():
+    flight, reference = still(), sample(hover(), CONTROLLER, 0.1)
+    flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[2:, 1].add(jnp.array([0.3, 0.0, 0.4])))
+    flight = eqx.tree_at(lambda f: f.u, flight, flight.u.at[0, 0].set(1099.0).at[1, 1].set(1.0))
+    found = performance(flight, reference, CONTROLLER)
+    assert found.position_rmse == pytest.approx(0.25, rel=1e-5)
+    assert found.largest_error == pytest.approx(0.4, rel=1e-5)
+    assert found.saturation == 2 / 16
+    assert found.yaw_rmse == 0
+    assert not found.crashed
+
+
+def test_yaw_is_compared_on_the_circle():
+    flight, reference = still(), sample(hover(yaw=np.pi - 0.1), CONTROLLER, 0.1)
+    ahead = sample(hover(yaw=-np.pi + 0.1), CONTROLLER, 0.1)[0]
+    flight = eqx.tree_at(lambda f: f.x, flight, jnp.tile(ahead, (5, 1)))
+    assert performance(flight, reference, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
+
+
+@pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
+def test_below_ground_far_away_and_no_number_are_crashes(end):
+    flight = still()
+    flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[3, :3].set(jnp.array(end)))
+    assert performance(flight, sample(hover(), CONTROLLER, 0.1), CONTROLLER).crashed
+
+
+def test_what_makes_no_sense_is_refused():
+    reference = REFERENCES[0]
+    for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
+        with pytest.raises(ValueError, match="reference"):
+            fly(plant(BODY), BODY, samples, x0, CONTROLLER)
+
+
+def test_the_example_of_the_package_flies(capsys):
+    import hybrid_jax.control as package
+
+    lines = package.__doc__.split("\n\n")
+    example = "\n\n".join(block for block in lines if block.startswith("    "))
+    code = "\n".join(line[4:] for line in example.splitlines())
+    assert len([line for line in code.splitlines() if line.strip()]) <= 20
+    exec(compile(code, "example", "exec"), {})
+    away = float(capsys.readouterr().out.split()[3])
+    assert away < 0.01

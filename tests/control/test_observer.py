@@ -1,0 +1,66 @@
+"""Laws of the disturbance observer."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control import Disturbed, advance, observer
+from hybrid_jax.residual import InputScaling
+
+DT = 0.01
+TRUE = jnp.array([0.0, -4 / 1.5, 0.5, 0.3, -0.2, 0.1])
+BODY = hj.rigid_body(hj.IRIS)
+START = jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
+
+
+def watch(field, plant, bandwidth, periods=100, sign=1.0):
+    """The estimates over a flight of the plant under wild speeds, all seen through quaternions of this sign."""
+    speeds = hj.IRIS.hover_speed + 20 * jax.random.normal(jax.random.key(0), (periods, 4))
+
+    def tick(carry, u):
+        x, estimate = carry
+        seen = x.at[3:7].multiply(sign)
+        estimate = observer.correct(estimate, seen, bandwidth, DT)
+        estimate = observer.predict(estimate, field, seen, u, DT)
+        return (advance(plant, x, u, DT), estimate), estimate.disturbance
+
+    return np.asarray(jax.lax.scan(tick, (START, observer.begin(START)), speeds)[1])
+
+
+@pytest.fixture(scope="module")
+def fields():
+    speeds = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
+    network = hj.residual_network(13, 4, jax.random.key(0), hidden=8, scaling=speeds)
+    return {"physics": BODY, "hybrid": hj.Hybrid(BODY, network), "network": network}
+
+
+@pytest.mark.parametrize("name", ["physics", "hybrid", "network"])
+def test_a_constant_disturbance_is_found_at_the_stated_bandwidth(fields, name):
+    """Of a first-order filter: 1 − exp(−β t) of it by time t, whatever the field."""
+    found = watch(fields[name], Disturbed(fields[name], TRUE), 5.0)
+    share = -np.expm1(-5.0 * DT * np.arange(100))[:, None]
+    # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
+    np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2)
+
+
+def test_without_bandwidth_there_is_no_observer(fields):
+    np.testing.assert_array_equal(watch(BODY, Disturbed(BODY, TRUE), 0.0), 0.0)
+
+
+def test_an_exact_model_has_no_disturbance():
+    np.testing.assert_allclose(watch(BODY, BODY, 5.0), 0.0, atol=1e-3)
+
+
+def test_the_sign_of_the_quaternion_is_nothing_to_it(fields):
+    hybrid = fields["hybrid"]
+    disturbed = Disturbed(hybrid, TRUE)
+    np.testing.assert_array_equal(watch(hybrid, disturbed, 5.0), watch(hybrid, disturbed, 5.0, sign=-1.0))
+
+
+def test_a_disturbed_field_adds_to_the_accelerations():
+    u = jnp.full(4, 600.0)
+    np.testing.assert_allclose(
+        Disturbed(BODY, TRUE)(START, u) - BODY(START, u), np.concatenate([np.zeros(7), TRUE]), atol=1e-5
+    )
