@@ -3,13 +3,15 @@
 Imports point down; simulator and learning meet in `experiments` only. From the bottom:
 
 - state, rotation, vehicle, trajectories: what flies, and its windows.
-- vector_field, rigid_body, residual, features: ẋ = f(x, u).
-- rollout, loss, metrics, objective, training: one training run as a pure function.
+- vector_field, rigid_body, multirotor, baselines, residual, features: ẋ = f(x, u).
+- rollout, loss, metrics, channels, objective, training, schedule: one training run as a pure function.
 - least_squares, uncertainty, linear_adaptation, expert_augmentation: other ways to adapt, and how sure θ_p is.
-- lanes, sweep: every seed, size and rate a lane of one compiled program, on all devices.
+- hosts, lanes, sweep: every seed, size and rate a lane of one compiled program, on all devices of all hosts.
 - models, datasets, archive, files: what is kept.
 - rows, summary, claims, report, standings, ablations and the figures: what is told.
 - sim: the MuJoCo MJX quadrotor, its forces and its pilot.
+- flights: recorded flights, read, checked and cleaned.
+- control: closed-loop flight with any field: controller, references, disturbance observer.
 """
 
 from hybrid_jax.models import Model, load, save
