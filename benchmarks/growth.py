@@ -1,13 +1,13 @@
 """How do time and memory grow with seeds, with windows, with the horizon and with the width of the network?
 
 Seeds: one epoch of so many lanes, each of 100 windows, on all devices. Windows: one epoch of one lane over so many
-windows, which are copied to the devices in this time too. Horizon and width: one gradient step on 100 windows. All are
-hybrids as in the protocol. The slope is that of log time against log number between the two largest: 1 means that
-twice as much takes twice as long. Memory is what a program asks for beside its arguments, from its compilation; for
-lanes and windows, what they hold themselves.
+windows, which are copied to the devices in this time too. Horizon and width: one gradient step on 100 windows. The
+slope is that of log time against log number between the two largest: 1 means that twice as much takes twice as long.
+Memory is what a program asks for beside its arguments, from its compilation; for lanes and windows, what they hold
+themselves.
 
-smoke: two small numbers each. full: 1 to 1000 seeds, 1e3 to 1e6 windows, 10 to 1000 steps, 16 to 1024 hidden units, in
-some five minutes.
+smoke: the network alone, two small numbers each. full: the hybrid, 1 to 1000 seeds, 1e3 to 1e6 windows, 10 to 1000
+steps, 16 to 1024 hidden units, in some five minutes.
 """
 
 import math
@@ -26,6 +26,7 @@ from rich.table import Table
 from benchmarks.subjects import make_windows, protocol
 from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run
 from experiments.conditions import pretraining, settings
+from experiments.protocol import Model
 from hybrid_jax import training
 from hybrid_jax.lanes import LaneMap, lane
 from hybrid_jax.residual import residual_network
@@ -47,6 +48,7 @@ class Preset:
         budget: seconds after which a call is repeated no more, beyond the third time.
     """
 
+    model: Model
     seeds: tuple[int, ...]
     windows: tuple[int, ...]
     steps: tuple[int, ...]
@@ -57,14 +59,20 @@ class Preset:
 
 PRESETS = {
     "full": Preset(
-        (1, 10, 100, 1000), (1_000, 10_000, 100_000, 1_000_000), (10, 30, 100, 300, 1000), (16, 64, 256, 1024), 10, 10.0
+        "hybrid",
+        (1, 10, 100, 1000),
+        (1_000, 10_000, 100_000, 1_000_000),
+        (10, 30, 100, 300, 1000),
+        (16, 64, 256, 1024),
+        10,
+        10.0,
     ),
-    "smoke": Preset((1, 2), (100, 200), (2, 4), (4, 8), turns=2, budget=1.0),
+    "smoke": Preset("no_physics", (1, 2), (100, 200), (2, 4), (4, 8), turns=2, budget=1.0),
 }
 Case = tuple[Call, int]  # what is timed, and the bytes that it needs
 
 
-def epoch_of(seeds: int, windows: int) -> Case:
+def epoch_of(model: Model, seeds: int, windows: int) -> Case:
     """One epoch of so many lanes over so many windows each, as `hybrid_jax.sweep` runs it."""
     config = protocol(seeds, windows)
     chosen = settings(config)
@@ -73,7 +81,7 @@ def epoch_of(seeds: int, windows: int) -> Case:
         state, plan = lane
         return training.run(state, plan, train, validation, chosen, state.epoch + 1)
 
-    mapped, lanes = LaneMap(epoch), pretraining("hybrid", IRIS, config)
+    mapped, lanes = LaneMap(epoch), pretraining(model, IRIS, config)
     shared = many_windows(windows), many_windows(VALIDATION)
     return lambda: mapped(lanes, shared, [1.0] * seeds, range(seeds)), bytes_of((lanes, shared))
 
@@ -84,12 +92,13 @@ def many_windows(count: int) -> Trajectories:
     return flown[np.arange(count) % len(flown)]
 
 
-def step_of(steps: int, hidden: int) -> Case:
-    """One gradient step on windows of so many intervals, of a hybrid with so many hidden units."""
+def step_of(model: Model, steps: int, hidden: int) -> Case:
+    """One gradient step on windows of so many intervals, of a model with so many hidden units."""
     config = protocol(1, BATCH)
-    state, plan = (lane(stacked, 0) for stacked in pretraining("hybrid", IRIS, config))
-    wide = residual_network(13, 4, jax.random.key(0), hidden=hidden, scaling=state.field.residual.scaling)
-    start = training.start(Hybrid(state.field.physics, wide), jax.random.key(1))
+    state, plan = (lane(stacked, 0) for stacked in pretraining(model, IRIS, config))
+    network = state.field.residual if model == "hybrid" else state.field
+    wide = residual_network(13, 4, jax.random.key(0), hidden=hidden, scaling=network.scaling)
+    start = training.start(Hybrid(state.field.physics, wide) if model == "hybrid" else wide, jax.random.key(1))
     arguments = start.field, start.adam, plan, make_windows(BATCH, steps)
     call, _, needed = compiled_with_memory(partial(gradient_step, settings=settings(config)), *arguments)
     return call, needed
@@ -100,11 +109,11 @@ def bytes_of(tree) -> int:
     return sum(leaf.nbytes for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf))
 
 
-AXES: dict[str, tuple[str, Callable[[int], Case]]] = {
-    "seeds": ("one epoch of 100 windows a seed", lambda seeds: epoch_of(seeds, BATCH)),
-    "windows": ("one epoch of one seed", lambda windows: epoch_of(1, windows)),
-    "steps": ("one gradient step on 100 windows", lambda steps: step_of(steps, 64)),
-    "hidden": ("one gradient step on 100 windows of 10 steps", lambda hidden: step_of(10, hidden)),
+AXES: dict[str, tuple[str, Callable[[Model, int], Case]]] = {
+    "seeds": ("one epoch of 100 windows a seed", lambda model, seeds: epoch_of(model, seeds, BATCH)),
+    "windows": ("one epoch of one seed", lambda model, windows: epoch_of(model, 1, windows)),
+    "steps": ("one gradient step on 100 windows", lambda model, steps: step_of(model, steps, 64)),
+    "hidden": ("one gradient step on 100 windows of 10 steps", lambda model, hidden: step_of(model, 10, hidden)),
 }
 LABELS = {"seeds": "seeds", "windows": "windows", "steps": "steps of horizon", "hidden": "hidden units"}
 
@@ -114,7 +123,7 @@ def measure_axis(axis: str, preset: Preset) -> list[dict[str, Any]]:
     work, make = AXES[axis]
     rows: list[dict[str, Any]] = []
     for number in getattr(preset, axis):
-        call, needed = make(number)
+        call, needed = make(preset.model, number)
         seconds = repeated(call, preset.turns, preset.budget)
         rows.append({"axis": axis, "work": work, "number": number, "seconds": seconds, "bytes": needed})
         rows[-1]["slope"] = slope(rows[-2], rows[-1]) if len(rows) > 1 else None

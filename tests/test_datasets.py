@@ -1,5 +1,6 @@
 """Laws of dataset files."""
 
+import errno
 import json
 import os
 import time
@@ -162,7 +163,7 @@ def test_an_interrupted_write_leaves_the_old_file_and_no_litter(file, dataset, m
     before = file.read_bytes()
 
     def full_disk(_):
-        raise OSError("no space left")
+        raise OSError(errno.ENOSPC, "no space left")
 
     monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="no space"):

@@ -15,7 +15,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "4"))
+KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "2"))
 EPOCHS = "400"
 SMALL = [
     "--preset", "smoke", "--models", "hybrid", "--saving", "1", "--max-epochs", EPOCHS,
