@@ -8,13 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.loss import Minibatch
+from hybrid_jax.metrics import mean_over
 from hybrid_jax.objective import Prediction, Settings
 from hybrid_jax.rollout import rollout_batch, rollout_minibatch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -22,7 +22,6 @@ from hybrid_jax.trajectories import Trajectories, check
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 
 MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
-CHUNK = 1000  # windows that are predicted at a time in validation
 
 
 @dataclass(frozen=True)
@@ -83,16 +82,11 @@ class ChannelPrediction:
         return Prediction().observe(field, batch, seen)
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: Settings) -> Float[Array, ""]:
-        def total(part: Trajectories) -> Float[Array, ""]:
-            predicted = rollout_batch(field, part.x0, part.u, part.dt, settings.solver)
-            return jnp.sum(self.error(predicted - jnp.asarray(part.x)))
+        def errors(windows: Trajectories) -> Float[Array, " n"]:
+            predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, settings.solver)
+            return jnp.mean(self.error(predicted - jnp.asarray(windows.x)), axis=-1)
 
-        whole = len(data) // CHUNK * CHUNK
-        chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, CHUNK, *leaf.shape[1:]), data)
-        rest = jax.tree.map(lambda leaf: leaf[whole:], data)
-        value = jnp.sum(jax.lax.map(total, chunks)) if whole else jnp.zeros(())
-        value = value + total(rest) if len(rest) else value
-        return value / (len(data) * data.horizon)
+        return mean_over(data, errors)
 
     def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
         """The sum over channels of what one error counts."""

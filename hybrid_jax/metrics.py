@@ -1,5 +1,7 @@
 """How well a model predicts: L_MSE on windows, and ρ, what fine-tuning gained (paper, Sec. 3.3 and Eq. 9)."""
 
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,8 @@ from hybrid_jax import checks
 from hybrid_jax.rollout import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check
 from hybrid_jax.vector_field import AbstractVectorField
+
+CHUNK = 1000  # windows that are predicted at a time
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
@@ -23,7 +27,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 
 
 def deployed_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = 1000
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
     """L_MSE of a field as deployed, mean over windows, compared with the truth at every `every`-th interval's end.
 
@@ -43,6 +47,13 @@ def deployed_mse(
         predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
+    return mean_over(windows, errors, chunk)
+
+
+def mean_over(
+    windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
+) -> Float[Array, ""]:
+    """The mean of one number for each window, made for `chunk` of them at a time."""
     whole = len(windows) // chunk * chunk
     chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, chunk, *leaf.shape[1:]), windows)
     rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
