@@ -19,6 +19,8 @@ def configure(cache: Path) -> None:
         raise ValueError(f"--cache {cache}: cannot be written: {error.strerror}") from error
     jax.config.update("jax_num_cpu_devices", cores())
     jax.config.update("jax_compilation_cache_dir", str(programs))
+    # XLA's own caches would put their folder into the key of every program, and none would be found in a moved cache.
+    jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
