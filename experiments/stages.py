@@ -79,10 +79,10 @@ class Stages:
         return states
 
     def timed(self, name: str, work: Callable[[], Result]) -> Result:
-        """The result of work(), its seconds noted under a name."""
+        """The result of work(), its seconds added to those under a name: two domains may have a stage of one name."""
         began = time.perf_counter()
         result = work()
-        self.seconds[name] = time.perf_counter() - began
+        self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
         return result
 
     def notes(self) -> list[str]:
