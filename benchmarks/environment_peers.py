@@ -20,7 +20,6 @@ os.environ["SCIPY_ARRAY_API"] = "1"  # crazyflow asks for it, before anything im
 
 import contextlib
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -45,18 +44,9 @@ REMEDY = "pip install crazyflow==0.4.0, in an environment whose jax is not 0.10.
 AGREEMENT = 1e-8
 
 
-@dataclass(frozen=True)
-class Preset:
-    """Batch sizes, steps of each flight, and turns."""
-
-    batches: tuple[int, ...]
-    steps: int
-    turns: int
-
-
 PRESETS = {
-    "smoke": Preset((8,), steps=10, turns=2),
-    "full": Preset((64, 1000), steps=100, turns=10),
+    "smoke": environment.Preset((8,), steps=10, turns=2),
+    "full": environment.Preset((64, 1000), steps=100, turns=10),
 }
 
 
@@ -91,7 +81,7 @@ def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
     return compiled(fly, data.replace(states=states), commands)
 
 
-def measure_batch(batch: int, preset: Preset) -> dict[str, Any]:
+def measure_batch(batch: int, preset: environment.Preset) -> dict[str, Any]:
     """Agreement, compile seconds and steps per second for one batch size."""
     x0, u = make_flights(batch, preset.steps)
     programs: dict[str, tuple[Callable, float]] = {
@@ -139,7 +129,7 @@ def ratios_of(row: dict[str, Any]) -> list[Ratio]:
     return [Ratio(f"{task}: {comparisons[rival]}", value) for rival, value in row["rival_over_ours"].items()]
 
 
-def measure(preset: Preset) -> Findings:
+def measure(preset: environment.Preset) -> Findings:
     """Every batch size; the ratios are those of the last."""
     with jax.enable_x64(True):
         rows = [measure_batch(batch, preset) for batch in preset.batches]
