@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Int, PyTree
+from jaxtyping import Float, Int, PyTree
 
 from hybrid_jax import hosts
 
@@ -60,6 +60,16 @@ def deal(costs: Numbers, active: Numbers, devices: int, width: int, most: int) -
     return [np.array(hand, int) for hand in hands]
 
 
+def slack(hands: Sequence[np.ndarray], costs: Numbers, width: int) -> Float[np.ndarray, " n"]:
+    """For each lane that is dealt, the busiest device's work over its own device's; for the others 0."""
+    # A chunk takes as long as its dearest lane, which is its first.
+    loads = [sum(float(costs[i]) for i in hand[::width]) for hand in hands]
+    ratios = np.zeros(len(costs))
+    for hand, load in zip(hands, loads, strict=True):
+        ratios[hand] = max(loads) / load if len(hand) else 0.0
+    return ratios
+
+
 class LaneMap:
     """`function(lane, *shared) -> lane's result`, compiled once for all lanes, chunks and devices.
 
@@ -86,16 +96,25 @@ class LaneMap:
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
-        total, width = count(lanes), self._width(lanes, shared)
-        most = self._most(total, width)
-        hands = deal(costs, active, len(self.devices), width, most)
-        capacity = most * width
+        width = self._width(lanes, shared)
+        hands, capacity = self._dealt(count(lanes), width, costs, active)
         places = np.stack([np.resize(np.concatenate([hand, [0]]), capacity) for hand in hands])
         chunks = np.array([-(-len(hand) // width) for hand in hands])
         own = [d for d, device in enumerate(self.devices) if device.process_index == jax.process_index()]
         results = self._launch(width, lane(lanes, places[own].ravel()), chunks[own], shared)
         where = {i: capacity * d + j for d, hand in enumerate(hands) for j, i in enumerate(hand)}
         return lane(results, np.array([where[i] for i in active], int))
+
+    def slack(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> Float[np.ndarray, " n"]:
+        """For each active lane, how often its device could do all its work while the busiest does its own once."""
+        width = self._width(lanes, shared)
+        hands, _ = self._dealt(count(lanes), width, costs, active)
+        return slack(hands, costs, width)[np.asarray(active, int)]
+
+    def _dealt(self, total: int, width: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int]:
+        """What each device runs, and how many lanes it has room for."""
+        most = self._most(total, width)
+        return deal(costs, active, len(self.devices), width, most), most * width
 
     def _most(self, total: int, width: int) -> int:
         """Chunks that a device has room for: twice the even share, enough to balance costs, and all if it is alone."""

@@ -12,7 +12,7 @@ from functools import lru_cache
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hybrid_jax import hosts, training
 from hybrid_jax.lanes import LaneMap, count
@@ -76,21 +76,29 @@ def sweep(
         ValueError: bad data, or a plan that asks for more windows than `train` has or for less than a minibatch.
     """
     states, plans = jax.device_get((states, plans))
-    train = settings.objective.prepare(train, "train")
-    validation = settings.objective.prepare(validation, "validation")
-    _check(plans, train, settings)
-    shared = (train, validation)
-    block = _block(settings, width, _shapes((states, plans), shared))
-    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
-    block((states, plans), (*shared, np.int32(0)), costs, range(len(costs)))  # compiles, trains nothing
+    block, shared, costs = _ready(states, plans, train, validation, settings, width)
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == training.RUNNING)):
         start = time.perf_counter()
-        states = _merge(states, active, block((states, plans), (*shared, np.int32(more)), costs, active))
+        # A device with less to do than the busiest trains its lanes longer, so that none of them waits.
+        epochs = np.zeros(len(costs), np.int32)
+        epochs[active] = more * block.slack((states, plans, epochs), shared, costs, active)
+        states = _merge(states, active, block((states, plans, epochs), shared, costs, active))
         if on_block is not None:
             on_block(states, _progress(states, plans, time.perf_counter() - began))
         more = hosts.agreed(int(np.clip(more * block_seconds / (time.perf_counter() - start), 1, 4 * more)))
     return states
+
+
+def compile_sweep(
+    states: FitState, plans: Plan, train: Trajectories, validation: Trajectories, settings: Settings
+) -> None:
+    """Compile what `sweep` of arguments of these shapes would; on another thread, say, while data are being made.
+
+    Raises:
+        ValueError: as `sweep`.
+    """
+    _ready(*jax.device_get((states, plans)), train, validation, settings, None)
 
 
 def evaluate(
@@ -102,6 +110,25 @@ def evaluate(
     return errors(jax.device_get(fields), (windows,), np.ones(lanes), range(lanes))
 
 
+def compile_evaluation(fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings) -> None:
+    """Compile what `evaluate` of arguments of these shapes would."""
+    errors = _evaluation(settings, every, _shapes(fields, windows))
+    errors(jax.device_get(fields), (windows,), np.ones(count(fields)), ())
+
+
+def _ready(states, plans, train, validation, settings: Settings, width: int | None):
+    """The compiled block of a sweep, the data that all lanes share, and what an epoch of each lane costs."""
+    train = settings.objective.prepare(train, "train")
+    validation = settings.objective.prepare(validation, "validation")
+    _check(plans, train, settings)
+    shared = (train, validation)
+    block = _block(settings, width, _shapes((states, plans), shared))
+    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
+    none = np.zeros(len(costs), np.int32)
+    block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
+    return block, shared, costs
+
+
 def _shapes(*trees: PyTree) -> tuple:
     """What a program is compiled for."""
     leaves = [leaf for leaf in jax.tree.leaves(trees) if eqx.is_array(leaf)]
@@ -111,9 +138,9 @@ def _shapes(*trees: PyTree) -> tuple:
 # A sweep of the same shapes, later in the same process, compiles nothing; one map a shape, so that old programs go.
 @lru_cache(PROGRAMS)
 def _block(settings: Settings, width: int | None, shapes: tuple) -> LaneMap:
-    def block(lane: tuple[FitState, Plan], train, validation, more) -> FitState:
-        state, plan = lane
-        return training.run(state, plan, train, validation, settings, state.epoch + more)
+    def block(lane: tuple[FitState, Plan, Int[Array, ""]], train, validation) -> FitState:
+        state, plan, epochs = lane
+        return training.run(state, plan, train, validation, settings, state.epoch + epochs)
 
     return LaneMap(block, width)
 

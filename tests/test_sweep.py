@@ -14,7 +14,7 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax import training
-from hybrid_jax.lanes import LaneMap, count, deal, lane, stack
+from hybrid_jax.lanes import LaneMap, count, deal, lane, slack, stack
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
 from hybrid_jax.sweep import evaluate, sweep
@@ -230,6 +230,18 @@ def test_no_device_is_dealt_more_chunks_than_it_has_room_for():
     assert [len(hand) for hand in deal(costs, range(10), 2, 1, 10)] == [1, 9]
     assert [len(hand) for hand in deal(costs, range(10), 2, 1, 6)] == [4, 6]
     assert [len(hand) for hand in deal(costs, range(10), 2, 2, 3)] == [4, 6]
+
+
+@pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5), (4, 30)])
+def test_a_device_with_less_to_do_is_given_as_much_more(devices, width):
+    rng = np.random.default_rng(1)
+    costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
+    hands = deal(costs, active, devices, width, 40)
+    times = slack(hands, costs, width)
+    busy = [sum(costs[i] * times[i] for i in hand[::width]) for hand in hands if len(hand)]
+    assert busy == pytest.approx([max(busy)] * len(busy))
+    assert times[active].min() == 1
+    assert not np.delete(times, active).any()
 
 
 def test_a_chunk_is_halved_until_its_program_fits_into_memory():
