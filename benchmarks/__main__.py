@@ -15,7 +15,7 @@ from benchmarks.timing import Ratio, ratio_table
 from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.files import json_text, read_json, write_whole
 
-Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "growth"]
+Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth"]
 PEERS = "training_peers", "environment_peers"
 
 

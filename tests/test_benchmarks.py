@@ -84,6 +84,17 @@ def test_widths_of_chunks_train_alike(tmp_path):
     assert choice["best_width"] in (1, 2)
 
 
+def test_weak_scaling_is_measured_in_processes_of_their_own(tmp_path):
+    report, printed = smoke("scaling", tmp_path)
+    assert "weak scaling" in printed
+    for row in report["rows"]:
+        assert row["lanes"] == row["processes"] * row["devices"]
+        assert min(row["seconds"].values()) >= 0
+        assert row["seconds"]["epoch"] > 0
+    # Every place with more than one device's lanes is held against the first.
+    assert len(report["ratios"]) == sum(row["lanes"] > 1 for row in report["rows"])
+
+
 def test_growth_is_measured_along_every_axis_and_drawn(tmp_path):
     report, printed = smoke("growth", tmp_path)
     rows = {axis: [row for row in report["rows"] if row["axis"] == axis] for axis in growth.AXES}

@@ -1,0 +1,193 @@
+"""Weak scaling: as many lanes for each device, on more devices and in more processes. Does an epoch take as long?
+
+A sweep of hybrids, as an experiment runs it, in processes of its own: one device held to one core, one device that may
+use what it likes, all cores as devices of one process, and as many processes of one device, which have to tell each
+other of every block. What is timed are epochs between two blocks, exchanges and the host's loop included; imports,
+joining and compiling are apart. All places take turns; after the first turn programs are found in a cache.
+"""
+
+import json
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from rich.table import Table
+
+from benchmarks.timing import Findings, Ratio, run
+from hybrid_jax.runtime import configure, cores
+
+REACH = 1.8 / 2  # of each further device: what a second core is to add
+
+
+APART = "imports", "joining", "first_block", "compiled_first_block"
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where lanes run: processes, devices of each, and whether a process is held to one core."""
+
+    processes: int
+    devices: int
+    held: bool = False
+
+    def __str__(self) -> str:
+        return f"{self.processes} × {self.devices}{', held to one core' if self.held else ''}"
+
+
+@dataclass(frozen=True)
+class Preset:
+    """Lanes for each device, training windows of each, epochs that are timed, at the least, and turns."""
+
+    lanes: int
+    windows: int
+    epochs: int
+    turns: int
+
+
+PRESETS = {
+    "full": Preset(lanes=4, windows=1000, epochs=60, turns=5),
+    "smoke": Preset(lanes=1, windows=100, epochs=4, turns=1),
+}
+
+# Runs in each process, its part as JSON in the one argument; process 0 prints what it saw.
+PROCESS = "import sys; from benchmarks.scaling import take_part; take_part(sys.argv[1])"
+
+
+def take_part(order: str) -> None:
+    """Be one of the processes of a place: train, and as process 0 print the seconds as JSON."""
+    began = time.perf_counter()
+    part = json.loads(order)
+    place, preset = Place(**part["place"]), Preset(**part["preset"])
+    if place.held:
+        os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
+    import jax
+
+    from hybrid_jax import hosts
+
+    configure(Path(part["cache"]))
+    jax.config.update("jax_num_cpu_devices", place.devices)
+    imported = time.perf_counter()
+    if place.processes > 1:
+        hosts.join(part["address"], place.processes, part["process"])
+    joined = time.perf_counter()
+    seconds, first = timed_epochs(place, preset)
+    if hosts.first():
+        apart = {"imports": imported - began, "joining": joined - imported, "first_block": first}
+        print(json.dumps({"epoch": seconds, **apart}))
+
+
+def timed_epochs(place: Place, preset: Preset) -> tuple[float, float]:
+    """The seconds of an epoch of all lanes, and until the first block was there."""
+    from dataclasses import replace
+
+    from benchmarks.subjects import make_windows, protocol
+    from experiments.conditions import pretraining, settings
+    from hybrid_jax.sweep import sweep
+    from hybrid_jax.vehicle import IRIS
+
+    lanes = preset.lanes * place.processes * place.devices
+    config = replace(protocol(lanes, preset.windows), max_epochs=5 + 2 * preset.epochs)
+    marks: list[tuple[int, float]] = []
+    began = time.perf_counter()
+
+    def mark(states, progress) -> None:
+        marks.append((progress.epochs, time.perf_counter()))
+
+    states, plans = pretraining("hybrid", IRIS, config)
+    windows = make_windows(preset.windows, 10)
+    sweep(states, plans, windows, windows, settings(config), on_block=mark, block_seconds=1.0)
+    (first, start), (last, end) = marks[0], marks[-1]
+    return (end - start) / (last - first), start - began
+
+
+def seconds_at(place: Place, preset: Preset, cache: str) -> dict[str, float]:
+    """What process 0 of a place saw.
+
+    Raises:
+        RuntimeError: a process failed.
+    """
+    shared = {"place": asdict(place), "preset": asdict(preset), "address": free_address(), "cache": cache}
+    orders = [json.dumps(shared | {"process": i}) for i in range(place.processes)]
+    started = [
+        subprocess.Popen(
+            [sys.executable, "-c", PROCESS, order], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+        )
+        for order in orders
+    ]
+    outputs = [process.communicate() for process in started]
+    for process, (_, error) in zip(started, outputs, strict=True):
+        if process.returncode:
+            raise RuntimeError(f"{place}: {error[-500:]}")
+    return json.loads(outputs[0][0].splitlines()[-1])
+
+
+def free_address() -> str:
+    """Where process 0 can be met."""
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def places() -> list[Place]:
+    """Those that this machine has cores for; only Linux can hold a process to one."""
+    held = [Place(1, 1, held=True)] if hasattr(os, "sched_setaffinity") else []
+    many = [Place(1, cores()), Place(cores(), 1)] if cores() > 1 else []
+    return [*held, Place(1, 1), *many]
+
+
+def row_of(place: Place, seen: Sequence[dict[str, float]], preset: Preset) -> dict[str, Any]:
+    """What is reported of a place."""
+    medians = {name: statistics.median(one[name] for one in seen) for name in seen[0]}
+    medians["compiled_first_block"] = seen[0]["first_block"]  # the others find its programs
+    lanes = preset.lanes * place.processes * place.devices
+    return {"place": str(place), **asdict(place), "lanes": lanes, "windows": preset.windows, "seconds": medians}
+
+
+def table_of(rows: list[dict[str, Any]]) -> Table:
+    """The places for reading."""
+    heads = (
+        "processes × devices",
+        "lanes",
+        "epoch of all [ms]",
+        "imports [s]",
+        "joining [s]",
+        "first block [s]",
+        "compiled [s]",
+    )
+    table = Table(*heads, title="weak scaling")
+    for row in rows:
+        seconds = row["seconds"]
+        apart = (f"{seconds[name]:.1f}" for name in APART)
+        table.add_row(row["place"], str(row["lanes"]), f"{1e3 * seconds['epoch']:.1f}", *apart)
+    return table
+
+
+def ratio_of(row: dict[str, Any], alone: dict[str, Any]) -> Ratio:
+    """How many times the lanes of one device a place trains in the same time."""
+    more = row["lanes"] / alone["lanes"]
+    value = more * alone["seconds"]["epoch"] / row["seconds"]["epoch"]
+    return Ratio(f"lanes of {row['place']} over those of {alone['place']}", value, at_least=REACH * more)
+
+
+def measure(preset: Preset) -> Findings:
+    """Every place, in turns."""
+    seen: dict[Place, list[dict[str, float]]] = {place: [] for place in places()}
+    with TemporaryDirectory() as cache:
+        for _ in range(preset.turns):
+            for place, found in seen.items():
+                found.append(seconds_at(place, preset, cache))
+    rows = [row_of(place, found, preset) for place, found in seen.items()]
+    ratios = [ratio_of(row, rows[0]) for row in rows if row["lanes"] > rows[0]["lanes"]]
+    return Findings(rows, [table_of(rows)], ratios)
+
+
+if __name__ == "__main__":
+    run("scaling", __doc__, PRESETS, measure)
