@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
+from jaxtyping import Array, Int, PRNGKeyArray
 
 from experiments.protocol import Config, Encoding, Stopping, column
 from hybrid_jax import training
@@ -33,12 +33,17 @@ def settings(config: Config) -> Settings:
 def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
     """The untrained models of all seeds, stacked. A seed gives the hybrid and its rivals the same parts."""
 
+    return jax.device_get(_fresh_fields(model, vehicle, config, np.arange(config.seeds)))
+
+
+@eqx.filter_jit
+def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[Array, " n"]) -> AbstractVectorField:
     def build(seed):
         physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
         network = _network(vehicle, config, _key(seed, NETWORK))
         return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
 
-    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(np.arange(config.seeds)))
+    return eqx.filter_vmap(build)(seeds)
 
 
 def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, Plan]:
@@ -130,11 +135,13 @@ def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.nd
 
 
 def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> FitState:
-    def begin(field, seed):
-        return training.start(field, _key(seed, purpose))
-
     assert count(fields) == len(seeds)
-    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(begin))(fields, seeds))
+    return jax.device_get(_begun(fields, seeds, purpose))
+
+
+@eqx.filter_jit
+def _begun(fields: AbstractVectorField, seeds: Int[Array, " n"], purpose: int) -> FitState:
+    return eqx.filter_vmap(lambda field, seed: training.start(field, _key(seed, purpose)))(fields, seeds)
 
 
 def _key(seed, purpose: int) -> PRNGKeyArray:

@@ -56,7 +56,7 @@ class Stages:
             OSError: the state cannot be saved.
         """
         identity = _identity(states, plans, settings, data)
-        finished = self._folder / f"{name.replace(' ', '-')}-{identity[:16]}.npz"
+        finished = self._folder / f"{_stem(name)}-{identity[:16]}.npz"
         begun = finished.with_suffix(".begun")
         if self._fresh and hosts.first():
             self._make_way(finished, begun)
@@ -84,6 +84,10 @@ class Stages:
         result = work()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
         return result
+
+    def knows(self, name: str) -> bool:
+        """Whether a sweep of this name, in whatever configuration, was begun or finished before."""
+        return any(self._folder.glob(f"{_stem(name)}-*"))
 
     def notes(self) -> list[str]:
         """What a reader of the seconds must know."""
@@ -182,6 +186,10 @@ class _Keeper:
         self._cost = time.perf_counter() - began
         self.saving += self._cost
         self._unsaved = None
+
+
+def _stem(name: str) -> str:
+    return name.replace(" ", "-")
 
 
 def summary(states: FitState) -> str:

@@ -2,11 +2,13 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 
+from experiments.ahead import Ahead, blank
 from experiments.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.make_flights import chosen_flights, flights
 from experiments.protocol import AdaptationConfig, Config
@@ -19,7 +21,7 @@ from hybrid_jax.datasets import ARRAYS, Dataset
 from hybrid_jax.rows import Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
-from hybrid_jax.sweep import evaluate
+from hybrid_jax.sweep import compile_evaluation, compile_sweep, evaluate
 from hybrid_jax.training import FitState
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
@@ -53,11 +55,14 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             return measured(from_first(lambda: chosen_flights(file, of, splits)), config.noise, config.data_seed)
         return flown(of, splits, config, stages)
 
-    source = get(config.source_flights, SOURCE, source_splits(config))
-    target = get(config.target_flights, domain, target_splits(config))
     lanes: list[Lanes] = []
-    for model in config.models:
-        lanes += _model_lanes(model, vehicle, config, stages, source, target)
+    unseen = [model for model in config.models if not stages.knows(f"pre-training {model}")]
+    with Ahead({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
+        source = get(config.source_flights, SOURCE, source_splits(config))
+        target = get(config.target_flights, domain, target_splits(config))
+        for model in config.models:
+            programs.wait_for(model)
+            lanes += _model_lanes(model, vehicle, config, stages, source, target)
     rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
 
@@ -116,6 +121,19 @@ def _model_lanes(
         for mode, start in starts.items()
     }
     return [_tested(model, mode, finals[mode], config, stages, target) for mode in TESTED]
+
+
+def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
+    """Compile all that `_model_lanes` will run: of windows and models, a program knows the shapes alone."""
+    shared, fresh = settings(config), fresh_fields(model, vehicle, config)
+    source, target = (
+        {name: blank(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
+    )
+    pretrained = pretraining(model, vehicle, config)
+    adapted = adaptation(model, "target_only", fresh, config)
+    for (states, plans), windows in ((pretrained, source), (adapted, target)):
+        compile_sweep(states, plans, windows["train"], windows["validation"], shared)
+        compile_evaluation(states.best, target["test"], EVERY, shared)
 
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
