@@ -4,6 +4,7 @@ The calls that are compared take turns, so that a busy moment of the machine hit
 median. A ratio of two calls is the median of the ratios within each turn. Set the cores with taskset.
 """
 
+import os
 import statistics
 import sys
 import time
@@ -25,7 +26,7 @@ from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.environment import environment
 from hybrid_jax.figures import save_figure
 from hybrid_jax.files import json_text, write_whole
-from hybrid_jax.runtime import configure, cores
+from hybrid_jax.runtime import PROGRAMS, configure, cores
 
 Call = Callable[[], Any]
 DISAGREEMENT = 1  # exit code
@@ -154,6 +155,7 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
         _end(name, error, BAD_INPUT)
     began = time.perf_counter()
     # An empty cache, so that every compilation that is timed is one.
+    os.environ.pop(PROGRAMS, None)
     with TemporaryDirectory() as cache:
         configure(Path(cache))
         try:

@@ -5,18 +5,23 @@ from pathlib import Path
 
 import jax
 
+PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
+
 
 def configure(cache: Path) -> None:
     """Set both up; call it before the first array is made, because JAX's devices are fixed by then.
 
+    Programs are kept in the cache folder, or where JAX's own variable JAX_COMPILATION_CACHE_DIR says.
+
     Raises:
-        ValueError: the cache folder cannot be made.
+        ValueError: the folder cannot be made.
     """
-    programs = cache / "programs"
+    programs = Path(os.environ.get(PROGRAMS) or cache / "programs")
     try:
         programs.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise ValueError(f"--cache {cache}: cannot be written: {error.strerror}") from error
+        where = f"{PROGRAMS} {programs}" if os.environ.get(PROGRAMS) else f"--cache {cache}"
+        raise ValueError(f"{where}: cannot be written: {error.strerror}") from error
     jax.config.update("jax_num_cpu_devices", cores())
     jax.config.update("jax_compilation_cache_dir", str(programs))
     # XLA's own caches would put their folder into the key of every program, and none would be found in a moved cache.
