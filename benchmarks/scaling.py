@@ -53,7 +53,7 @@ class Preset:
 
 
 PRESETS = {
-    "full": Preset(lanes=4, windows=1000, epochs=60, turns=5),
+    "full": Preset(lanes=4, windows=1000, epochs=20, turns=10),
     "smoke": Preset(lanes=1, windows=100, epochs=4, turns=1),
 }
 

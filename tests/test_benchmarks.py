@@ -12,7 +12,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from benchmarks import compilation, environment, growth, rollout, sweep, timing, training_step
+from benchmarks import (
+    compilation,
+    environment,
+    growth,
+    rollout,
+    scaling,
+    sweep,
+    timing,
+    training_peers,
+    training_step,
+)
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
 
@@ -168,4 +178,5 @@ def test_operations_are_counted_in_loops_and_calls():
 
 
 def test_the_preset_that_is_reported_times_each_call_ten_times():
-    assert all(module.PRESETS["full"].turns >= 10 for module in (environment, growth, rollout, sweep, training_step))
+    measured = environment, growth, rollout, scaling, sweep, training_peers, training_step
+    assert all(module.PRESETS["full"].turns >= 10 for module in measured)
