@@ -4,9 +4,9 @@ import os
 import shutil
 import tempfile
 
-# Read by JAX when it is imported, which no test file has done yet.
-SHARED = {
-    "JAX_COMPILATION_CACHE_DIR": None,
+# All are read when JAX is imported, which must not happen here; the others are as `runtime.configure` sets them.
+PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
+KEEP_ALL = {
     "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES": "none",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
@@ -14,8 +14,8 @@ SHARED = {
 
 
 def pytest_configure(config):
-    if hasattr(config, "workerinput") or "JAX_COMPILATION_CACHE_DIR" in os.environ:
-        return  # a worker has its parent's environment
-    folder = tempfile.mkdtemp(prefix="hybrid_jax_programs_")
-    os.environ |= {name: value or folder for name, value in SHARED.items()}
-    config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    if PROGRAMS not in os.environ:
+        folder = os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="hybrid_jax_programs_")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
+    for name, value in KEEP_ALL.items():
+        os.environ.setdefault(name, value)
