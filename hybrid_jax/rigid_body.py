@@ -22,7 +22,7 @@ class AbstractRigidBody(AbstractVectorField):
 
     @abstractmethod
     def theta(self) -> dict[str, Array]:
-        """The learned parameters in SI units, by name."""
+        """The learned parameters in SI units, by name; each entry grows with the parameter that holds it."""
 
 
 class RigidBody(AbstractRigidBody):

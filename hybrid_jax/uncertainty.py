@@ -8,26 +8,32 @@ H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996,
   clusters Liang and Zeger 1986; the factor is MacKinnon and White's HC1, 1985).
 - homoscedastic: σ² H⁻¹, right only if every entry of every r_i is white noise of one variance.
 
+A loss that counts errors otherwise, such as channels.py's, takes its slope and curvature at each error into M and H:
+M-estimation, of which the sandwich holds as it stands (Huber 1967).
+
 **Both are conditional on θ_d**: the network of a hybrid is taken as given, as if it had not been learned from the same
 windows, so they are too small by what θ_d may trade with θ_p. Neither contains bias: what the model cannot express
 (drag that it does not know) moves θ̂_p by an amount that no interval shows; `experiments/coverage.py` measures both.
 """
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.least_squares import check_windows, parametrise, physics_of, residual
-from hybrid_jax.rigid_body import RigidBody
+from hybrid_jax.rigid_body import AbstractRigidBody
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 
 Kind = Literal["sandwich", "homoscedastic"]
+Counted = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 
 class Interval(NamedTuple):
@@ -44,6 +50,7 @@ def physics_covariance(
     kind: Kind = "sandwich",
     solver: diffrax.AbstractSolver | None = None,
     chunk: int = 250,
+    error: Counted | None = None,
 ) -> Float[Array, "p p"]:
     """The covariance of θ_p at a field fitted to the windows, given θ_d, in the physics' own parametrisation.
 
@@ -51,11 +58,14 @@ def physics_covariance(
     and maps over stacked fields. It is not finite where the windows do not tell the parameters apart.
 
     Args:
-        field: at, or near, the minimum of L_MSE over θ_p.
+        field: at, or near, the minimum over θ_p of L_MSE, or of what `error` makes of it.
         chunk: windows that are held in memory at a time.
+        error: what an error x − x̂ (d,) counts in the loss that was minimised, such as `ChannelPrediction.error`; its
+            square by default.
 
     Raises:
-        ValueError: no more windows than parameters, an unknown kind, or windows that are malformed.
+        ValueError: no more windows than parameters, an unknown kind, another error than the square where all are to be
+            white, or windows that are malformed.
     """
     check_windows(field, windows)
     checks.count("chunk", chunk)
@@ -64,21 +74,27 @@ def physics_covariance(
         raise ValueError(f"windows: {n} are too few for a covariance of {p} parameters, at least {p + 1} are needed")
     if kind not in Kind.__args__:
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
-    return _physics_covariance(field, windows, kind, solver, chunk)
+    if error is not None and kind == "homoscedastic":
+        raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
+    return _physics_covariance(field, windows, kind, solver, chunk, error)
 
 
 @eqx.filter_jit
-def _physics_covariance(field, windows: Trajectories, kind: Kind, solver, chunk: int) -> Float[Array, "p p"]:
+def _physics_covariance(
+    field, windows: Trajectories, kind: Kind, solver, chunk: int, error: Counted | None
+) -> Float[Array, "p p"]:
     theta, rebuild = parametrise(field)
     n, p = len(windows), theta.size
 
     def one(window: Trajectories):
-        def error(theta):
-            r = residual(rebuild(theta), window, solver).ravel()
+        def missed(theta):
+            r = residual(rebuild(theta), window, solver)
             return r, r
 
-        jacobian, r = jax.jacfwd(error, has_aux=True)(theta)
-        return jacobian.T @ jacobian, jacobian.T @ r, r @ r
+        jacobian, r = jax.jacfwd(missed, has_aux=True)(theta)
+        bent, slope = (jacobian, r) if error is None else _counted(error, jacobian, r)
+        effect, r = jacobian.reshape(-1, p), r.ravel()
+        return effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r
 
     gram, score, square = jax.lax.map(one, windows, batch_size=min(chunk, n))
     bread = _inverse(jnp.sum(gram, axis=0))
@@ -86,6 +102,14 @@ def _physics_covariance(field, windows: Trajectories, kind: Kind, solver, chunk:
         return jnp.sum(square) / (n * windows.x[0].size - p) * bread
     half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
     return n / (n - p) * half.T @ half
+
+
+def _counted(
+    error: Counted, jacobian: Float[Array, "t d p"], r: Float[Array, "t d"]
+) -> tuple[Float[Array, "t d p"], Float[Array, "t d"]]:
+    """(C J, slope) with slope and curvature C of what each error counts: J and r themselves, doubled, of the square."""
+    curvature = jax.vmap(jax.hessian(error))(r)
+    return jnp.einsum("tde,tep->tdp", curvature, jacobian), jax.vmap(jax.grad(error))(r)
 
 
 def standard_errors(field: AbstractVectorField, covariance: Float[Array, "p p"]) -> AbstractVectorField:
@@ -96,31 +120,47 @@ def standard_errors(field: AbstractVectorField, covariance: Float[Array, "p p"])
             windows do not tell the parameters apart, or has a negative variance.
     """
     theta, rebuild = parametrise(physics_of(field))
-    variances = jnp.diagonal(_square(covariance, theta.size))
-    if not checks.is_traced(variances) and (variances < 0).any():
-        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    return rebuild(jnp.sqrt(variances))
+    return rebuild(_deviations(covariance, theta.size))
 
 
 def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
-    """θ_p of a rigid body in SI units, as `RigidBody.theta`, each with an interval.
+    """θ_p of a field with named parameters in SI units, as its `theta`, each with an interval.
 
-    θ_p is held as a logarithm, whose error is taken as normal: the interval is value · exp(±z s).
+    By entry: k_rotors[0] … k_rotors[3], aerodynamic_moment[0,0] …. The error is taken as normal where the parameter is
+    held, so the interval is value · exp(±z s) of what is held as a logarithm and value ± z s of the rest.
 
     Raises:
-        ValueError: a level that is not between 0 and 1, or physics that is no `RigidBody`; as `standard_errors`.
+        ValueError: a level that is not between 0 and 1, or physics that is neither `RigidBody` nor `Multirotor` nor
+            another `AbstractRigidBody`; as `standard_errors`.
     """
     if not 0 < (checks.real(level) or 0) < 1:
         raise ValueError(f"level must be between 0 and 1, got {checks.shown(level)}")
-    errors = standard_errors(field, covariance)
-    if not isinstance(errors, RigidBody):
-        raise ValueError(f"field: its physics must be a RigidBody, got {type(errors).__name__}; see standard_errors")
-    z = jax.scipy.special.ndtri((1 + level) / 2)
+    physics = physics_of(field)
+    if not isinstance(physics, AbstractRigidBody):
+        name = type(physics).__name__
+        raise ValueError(f"field: its physics must be a RigidBody or Multirotor, got {name}; see standard_errors")
+    theta, rebuild = parametrise(physics)
+    away = jax.scipy.special.ndtri((1 + level) / 2) * _deviations(covariance, theta.size)
+    values = _entries(physics)
+    low, high = (_entries(rebuild(end)) for end in (theta - away, theta + away))
+    return {name: Interval(value, low[name], high[name]) for name, value in values.items()}
 
-    def interval(value, error) -> Interval:
-        return Interval(value, value * jnp.exp(-z * error), value * jnp.exp(z * error))
 
-    return {name: interval(value, errors.log_ratios[name]) for name, value in _theta(field).items()}
+def _entries(physics) -> dict[str, Float[Array, ""]]:
+    """θ_p number by number."""
+
+    def named(name: str, place: tuple[int, ...]) -> str:
+        return f"{name}[{','.join(map(str, place))}]" if place else name
+
+    theta = physics.theta()
+    return {named(name, at): value[at] for name, value in theta.items() for at in np.ndindex(value.shape)}
+
+
+def _deviations(covariance: Float[Array, "p p"], p: int) -> Float[Array, " p"]:
+    variances = jnp.diagonal(_square(covariance, p))
+    if not checks.is_traced(variances) and (variances < 0).any():
+        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
+    return jnp.sqrt(variances)
 
 
 def _square(covariance: Float[Array, "p p"], p: int) -> Float[Array, "p p"]:
@@ -128,12 +168,6 @@ def _square(covariance: Float[Array, "p p"], p: int) -> Float[Array, "p p"]:
     if array.shape != (p, p):
         raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
     return checks.floating("covariance", array)
-
-
-def _theta(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
-    physics = physics_of(field)
-    assert isinstance(physics, RigidBody)
-    return physics.theta()
 
 
 def _inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:

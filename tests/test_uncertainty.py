@@ -111,7 +111,7 @@ def test_what_makes_no_sense_is_refused():
     for level in (0.0, 1.0, 95, float("nan")):
         with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
             intervals(rigid_body(IRIS), COVARIANCE, level)
-    with pytest.raises(ValueError, match="must be a RigidBody, got Pendulum"):
+    with pytest.raises(ValueError, match="must be a RigidBody or Multirotor, got Pendulum"):
         intervals(pendulum(), jnp.ones((1, 1)))
 
 
