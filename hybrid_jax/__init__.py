@@ -12,6 +12,7 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 - sim: the MuJoCo MJX quadrotor, its forces and its pilot.
 - flights: recorded flights, read, checked and cleaned.
 - control: closed-loop flight with any field: controller, references, disturbance observer.
+- export: any field and its steps as StableHLO in a file and as CasADi functions.
 """
 
 from hybrid_jax.models import Model, load, save

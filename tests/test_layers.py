@@ -26,6 +26,7 @@ NEEDS = {
     "sim": {"state", "rotation", "files", "checks", "vehicle", "trajectories", "datasets"},
     "flights": {"state", "vehicle", "trajectories"},
     "control": {"state", "rotation", "checks", "vehicle", "vector_field", "rollout"},  # any field, however learned
+    "export": {"state", "checks", "archive", "vector_field", "rollout"},  # likewise
 }
 
 

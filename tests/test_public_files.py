@@ -24,6 +24,8 @@ import hybrid_jax as hj
 from hybrid_jax.archive import named_leaves, save_archive
 from hybrid_jax.datasets import FORMAT as DATASET
 from hybrid_jax.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.export import Program, export_field, load_program
+from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
 from hybrid_jax.models import FORMAT as MODEL
 from hybrid_jax.models import portable
 
@@ -117,16 +119,20 @@ def files(folder):
     """Loader → the bytes of a sound file."""
     hj.save(folder / "model.npz", MIXED, {"n": 1})
     save_dataset(folder / "set.npz", Dataset({"train": WINDOWS}, {"config": {"seed": 1}}))
-    return {hj.load: (folder / "model.npz").read_bytes(), load_dataset: (folder / "set.npz").read_bytes()}
+    export_field(folder / "program.npz", MIXED, state_size=2, input_size=1)
+    names = {hj.load: "model", load_dataset: "set", load_program: "program"}
+    return {load: (folder / f"{name}.npz").read_bytes() for load, name in names.items()}
 
 
 def content(found):
+    if isinstance(found, Program):
+        return np.asarray(found(np.ones(2), np.ones(1)))
     return named_leaves(found.field if isinstance(found, hj.Model) else dict(found.splits))
 
 
 @cases(0.05)
 @given(
-    load=st.sampled_from([hj.load, load_dataset]),
+    load=st.sampled_from([hj.load, load_dataset, load_program]),
     damage=st.lists(st.tuples(st.floats(0, 1), st.integers(0, 40), st.binary(max_size=40)), min_size=1, max_size=3),
 )
 def test_a_damaged_file_is_refused_by_its_name_or_gives_what_was_saved(folder, files, load, damage):
@@ -167,7 +173,7 @@ FORGED = st.recursive(
 )
 def test_a_forged_file_is_refused_or_gives_what_refuses_to_fly(folder, header, array):
     path, arrays = folder / "forged.npz", {"a": array} if isinstance(array, np.ndarray) else {}
-    for form, load in ((MODEL, hj.load), (DATASET, load_dataset)):
+    for form, load in ((MODEL, hj.load), (DATASET, load_dataset), (PROGRAM, load_program)):
         path.unlink(missing_ok=True)
         outcome(save_archive, path, form, header, arrays)
         if not path.exists():
@@ -223,10 +229,10 @@ HOSTILE = {
 }
 
 
-@pytest.mark.parametrize("load", [hj.load, load_dataset])
+@pytest.mark.parametrize("load", [hj.load, load_dataset, load_program])
 @pytest.mark.parametrize("name", HOSTILE)
 def test_a_hostile_file_is_refused_and_nothing_of_it_is_run_or_written(name, load, tmp_path):
-    form = {hj.load: MODEL, load_dataset: DATASET}[load]
+    form = {hj.load: MODEL, load_dataset: DATASET, load_program: PROGRAM}[load]
     path = tmp_path / "inside" / "hostile.npz"
     path.parent.mkdir()
     with zipfile.ZipFile(path, "w") as archive:

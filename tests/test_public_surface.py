@@ -17,7 +17,9 @@ from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
 
 import hybrid_jax as hj
 from hybrid_jax import linear_adaptation, metrics, uncertainty
+from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
 from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.multirotor import multirotor
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import fly
@@ -30,6 +32,7 @@ BODY, SWING = hj.rigid_body(hj.IRIS), pendulum()
 NETWORK = hj.residual_network(2, 1, KEY, hidden=4)
 MIXED = hj.Hybrid(SWING, NETWORK)
 WINDOWS = jax.tree.map(np.asarray, swings(12, steps=3))
+DRAGGED = multirotor(hj.IRIS, ("drag",))
 COVARIANCE = np.diag([1e-4, 4e-4, 9e-4])
 
 
@@ -157,7 +160,7 @@ def test_what_is_made_of_windows_is_finite_or_refused(found, number, name):
 
 
 @cases(0.04)
-@given(spoiled(COVARIANCE), odd(0.95, 0.5), st.sampled_from([BODY, hj.Hybrid(BODY, BODY), SWING]))
+@given(spoiled(COVARIANCE), odd(0.95, 0.5), st.sampled_from([BODY, hj.Hybrid(BODY, BODY), DRAGGED, SWING]))
 def test_intervals_are_finite_or_refused(covariance, level, field):
     found = outcome(uncertainty.intervals, field, covariance, level)
     assert found is None or all(is_finite(interval) or interval.high == np.inf for interval in found.values())
@@ -232,3 +235,55 @@ def test_the_simulator_refuses_states_that_cannot_fly(flight, dt, chunk, name):
     _, _, u = flight
     x0 = SPOILED["nan" if name in ("f8", "f2", "1e+25", "-100000.0", "i4", "u1") else name](np.zeros((2, 13)), 3)
     assert outcome(SOURCE.quadrotor().rollouts, x0, u, jnp.zeros(2), dt, chunk) is None
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("programs")
+
+
+@pytest.fixture(scope="module")
+def programs(folder):
+    """Whether it is of a batch → a program of a step."""
+    for batched in (False, True):
+        export_step(folder / f"{batched}.npz", SWING, 0.05, state_size=2, input_size=1, batched=batched)
+    return {batched: load_program(folder / f"{batched}.npz") for batched in (False, True)}
+
+
+@cases(0.1)
+@given(st.booleans(), st.sampled_from([(), (3,)]), st.data())
+def test_a_program_answers_with_what_is_finite_or_refuses(programs, batched, shape, data):
+    x, u = (
+        data.draw(spoiled(part[..., 0, :] if part.ndim > len(shape) + 1 else part)) for part in states("swing", shape)
+    )
+    found = outcome(programs[batched], x, u)
+    assert found is None or is_finite(found) or max(np.abs(x).max(), np.abs(u).max()) > 1e4
+
+
+SIZES = {"state_size": odd(2), "input_size": odd(1)}
+
+
+@cases(0.04)
+@given(
+    st.fixed_dictionaries(
+        SIZES, optional={"platforms": st.sampled_from([("cpu",), ("cuda",), "cpu", (), ("cpu", 1), (["cpu"],), None])}
+    ),
+    odd(0.05),
+    st.sampled_from([SWING, BODY, None, "field"]),
+)
+def test_a_program_is_written_whole_or_refused(folder, options, dt, field):
+    for export in (export_field, lambda path, field, **options: export_step(path, field, dt, **options)):
+        path = folder / "written.npz"
+        path.unlink(missing_ok=True)
+        outcome(export, path, field, **options)
+        if path.exists():
+            assert load_program(path).state_size == options["state_size"]
+
+
+@cases(0.04)
+@given(
+    st.fixed_dictionaries(SIZES, optional={"name": odd("f")}), odd(0.05), st.sampled_from([SWING, BODY, None, "field"])
+)
+def test_a_casadi_function_is_made_or_refused(options, dt, field):
+    for made in (outcome(casadi_function, field, **options), outcome(casadi_step, field, dt, **options)):
+        assert made is None or is_finite(np.asarray(made(np.ones(2), np.ones(1))))

@@ -1,0 +1,96 @@
+"""A trained model for programs that know nothing of this library: StableHLO in files, CasADi functions; docs/export.md.
+
+python -m experiments.export --help
+"""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import tyro
+
+from experiments.command import BAD_INPUT, check_folder
+from hybrid_jax import Model, load
+from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+
+NAME = "export"
+
+
+@dataclass(frozen=True)
+class Config:
+    """Write the field ẋ = f(x, u) of a model, and a step x⁺ = F(x, u) of it, for programs outside this library.
+
+    field.npz and step.npz: StableHLO, which hybrid_jax.export.load_program reads, or JAX alone. With --casadi also
+    field.casadi and step.casadi, which casadi.Function.load reads.
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """A file that an experiment wrote into its folder `models`, or hybrid_jax.save."""
+    out: Path = Path("runs/export")
+    """Folder for the files."""
+    dt: float | None = None
+    """Length of a step [s]; by default what the model says of the flights that it was trained on."""
+    batched: bool = False
+    """The programs take x (b, 13) and u (b, 4), for any b, in the place of x (13,) and u (4,)."""
+    platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
+    """Where the programs are to run."""
+    casadi: bool = False
+    """Write CasADi functions as well."""
+    state_size: int = STATE_SIZE
+    """Numbers in x, of a model of something else than a multirotor."""
+    input_size: int = INPUT_SIZE
+    """Numbers in u, likewise."""
+
+
+def export(config: Config) -> list[Path]:
+    """Write the files; their paths.
+
+    Raises:
+        ValueError: no model, or one that cannot be exported; says why.
+        ImportError: what the extras `export` and `casadi` bring is not installed.
+        OSError: the folder cannot be written.
+    """
+    model = load(config.model)
+    dt = step_length(config, model)
+    check_folder("--out", config.out)
+    sizes: dict[str, Any] = {"state_size": config.state_size, "input_size": config.input_size}
+    options = sizes | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
+    written = [config.out / "field.npz", config.out / "step.npz"]
+    export_field(written[0], model.field, **options)
+    export_step(written[1], model.field, dt, **options)
+    if config.casadi:
+        functions = casadi_function(model.field, **sizes), casadi_step(model.field, dt, **sizes)
+        for path, function in zip([path.with_suffix(".casadi") for path in written], functions, strict=True):
+            function.save(str(path))
+            written.append(path)
+    return written
+
+
+def step_length(config: Config, model: Model) -> float:
+    """What was asked for, or what the model says.
+
+    Raises:
+        ValueError: neither is there.
+    """
+    dt = model.about.get("dt") if config.dt is None else config.dt
+    if dt is None:
+        raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
+    return dt
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line. Bad input ends in one line on stderr and exit code 2."""
+    config = tyro.cli(Config, prog=f"python -m experiments.{NAME}", description=Config.__doc__, args=arguments)
+    try:
+        for path in export(config):
+            print(path)
+    except (ValueError, OSError, ImportError) as error:
+        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,289 @@
+"""JAX's programs in CasADi's symbols, operation by operation.
+
+A value is an array of numbers as long as it is known. One that depends on the symbols is a column of all its entries,
+in JAX's order (the last axis runs fastest), and its shape.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import reduce
+from typing import Any, NamedTuple
+
+import casadi as ca
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, JaxprEqn, Literal
+
+
+class Entries(NamedTuple):
+    """A value that depends on the symbols."""
+
+    column: "Column"
+    shape: tuple[int, ...]
+
+
+Value = np.ndarray | Entries
+Column = ca.SX | ca.DM
+
+
+def evaluate(program: ClosedJaxpr, symbols: Sequence[ca.SX]) -> ca.SX:
+    """The result of a program of vectors to one vector, as a dense column.
+
+    Raises:
+        ValueError: an operation that has no counterpart.
+    """
+    (result,) = _run(program.jaxpr, program.consts, [Entries(one, (one.numel(),)) for one in symbols])
+    return ca.densify(ca.SX(_column(result)))
+
+
+def _run(program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Value]) -> list[Value]:
+    values: dict[Any, Value] = dict(zip(program.constvars, map(np.asarray, constants), strict=True))
+    values.update(zip(program.invars, arguments, strict=True))
+
+    def read(atom) -> Value:
+        return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
+
+    for equation in program.eqns:
+        results = _results(equation, [read(atom) for atom in equation.invars])
+        values.update(zip(equation.outvars, results, strict=True))
+    return [read(atom) for atom in program.outvars]
+
+
+def _results(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    name, shape = equation.primitive.name, tuple(equation.outvars[0].aval.shape)  # type: ignore
+    if name in CALLS:
+        return _call(equation, inputs)
+    if not any(isinstance(value, Entries) for value in inputs):
+        return _known(equation, inputs)
+    if name in ENTRYWISE:
+        return [Entries(ENTRYWISE[name](equation, *(_spread(value, shape) for value in inputs)), shape)]
+    if name in MOVES:
+        return _moved(equation, inputs)
+    if name in LINEAR:
+        return [Entries(_linear(equation, inputs), shape)]
+    if name in FOLDS:
+        return [Entries(_folded(inputs[0], equation.params["axes"], FOLDS[name]), shape)]
+    if name == "dot_general":
+        return [Entries(_product(inputs[0], inputs[1], equation.params["dimension_numbers"]), shape)]
+    raise _refusal(equation)
+
+
+def _known(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
+    """The results of an operation on numbers, by JAX."""
+    found = equation.primitive.bind(*map(jnp.asarray, inputs), **equation.params)
+    return [np.asarray(one) for one in (found if equation.primitive.multiple_results else [found])]
+
+
+def _refusal(equation: JaxprEqn, why: str = "") -> ValueError:
+    return ValueError(f"field: its operation {equation.primitive.name!r}{why} has no counterpart in CasADi")
+
+
+def _call(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    inner = equation.params["jaxpr" if "jaxpr" in equation.params else "call_jaxpr"]
+    if isinstance(inner, ClosedJaxpr):
+        return _run(inner.jaxpr, inner.consts, inputs)
+    return _run(inner, (), inputs)
+
+
+def _column(value: Value) -> Column:
+    return value.column if isinstance(value, Entries) else ca.DM(np.asarray(value, float).reshape(-1, 1))
+
+
+def _taken(column: Column, places: np.ndarray) -> Column:
+    """The entries at these places, one after the other, as a column."""
+    return column[places.ravel().tolist(), 0]
+
+
+def _shape(value: Value) -> tuple[int, ...]:
+    return tuple(value.shape)
+
+
+def _places(value: Value) -> np.ndarray:
+    """Where in its column each entry of a value stands, in the value's shape."""
+    return np.arange(int(np.prod(_shape(value)))).reshape(_shape(value))
+
+
+def _spread(value: Value, shape: tuple[int, ...]) -> Column:
+    """The column with entries repeated along axes of length 1, as in NumPy; one alone goes with any shape as it is."""
+    column = _column(value)
+    if _shape(value) == shape or column.numel() == 1:
+        return column
+    return _taken(column, np.broadcast_to(_places(value), shape))
+
+
+def _moved(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+    """What only puts entries elsewhere: JAX does it to their places, and the entries follow."""
+    columns, sent, count = [], list(inputs), 0
+    for i in MOVES[equation.primitive.name](len(inputs)):
+        places = _places(inputs[i])
+        columns.append(_column(inputs[i]))
+        sent[i] = (count + places).astype(float)  # of the type of the entries, which JAX looks at
+        count += places.size
+    if any(isinstance(value, Entries) for value in sent):
+        raise _refusal(equation, " at a place that depends on x or u")
+    column = ca.vertcat(*columns)
+
+    def entries(places: np.ndarray) -> Value:
+        if not np.isfinite(places).all():
+            raise _refusal(equation, " beyond the end of an array")
+        return Entries(_taken(column, places.astype(int)), places.shape)
+
+    return [entries(places) for places in _known(equation, sent)]
+
+
+def _linear(equation: JaxprEqn, inputs: list[Value]) -> Column:
+    """What is linear in its data, each as a matrix times its column."""
+    data = LINEAR[equation.primitive.name]
+    if any(isinstance(value, Entries) for i, value in enumerate(inputs) if i not in data):
+        raise _refusal(equation, " at a place that depends on x or u")
+    zeros = [jnp.zeros(_shape(value)) if i in data else jnp.asarray(value) for i, value in enumerate(inputs)]
+
+    def part(i: int) -> Column:
+        def of_one(entries):
+            return equation.primitive.bind(*zeros[:i], entries, *zeros[i + 1 :], **equation.params).ravel()
+
+        matrix = jax.jacfwd(of_one)(zeros[i]).reshape(-1, zeros[i].size)
+        return ca.mtimes(ca.sparsify(ca.DM(np.asarray(matrix))), _column(inputs[i]))
+
+    return reduce(lambda a, b: a + b, map(part, data))
+
+
+def _folded(value: Value, axes: Sequence[int], fold: Callable) -> Column:
+    places = np.moveaxis(_places(value), axes, range(len(axes)))
+    rows = places.reshape(int(np.prod(places.shape[: len(axes)])), -1)
+    column = _column(value)
+    return reduce(fold, (_taken(column, row) for row in rows))
+
+
+def _product(left: Value, right: Value, dimension_numbers) -> Column:
+    """The sums of products over the contracted axes; its axes are the common ones, the left's and the right's."""
+    (of_left, of_right), (common_left, common_right) = dimension_numbers
+    rows, columns = _matrices(left, of_left, common_left), _matrices(right, of_right, common_right)
+    # CasADi counts columns first, JAX rows: the transpose puts the entries into JAX's order.
+    return ca.vertcat(*(ca.vec(ca.mtimes(a, b.T).T) for a, b in zip(rows, columns, strict=True)))
+
+
+def _matrices(value: Value, contracted: Sequence[int], common: Sequence[int]) -> list[Column]:
+    """One matrix (free × contracted) for each index of the common axes."""
+    free = [axis for axis in range(len(_shape(value))) if axis not in (*contracted, *common)]
+    places = np.transpose(_places(value), (*common, *free, *contracted))
+    sizes = [int(np.prod([_shape(value)[axis] for axis in axes])) for axes in (common, free, contracted)]
+    column = _column(value)
+    return [ca.reshape(_taken(column, one), sizes[2], sizes[1]).T for one in places.reshape(sizes)]
+
+
+def _select(equation: JaxprEqn, which, *cases):
+    if len(cases) != 2:
+        raise _refusal(equation, f" of {len(cases)} cases")
+    return ca.if_else(which, cases[1], cases[0])
+
+
+def _convert(equation: JaxprEqn, a):
+    if not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
+        raise _refusal(equation, f" to {equation.params['new_dtype']}")
+    return a
+
+
+def _logical(operation: Callable) -> Callable:
+    def of(equation: JaxprEqn, *inputs):
+        if equation.invars[0].aval.dtype != bool:  # type: ignore
+            raise _refusal(equation, " of integers")
+        return operation(*inputs)
+
+    return of
+
+
+def _plain(operation: Callable) -> Callable:
+    return lambda equation, *inputs: operation(*inputs)
+
+
+# Operations that call a program within the program; a custom derivative gives way to CasADi's.
+CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
+_FIRST, _ALL = (lambda count: (0,)), range
+# Name → of how many inputs, which ones hold entries that are moved; the others say where to.
+MOVES: dict[str, Callable[[int], Sequence[int]]] = {
+    "reshape": _FIRST,
+    "squeeze": _FIRST,
+    "expand_dims": _FIRST,
+    "transpose": _FIRST,
+    "rev": _FIRST,
+    "tile": _FIRST,
+    "split": _FIRST,
+    "unstack": _FIRST,
+    "slice": _FIRST,
+    "broadcast_in_dim": _FIRST,
+    "dynamic_slice": _FIRST,
+    "gather": _FIRST,
+    "concatenate": _ALL,
+    "stack": _ALL,
+    "pad": _ALL,
+    "dynamic_update_slice": lambda count: (0, 1),
+    "scatter": lambda count: (0, 2),
+}
+LINEAR = {"scatter-add": (0, 2), "cumsum": (0,)}
+FOLDS = {
+    "reduce_sum": lambda a, b: a + b,
+    "reduce_prod": lambda a, b: a * b,
+    "reduce_max": ca.fmax,
+    "reduce_min": ca.fmin,
+}
+ENTRYWISE: dict[str, Callable] = {
+    "select_n": _select,
+    "convert_element_type": _convert,
+    "integer_pow": lambda equation, a: a ** equation.params["y"],
+    "and": _logical(ca.logic_and),
+    "or": _logical(ca.logic_or),
+    "not": _logical(ca.logic_not),
+} | {
+    name: _plain(operation)
+    for name, operation in {
+        "add": lambda a, b: a + b,
+        "add_any": lambda a, b: a + b,
+        "sub": lambda a, b: a - b,
+        "mul": lambda a, b: a * b,
+        "div": lambda a, b: a / b,
+        "rem": ca.fmod,
+        "pow": lambda a, b: a**b,
+        "max": ca.fmax,
+        "min": ca.fmin,
+        "clamp": lambda low, a, high: ca.fmin(ca.fmax(a, low), high),
+        "atan2": ca.atan2,
+        "lt": lambda a, b: a < b,
+        "le": lambda a, b: a <= b,
+        "gt": lambda a, b: a > b,
+        "ge": lambda a, b: a >= b,
+        "eq": lambda a, b: a == b,
+        "ne": lambda a, b: a != b,
+        "copy": lambda a: a,
+        "copy_p": lambda a: a,
+        "stop_gradient": lambda a: a,
+        "neg": lambda a: -a,
+        "sign": ca.sign,
+        "abs": ca.fabs,
+        "floor": ca.floor,
+        "ceil": ca.ceil,
+        "square": lambda a: a * a,
+        "sqrt": ca.sqrt,
+        "rsqrt": lambda a: 1 / ca.sqrt(a),
+        "exp": ca.exp,
+        "exp2": lambda a: 2**a,
+        "expm1": ca.expm1,
+        "log": ca.log,
+        "log1p": ca.log1p,
+        "logistic": lambda a: 1 / (1 + ca.exp(-a)),
+        "erf": ca.erf,
+        "erfc": lambda a: 1 - ca.erf(a),
+        "sin": ca.sin,
+        "cos": ca.cos,
+        "tan": ca.tan,
+        "asin": ca.asin,
+        "acos": ca.acos,
+        "atan": ca.atan,
+        "sinh": ca.sinh,
+        "cosh": ca.cosh,
+        "tanh": ca.tanh,
+        "asinh": ca.asinh,
+        "acosh": ca.acosh,
+        "atanh": ca.atanh,
+    }.items()
+}

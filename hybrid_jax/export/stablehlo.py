@@ -1,0 +1,218 @@
+"""Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library.
+
+A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`. They
+are a list of operations on arrays, the parameters among them; loading them runs no Python of the file, and a program
+that calls anything outside itself is neither written nor loaded.
+"""
+
+import importlib.util
+import re
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.archive import load_archive, save_archive
+from hybrid_jax.export.step import one_step
+from hybrid_jax.rollout import Derivative, check_field
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch
+
+FORMAT = "hybrid_jax program 1"
+PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
+BATCH = "b"  # the name of the axis of a batch, whose length stays open
+_OWN_CALLS = ("shape_assertion",)  # JAX's own checks of an open length
+
+
+@dataclass(frozen=True)
+class Program:
+    """ẋ = f(x, u), or x⁺ = F(x, u), as read from a file; `jax.jit` takes it, `jax.vmap` and `jax.grad` do not.
+
+    Attributes:
+        dt: how long a step is [s]; None for a field.
+        state_size: d.
+        input_size: m.
+        batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
+        platforms: on which it runs.
+        about: JSON values: what was known about the model.
+    """
+
+    dt: float | None
+    state_size: int
+    input_size: int
+    batched: bool
+    platforms: tuple[str, ...]
+    about: Mapping[str, Any]
+    _call: Callable[[Array, Array], Array] = field(repr=False)
+
+    def __call__(
+        self, x: Float[Array | np.ndarray, "*b d"], u: Float[Array | np.ndarray, "*b m"]
+    ) -> Float[Array, "*b d"]:
+        """ẋ, or the state dt later with the input held; in single precision.
+
+        Raises:
+            ValueError: other shapes, or a number that is not finite.
+        """
+        x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
+        batch = x.shape[:1] if self.batched else ()
+        if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
+            form = "x (b, {}) and u (b, {})" if self.batched else "x ({},) and u ({},)"
+            expected = form.format(self.state_size, self.input_size)
+            raise ValueError(f"{expected} expected, got shapes {x.shape} and {u.shape}")
+        return self._call(x, u)
+
+
+def export_field(
+    path: str | Path,
+    field: AbstractVectorField,
+    *,
+    state_size: int = STATE_SIZE,
+    input_size: int = INPUT_SIZE,
+    batched: bool = False,
+    platforms: tuple[str, ...] = ("cpu",),
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write ẋ = f(x, u) of a field as deployed, in single precision, to a file that `load_program` reads.
+
+    Args:
+        batched: whether it is to take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
+        platforms: of PLATFORMS; only those that the program will ever run on, each makes the file longer.
+        about: JSON values that travel with it.
+
+    Raises:
+        ValueError: a field that does not take such x and u, a platform that is none, what is not JSON, or a program
+            that would call something outside itself, such as LAPACK.
+        ImportError: flatbuffers is not installed (extra `export`).
+        OSError: the folder cannot be written.
+    """
+    _export(path, field, None, state_size, input_size, batched, platforms, about)
+
+
+def export_step(
+    path: str | Path,
+    field: AbstractVectorField,
+    dt: float,
+    *,
+    state_size: int = STATE_SIZE,
+    input_size: int = INPUT_SIZE,
+    batched: bool = False,
+    platforms: tuple[str, ...] = ("cpu",),
+    about: Mapping[str, Any] | None = None,
+) -> None:
+    """Write x⁺ = F(x, u), one step of the library's RK4 over dt [s] with the input held; all else as `export_field`.
+
+    Raises:
+        ValueError: dt that is not positive; as `export_field`.
+        ImportError, OSError: as `export_field`.
+    """
+    checks.positive("dt", dt, "a positive number of seconds")
+    _export(path, field, float(dt), state_size, input_size, batched, platforms, about)
+
+
+def load_program(path: str | Path) -> Program:
+    """Read what `export_field` or `export_step` wrote; no Python of the file is run.
+
+    Raises:
+        ValueError: the file is missing, damaged, no program, or one that calls something outside itself; one line.
+        ImportError: flatbuffers is not installed (extra `export`).
+    """
+    _need_flatbuffers()
+    metadata, arrays = load_archive(path, FORMAT)
+    try:
+        exported = jax.export.deserialize(bytearray(arrays["exported"].tobytes()))
+        _check_calls(exported)
+        dt, about = metadata["dt"], dict(metadata["about"])
+        if dt is not None:
+            checks.positive("dt", dt)
+        batched, state_size, input_size = _sizes(exported)
+    except Exception as error:  # of forged bytes, JAX's parser raises whatever it meets
+        raise ValueError(f"{path}: not a program of a field or a step: {checks.one_line(error)}") from error
+    return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
+
+
+def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, about) -> None:
+    _need_flatbuffers()
+    checks.count("state_size", state_size)
+    checks.count("input_size", input_size, least=0)
+    if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
+        raise ValueError(f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.shown(platforms)}")
+    with jax.enable_x64(False), _nowhere():
+        single = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_inexact_array(leaf) else leaf, field
+        )
+        batch = jax.export.symbolic_shape(BATCH) if batched else ()
+        x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in (state_size, input_size))
+        check_field(single, *(jax.ShapeDtypeStruct(like.shape[-1:], like.dtype) for like in (x, u)))
+        derivative = _of_rows(single) if batched else single
+        exported = jax.export.export(jax.jit(_program(derivative, dt)), platforms=platforms)(x, u)
+    _check_calls(exported)
+    metadata = {"dt": dt, "about": dict(about or {})}
+    save_archive(path, FORMAT, metadata, {"exported": np.frombuffer(exported.serialize(), np.uint8)})
+
+
+@contextmanager
+def _nowhere() -> Iterator[None]:
+    """Without it a program names the files and lines that it was traced from, in folders that are nobody's business."""
+    name = "jax_traceback_in_locations_limit"
+    before = getattr(jax.config, name)
+    jax.config.update(name, 0)
+    try:
+        yield
+    finally:
+        jax.config.update(name, before)
+
+
+def _program(derivative: Derivative, dt: float | None) -> Derivative:
+    whole = derivative if dt is None else partial(one_step, derivative, dt=dt)
+    return lambda x, u: whole(x, u)  # what is compiled must have a hash, which a field has not
+
+
+def _of_rows(field: AbstractVectorField) -> Derivative:
+    """The field on a batch, one sample a row."""
+    return lambda x, u: jnp.moveaxis(deploy_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
+
+
+def _check_calls(exported: jax.export.Exported) -> None:
+    """Refuse a program that is not whole in itself: it would run on this machine's libraries, or not at all.
+
+    Raises:
+        ValueError: what it calls.
+    """
+    for call in re.findall(r"custom_call\W*(\w*)", exported.mlir_module()):
+        if call not in _OWN_CALLS:
+            raise ValueError(f"field: its program calls {call or 'something'}, which is no operation of StableHLO")
+
+
+def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
+    """(batched, d, m) of a program from x and u to something like x.
+
+    Raises:
+        ValueError: it is of another kind.
+    """
+    x, u = exported.in_avals
+    (result,) = exported.out_avals
+    arguments = jax.tree.structure(((0, 0), {}))
+    batched = len(x.shape) == 2
+    batch = (str(x.shape[0]),) if batched else ()
+    sizes = [x.shape[-1], u.shape[-1]]
+    shapes = [tuple(map(str, value.shape)) for value in (x, u, result)]
+    fits = shapes == [(*batch, str(size)) for size in (*sizes, sizes[0])] and batch in ((), (BATCH,))
+    single = all(value.dtype == np.float32 for value in (x, u, result))
+    if not fits or not single or exported.in_tree != arguments or exported.out_tree != jax.tree.structure(0):
+        raise ValueError(f"it maps {exported.in_avals} to {exported.out_avals}")
+    return batched, int(sizes[0]), int(sizes[1])
+
+
+def _need_flatbuffers() -> None:
+    if importlib.util.find_spec("flatbuffers") is None:
+        raise ImportError("programs in files need flatbuffers: pip install 'hybrid_jax[export]'")

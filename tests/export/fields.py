@@ -1,0 +1,86 @@
+"""One field of every kind, for the tests of export, with states and inputs to try them on."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.baselines import FrozenRates, HoldState
+from hybrid_jax.features import FROM_THE_BODY, INPUTS, OUTPUTS, restricted
+from hybrid_jax.multirotor import SHAPES, Terms, multirotor
+from hybrid_jax.residual import NORMS, InputScaling, LinearResidual, residual_network
+from hybrid_jax.rigid_body import RigidBody, guess
+from hybrid_jax.state import QUATERNION, VELOCITY
+from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid
+from hybrid_jax.vehicle import IRIS
+
+KEY = jax.random.key(0)
+SCALING = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
+TERMS = Terms(torque_gain=(0.9, 1.1, 0.8), drag=(0.3, 0.4, 0.1))
+
+
+class Dragged(AbstractVectorField):
+    """A field of one's own, which adds to some entries of another's."""
+
+    body: RigidBody
+    drag: Float[Array, ""]
+
+    def __call__(self, x, u):
+        return self.body(x, u).at[VELOCITY].add(-self.drag * x[VELOCITY])
+
+
+def moved(field, size=0.1):
+    """The field with every number in it away from what it began as; what is positive stays so."""
+    rng = np.random.default_rng(2)
+    leaves, structure = jax.tree.flatten(field)
+    return jax.tree.unflatten(
+        structure, [jnp.asarray(leaf + size * rng.uniform(size=leaf.shape), leaf.dtype) for leaf in leaves]
+    )
+
+
+def network(**options):
+    return moved(restricted(KEY, hidden=5, scaling=SCALING, **options))
+
+
+def plain(x, u):
+    """A function, and no field."""
+    return jnp.tanh(x) * jnp.where(x[2] > 0, 1.0, jnp.sum(u) / 2500)
+
+
+BODY = guess(IRIS, KEY)
+PER_ROTOR = moved(multirotor(IRIS, tuple(name for name in SHAPES if name != "k"), TERMS))
+FIELDS = {
+    "rigid body": BODY,
+    "multirotor, per rotor": PER_ROTOR,
+    "multirotor": multirotor(IRIS, (), TERMS),
+    **{
+        f"hybrid, norm {norm}": Hybrid(BODY, moved(residual_network(13, 4, KEY, hidden=5, scaling=SCALING, norm=norm)))
+        for norm in NORMS
+    },
+    **{
+        f"residual from {inputs} to {outputs}": Hybrid(PER_ROTOR, network(inputs=inputs, outputs=outputs))
+        for inputs in INPUTS
+        for outputs in OUTPUTS
+        if outputs != "motion" or inputs in FROM_THE_BODY
+    },
+    "linear residual": Hybrid(BODY, moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
+    "frozen rates": FrozenRates(PER_ROTOR),
+    "frozen": Frozen(BODY),
+    "hold": HoldState(),
+    "one's own": Dragged(BODY, jnp.asarray(0.3)),
+    "function": plain,
+}
+
+
+def samples(count=3, seed=1):
+    """States (n, 13) and inputs (n, 4)."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(count, 13))
+    x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
+    return x, rng.uniform(400, 900, (count, 4))
+
+
+def double(field):
+    """The field with its numbers in double precision, where that is enabled."""
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)

@@ -1,0 +1,132 @@
+"""CasADi's function of a field is the field: its values, its derivatives, its steps."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import BODY, FIELDS, KEY, PER_ROTOR, double, samples
+
+from hybrid_jax import Hybrid, residual_network
+from hybrid_jax.export import casadi_function, casadi_step
+from hybrid_jax.rollout import rollout
+
+ca = pytest.importorskip("casadi")
+ROUND_OFF = 1e-12  # of the largest entry: a few hundred operations of 1e-16 each
+
+
+def close(found, expected):
+    found, expected = np.asarray(found), np.asarray(expected)
+    np.testing.assert_allclose(found.reshape(expected.shape), expected, rtol=0, atol=ROUND_OFF * abs(expected).max())
+
+
+def jacobian(function):
+    """∂/∂(x, u) of a CasADi function of x and u."""
+    x, u = function.sx_in()
+    return ca.Function("jacobian", [x, u], [ca.jacobian(function(x, u), ca.vertcat(x, u))])
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_it_has_the_values_and_the_derivatives_of_the_field(name):
+    """The derivatives along a random direction: one wrong entry of the Jacobian shows in it."""
+    function = casadi_function(FIELDS[name])
+    slopes, (dx, du) = jacobian(function), (part[0] for part in samples(seed=2))
+    with jax.enable_x64(True):
+        field = double(FIELDS[name])
+        for x, u in zip(*samples(2), strict=True):
+            value, slope = jax.jvp(field, (jnp.asarray(x), jnp.asarray(u)), (jnp.asarray(dx), jnp.asarray(du)))
+            close(function(x, u), value)
+            close(slopes(x, u) @ np.concatenate([dx, du]), slope)
+
+
+def test_its_jacobian_is_that_of_jacfwd_entry_by_entry():
+    slopes = jacobian(casadi_function(PER_ROTOR))
+    with jax.enable_x64(True):
+        field = double(PER_ROTOR)
+        expected = jax.jit(lambda x, u: jax.jacfwd(field, (0, 1))(x, u))
+        for x, u in zip(*samples(2), strict=True):
+            close(slopes(x, u), np.concatenate(expected(x, u), axis=1))
+
+
+@pytest.mark.parametrize("name", ["hybrid, norm batch", "one's own"])
+def test_a_step_is_an_interval_of_a_rollout(name):
+    function = casadi_step(FIELDS[name], 0.02)
+    with jax.enable_x64(True):
+        field = double(FIELDS[name])
+        for x, u in zip(*samples(2), strict=True):
+            close(function(x, u), rollout(field, x, u[None], 0.02)[0])
+
+
+def test_inputs_and_outputs_have_names_and_sizes_of_another_system_too():
+    function = casadi_function(residual_network(2, 1, KEY, hidden=4), state_size=2, input_size=1, name="pendulum")
+    assert str(function) == "pendulum:(x[2],u)->(xdot[2]) SXFunction"
+    assert casadi_step(BODY, 0.01).name_out() == ["xnext"]
+    assert function(x=[0.1, 0.2], u=0.3)["xdot"].shape == (2, 1)
+
+
+def test_it_is_the_same_after_a_file(tmp_path):
+    function = casadi_function(FIELDS["hybrid, norm layer"])
+    function.save(str(tmp_path / "f.casadi"))
+    x, u = (part[0] for part in samples())
+    np.testing.assert_array_equal(ca.Function.load(str(tmp_path / "f.casadi"))(x, u), function(x, u))
+
+
+def everything(x, u):
+    """What no field of the library needs and one of a user's own may."""
+    matrix = jnp.outer(x, u)
+    batch = jnp.stack([matrix, 2 * matrix])
+    parts = [
+        jnp.linalg.norm(x),
+        jnp.einsum("bij,bkj->b", batch, batch[:, ::-1]).sum(),
+        jnp.cumsum(x)[-2] + jnp.prod(u) + jnp.max(x) + jnp.min(u),
+        jnp.arctan2(x[0], x[1]) + jnp.clip(x[2], -0.1, 0.1) + jnp.sign(x[3]),
+        jax.nn.sigmoid(x[4]) + jax.nn.softplus(x[0]) + jax.nn.gelu(x[1], approximate=False),
+        jnp.where((x[0] > 0) & ~(x[1] > 0) | (u[0] < 500), x[2], u[1]),
+        jnp.linalg.matrix_power(matrix[:4], 3).sum() + jnp.pad(x, 2).sum() + jnp.tile(x, 3)[20],
+        x[jnp.array([0, 0, 5])].sum() + x.at[jnp.array([1, 1])].add(x[2]).sum(),
+        (x**3).sum() + jnp.abs(x[0]) ** 1.5 + 2.0 ** x[1] + jnp.log1p(x[2] ** 2) + jnp.expm1(x[3]),
+        jax.checkpoint(jnp.sin)(x[0]) + jnp.roll(x, 2)[0] + jax.lax.dynamic_slice(x, (3,), (2,)).sum(),
+        sum(jnp.split(x[:12], 3))[0] + jnp.remainder(x[0], 1.3),
+        jnp.floor(x[0]),
+        jnp.mean(x) + jnp.var(x),
+    ]
+    return jnp.stack(parts)
+
+
+def test_a_field_of_one_s_own_may_use_what_casadi_has():
+    function = casadi_function(everything)
+    with jax.enable_x64(True):
+        for x, u in zip(*samples(), strict=True):
+            expected = np.asarray(jax.jit(everything)(x, u))
+            np.testing.assert_allclose(np.asarray(function(x, u)).ravel(), expected, rtol=1e-12)
+
+
+def solved(x, u):
+    return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
+
+
+def looked_up(x, u):
+    return x * jnp.arange(3.0)[jnp.clip(x[0].astype(int), 0, 2)]
+
+
+def looped(x, u):
+    return jax.lax.fori_loop(0, 3, lambda _, y: y / 2, x)
+
+
+@pytest.mark.parametrize(
+    ("field", "said"), [(solved, "operation 'lu'"), (looked_up, "to int64"), (looped, "operation 'scan'")]
+)
+def test_an_operation_that_casadi_has_not_is_named(field, said):
+    with pytest.raises(ValueError, match=rf"^field: its .*{said}.* has no counterpart in CasADi$"):
+        casadi_function(field)
+
+
+def test_what_makes_no_sense_is_refused():
+    for dt in (0.0, -1.0, float("nan")):
+        with pytest.raises(ValueError, match="dt must be a positive"):
+            casadi_step(BODY, dt)
+    with pytest.raises(ValueError, match="name must be one"):
+        casadi_function(BODY, name="1 f")
+    with pytest.raises(ValueError, match="field: ResidualNetwork does not take"):
+        casadi_function(residual_network(2, 1, KEY))
+    with pytest.raises(ValueError, match="state_size must be"):
+        casadi_function(Hybrid(BODY, BODY), state_size=0)

@@ -1,0 +1,24 @@
+"""What docs/export.md shows is what happens; a program is read without the library."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+WITH, WITHOUT = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), flags=re.DOTALL)
+
+
+def said(code, folder):
+    code = f"import sys\nsys.path.insert(0, {str(ROOT)!r})\n{code}"
+    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_the_examples_run_and_the_two_forms_agree(tmp_path):
+    of_the_first = said(WITH, tmp_path)
+    assert "F:(x[13],u[4])->(xnext[13])" in of_the_first
+    assert float(of_the_first.split()[-1]) < 1e-5  # single precision of states of size 1
+    assert (tmp_path / "step.casadi").exists()
+    assert "float32[13]" in said(f"sys.modules['hybrid_jax'] = None\n{WITHOUT}", tmp_path)

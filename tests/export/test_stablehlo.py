@@ -1,0 +1,165 @@
+"""A program in a file is the field, for whoever reads it; anything else is refused in one line."""
+
+import jax
+import jax.export
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from fields import BODY, FIELDS, KEY, samples
+
+from hybrid_jax import residual_network, rollout_batch, save
+from hybrid_jax.archive import save_archive
+from hybrid_jax.export import export_field, export_step, load_program
+from hybrid_jax.export.stablehlo import FORMAT
+
+KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
+HYBRID = FIELDS["hybrid, norm batch"]
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "program.npz"
+
+
+def refusal(path, what=load_program):
+    with pytest.raises(ValueError, match=r".") as error:
+        what(path)
+    message = str(error.value)
+    assert "\n" not in message
+    return message
+
+
+def close(found, expected):
+    expected = np.asarray(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=2e-6 * abs(expected).max())  # some roundings of 6e-8
+    assert found.dtype == np.float32
+
+
+@pytest.mark.parametrize("name", KINDS)
+def test_a_program_is_the_field(name, path):
+    export_field(path, FIELDS[name], about={"seed": 3})
+    program = load_program(path)
+    for x, u in zip(*samples(2), strict=True):
+        close(program(x, u), FIELDS[name](jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)))
+    assert (program.dt, program.state_size, program.input_size) == (None, 13, 4)
+    assert (program.batched, program.platforms, program.about) == (False, ("cpu",), {"seed": 3})
+
+
+@pytest.mark.parametrize("name", ["multirotor, per rotor", "hybrid, norm batch"])
+def test_a_program_of_steps_is_an_interval_of_a_rollout_for_a_batch_of_any_length(name, path):
+    export_step(path, FIELDS[name], 0.02, batched=True)
+    program = load_program(path)
+    assert (program.dt, program.batched) == (0.02, True)
+    for count in (1, 3):
+        x, u = (part.astype(np.float32) for part in samples(count))
+        close(program(x, u), rollout_batch(FIELDS[name], x, u[:, None], 0.02)[:, 0])
+
+
+def test_it_may_be_part_of_a_compiled_program(path):
+    export_field(path, BODY)
+    program, (x, u) = load_program(path), (part[0] for part in samples())
+    close(jax.jit(lambda x, u: 2 * program(x, u))(x, u), 2 * program(x, u))
+
+
+def test_in_double_precision_it_stays_single(path):
+    with jax.enable_x64(True):
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), BODY)
+        export_field(path, field)
+        x, u = (part[0] for part in samples())
+        close(load_program(path)(x, u), BODY(*(jnp.asarray(a, jnp.float32) for a in (x, u))))
+
+
+def test_a_file_for_two_platforms_says_so(path):
+    export_step(path, HYBRID, 0.01, platforms=("cpu", "cuda"))
+    assert load_program(path).platforms == ("cpu", "cuda")
+
+
+def test_equal_fields_are_equal_files_that_name_no_file_of_the_writer(path, tmp_path):
+    for name in ("one.npz", "two.npz"):
+        export_step(tmp_path / name, HYBRID, 0.01, batched=True)
+    content = (tmp_path / "one.npz").read_bytes()
+    assert content == (tmp_path / "two.npz").read_bytes()
+    assert b".py" not in content.replace(b"exported.npy", b"")
+
+
+def test_another_system_has_other_sizes(path):
+    field = residual_network(2, 1, KEY, hidden=4)
+    export_field(path, field, state_size=2, input_size=1)
+    close(load_program(path)(np.ones(2), np.ones(1)), field(jnp.ones(2), jnp.ones(1)))
+
+
+@pytest.mark.parametrize("shapes", [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], ids=str)
+def test_shapes_that_are_not_the_program_s_are_refused(shapes, path):
+    export_field(path, BODY)
+    with pytest.raises(ValueError, match=r"x \(13,\) and u \(4,\) expected, got"):
+        load_program(path)(*map(np.ones, shapes))
+
+
+@pytest.mark.parametrize("shapes", [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], ids=str)
+def test_shapes_that_are_no_batch_are_refused(shapes, path):
+    export_field(path, BODY, batched=True)
+    with pytest.raises(ValueError, match=r"x \(b, 13\) and u \(b, 4\) expected, got"):
+        load_program(path)(*map(np.ones, shapes))
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"state_size": 2}, "field: RigidBody does not take"),
+        ({"state_size": 0}, "state_size must be"),
+        ({"platforms": ("abacus",)}, "platforms must be a tuple of some of cpu"),
+        ({"platforms": ()}, "platforms must be"),
+        ({"about": {"a": np.ones(2)}}, "must be JSON"),
+    ],
+    ids=str,
+)
+def test_what_makes_no_program_is_refused(options, said, path):
+    assert said in refusal(path, lambda path: export_field(path, BODY, **options))
+    assert "dt must be a positive" in refusal(path, lambda path: export_step(path, BODY, -0.1))
+    assert not path.exists()
+
+
+def solved(x, u):
+    return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
+
+
+def test_a_program_that_calls_a_library_is_not_written(path):
+    assert "calls lapack" in refusal(path, lambda path: export_field(path, solved))
+
+
+def forged(path, function, *shapes, **metadata):
+    """A file with the right checksum that holds another program."""
+    likes = [jax.ShapeDtypeStruct(shape, jnp.float32) for shape in shapes]
+    content = np.frombuffer(jax.export.export(jax.jit(function))(*likes).serialize(), np.uint8)
+    save_archive(path, FORMAT, {"dt": None, "about": {}} | metadata, {"exported": content})
+    return path
+
+
+def test_what_is_no_program_is_refused_by_its_name(path):
+    assert "no such file" in refusal(path)
+    save(path, BODY)
+    assert "not a hybrid_jax program" in refusal(path)
+    for arrays in ({}, {"exported": np.zeros(0, np.uint8)}, {"exported": np.full(400, 7, np.uint8)}):
+        save_archive(path, FORMAT, {"dt": None, "about": {}}, arrays)
+        assert f"{path}: not a program" in refusal(path)
+
+
+def test_a_forged_program_is_refused(path):
+    d, m = (13,), (4,)
+    assert "calls lapack" in refusal(forged(path, solved, d, m))
+    assert "it maps" in refusal(forged(path, lambda x, u: x[:2], d, m))
+    assert "it maps" in refusal(forged(path, lambda x, u: (x,), d, m))
+    assert "it maps" in refusal(forged(path, lambda x, u: x, (3, *d), (3, *m)))
+    assert "not a program" in refusal(forged(path, lambda x: x, d))
+    assert "dt must be" in refusal(forged(path, lambda x, u: x, d, m, dt="0.01"))
+    assert "not a program" in refusal(forged(path, lambda x, u: x, d, m, about=3))
+
+
+def test_a_truncated_or_altered_program_is_refused(path):
+    export_field(path, BODY)
+    content = path.read_bytes()
+    path.write_bytes(content[:-100])
+    assert "truncated" in refusal(path)
+    place = len(content) // 2
+    path.write_bytes(content[:place] + bytes([content[place] ^ 1]) + content[place + 1 :])
+    assert str(path) in refusal(path)
