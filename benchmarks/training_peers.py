@@ -126,7 +126,8 @@ def our_steps(subject: tuple, config: Config, in_a_row: int) -> Steps:
 
     def loop(field, adam, plan, windows):
         def body(_, learner):
-            return step(*learner, plan, windows)[:2]
+            field, adam = learner
+            return step(field, adam, plan, windows)[:2]
 
         return jax.lax.fori_loop(0, in_a_row, body, (field, adam))
 

@@ -5,7 +5,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Int, PRNGKeyArray
+from jaxtyping import Int, PRNGKeyArray
 
 from experiments.protocol import Config, Encoding, Stopping, column
 from hybrid_jax import training
@@ -37,7 +37,7 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
 
 
 @eqx.filter_jit
-def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[Array, " n"]) -> AbstractVectorField:
+def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
     def build(seed):
         physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
         network = _network(vehicle, config, _key(seed, NETWORK))
@@ -140,7 +140,7 @@ def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> Fit
 
 
 @eqx.filter_jit
-def _begun(fields: AbstractVectorField, seeds: Int[Array, " n"], purpose: int) -> FitState:
+def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: int) -> FitState:
     return eqx.filter_vmap(lambda field, seed: training.start(field, _key(seed, purpose)))(fields, seeds)
 
 

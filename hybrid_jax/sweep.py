@@ -98,7 +98,8 @@ def compile_sweep(
     Raises:
         ValueError: as `sweep`.
     """
-    _ready(*jax.device_get((states, plans)), train, validation, settings, None)
+    states, plans = jax.device_get((states, plans))
+    _ready(states, plans, train, validation, settings, None)
 
 
 def evaluate(
@@ -116,7 +117,9 @@ def compile_evaluation(fields: AbstractVectorField, windows: Trajectories, every
     errors(jax.device_get(fields), (windows,), np.ones(count(fields)), ())
 
 
-def _ready(states, plans, train, validation, settings: Settings, width: int | None):
+def _ready(
+    states: FitState, plans: Plan, train: PyTree, validation: PyTree, settings: Settings, width: int | None
+) -> tuple[LaneMap, tuple, np.ndarray]:
     """The compiled block of a sweep, the data that all lanes share, and what an epoch of each lane costs."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
