@@ -11,12 +11,12 @@ import numpy as np
 from rich.console import Console
 
 from experiments import command
-from experiments.conditions import adaptation, pretraining, settings
+from experiments.conditions import settings
 from experiments.external_force import sine_floor
 from experiments.protocol import QUICK, SMOKE, Config, distinct, preset_like
 from experiments.results import Lanes, rows_of, trained
 from experiments.stages import Stages, stages_of
-from experiments.study import EVERY, flown, places, source_splits, target_splits
+from experiments.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
 from hybrid_jax import hosts
 from hybrid_jax.ablations import Trial, by_choice, figure, records, tables, to_csv
 from hybrid_jax.environment import environment
@@ -129,20 +129,19 @@ def tried(choice: str, value: str, config: AblationConfig, default: AblationConf
     """The hybrid, pre-trained and fine-tuned under a changed configuration."""
     source = flown(SOURCE, source_splits(config), config, stages)
     shared = settings(config)
-    pretrained = stages.run("pre-training hybrid", *pretraining("hybrid", IRIS, config), shared, source)
+    learned = pretrained("hybrid", IRIS, config, stages, source)
     rows: list[Row] = []
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        starts = adaptation("hybrid", "fine_tuned", pretrained.best, config)
-        final = stages.run(f"fine_tuned hybrid {domain.name}", *starts, shared, target)
+        final = adapted("hybrid", "fine_tuned", learned.best, config, stages, target)
 
         def lanes(mode: str, sizes, found: FitState, target=target) -> Lanes:
             errors = evaluate(found.best, target.splits["test"], EVERY, shared)
             return trained("hybrid", mode, *places(sizes, config), found, errors)
 
-        both = (lanes("source_only", (0,), pretrained), lanes("fine_tuned", config.sizes, final))
+        both = (lanes("source_only", (0,), learned), lanes("fine_tuned", config.sizes, final))
         rows += with_rho([row for group in both for row in rows_of(group, domain.name)])
-    return Trial(choice, value, config == default, [float(mse) for mse in pretrained.best_mse], rows)
+    return Trial(choice, value, config == default, [float(mse) for mse in learned.best_mse], rows)
 
 
 def truth() -> dict[str, dict[str, float]]:

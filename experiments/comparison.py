@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments import command
-from experiments.conditions import augmentation, pretraining, settings
+from experiments.conditions import augmentation, settings
 from experiments.coverage import Config as CoverageConfig
 from experiments.coverage import CoverageRow, coverage
 from experiments.external_force import sine_floor
@@ -19,7 +19,7 @@ from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, disti
 from experiments.results import Lanes, rows_of, save_models
 from experiments.rivals import METHODS, PAST, Case, Method, source_only
 from experiments.stages import Stages, stages_of
-from experiments.study import adaptation_splits, flown, source_splits
+from experiments.study import adaptation_splits, flown, pretrained, source_splits
 from hybrid_jax import hosts
 from hybrid_jax.claims import COMPARISON, claims
 from hybrid_jax.comparison_figures import standings
@@ -78,11 +78,11 @@ PRESETS = {
 def experiment(config: ComparisonConfig, console: Console) -> None:
     """Run all methods in both domains and write what came of it."""
     stages = stages_of(config, console)
-    pretrained, experts = source_models(config, stages)
+    learned, experts = source_models(config, stages)
     out, rows, datasets = config.out / NAME, list[Row](), dict[str, Any]()
     for domain in DOMAINS:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
-        lanes = compared(Case(config, stages, pretrained, experts, target), config.methods)
+        lanes = compared(Case(config, stages, learned, experts, target), config.methods)
         found = with_rho([row for group in lanes for row in rows_of(group, domain.name)])
         if hosts.first():
             save_models(out / "models" / domain.name, lanes, found)
@@ -99,19 +99,16 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
     """What is pre-trained on the source: a model for each method that starts from one, and the experts."""
     source = flown(SOURCE, source_splits(config), config, stages)
     models = dict.fromkeys(["hybrid", *(SOURCE_OF.get(method, method) for method in config.methods)])
-    pretrained = {
-        model: stages.run(f"pre-training {model}", *pretraining(model, IRIS, config), settings(config), source)
-        for model in models
-    }
+    learned = {model: pretrained(model, IRIS, config, stages, source) for model in models}
     if "expert_augmentation" not in config.methods:
-        return pretrained, None
+        return learned, None
     with_past = past_splits(train=config.source_train, validation=config.validation)
     longer = flown(SOURCE, with_past, config, stages)
     renamed = Dataset({name.removesuffix("_with_past"): longer.splits[name] for name in with_past}, longer.metadata)
     past, _ = split(renamed.splits["train"], PAST)
     learning = replace(settings(config), objective=Augmentation(PAST))
-    lanes = augmentation(pretrained["hybrid"].best, past, config.encoding, config)
-    return pretrained, stages.run("expert augmentation", *lanes, learning, renamed)
+    lanes = augmentation(learned["hybrid"].best, past, config.encoding, config)
+    return learned, stages.run("expert augmentation", *lanes, learning, renamed)
 
 
 def past_splits(**windows: int) -> dict[str, SplitSpec]:

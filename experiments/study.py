@@ -24,6 +24,7 @@ from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import compile_evaluation, compile_sweep, evaluate
 from hybrid_jax.training import FitState
 from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
@@ -65,6 +66,19 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             lanes += _model_lanes(model, vehicle, config, stages, source, target)
     rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
+
+
+def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
+    """A model after pre-training on source flight, one lane a seed."""
+    return stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), settings(config), source)
+
+
+def adapted(
+    model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
+) -> FitState:
+    """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
+    lanes = adaptation(model, mode, fields, config)
+    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target)
 
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
@@ -111,14 +125,10 @@ def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
 def _model_lanes(
     model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset, target: Dataset
 ) -> list[Lanes]:
-    shared = settings(config)
-    pretrained = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), shared, source)
-    starts = {"fine_tuned": pretrained.best, "target_only": fresh_fields(model, vehicle, config)}
-    finals = {"source_only": pretrained} | {
-        mode: stages.run(
-            f"{mode} {model} {domain_name(target)}", *adaptation(model, mode, start, config), shared, target
-        )
-        for mode, start in starts.items()
+    learned = pretrained(model, vehicle, config, stages, source)
+    starts = {"fine_tuned": learned.best, "target_only": fresh_fields(model, vehicle, config)}
+    finals = {"source_only": learned} | {
+        mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()
     }
     return [_tested(model, mode, finals[mode], config, stages, target) for mode in TESTED]
 
