@@ -14,6 +14,8 @@ TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of 
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only"]
+ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "body"]
+ResidualOutputs = Literal["all", "accelerations"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
 
@@ -107,9 +109,9 @@ class Config:
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Literal["batch", "layer", "none"] = "batch"
     """Normalisation of f_d's hidden layer."""
-    residual_inputs: Literal["all", "no_xy", "body"] = "all"
-    """What f_d sees of the state: all; all but p_x, p_y; or altitude and what the body feels, no yaw."""
-    residual_outputs: Literal["all", "accelerations"] = "all"
+    residual_inputs: ResidualInputs = "all"
+    """What f_d sees of the state: all; all but p_x, p_y; no yaw either; or altitude and what the body feels, no yaw."""
+    residual_outputs: ResidualOutputs = "all"
     """What f_d adds to: all 13 derivatives, or v̇ and ω̇ alone."""
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""

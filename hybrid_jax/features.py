@@ -53,6 +53,23 @@ class Placeless(View):
         return inside
 
 
+class TiltOnly(View):
+    """Blind to p_x, p_y and yaw, in the axes of the world: a wind keeps its direction, whichever way the nose points.
+
+    The field inside reads p_z [m], the direction of the world's up in the body, Rᵀe_z (3), the velocity [m/s, world]
+    and the body rates [rad/s] (10); what it returns is ẋ as it stands.
+    """
+
+    field: AbstractVectorField
+
+    def read(self, x):
+        up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
+        return jnp.concatenate([x[2:3], up, x[VELOCITY], x[BODY_RATES]])
+
+    def write(self, x, inside):
+        return inside
+
+
 class BodyFrame(View):
     """Blind to p_x, p_y and yaw: all is seen from the body, and turned into the world afterwards.
 
@@ -152,6 +169,7 @@ Wrapper = Callable[[AbstractVectorField], AbstractVectorField]
 INPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "no_xy": (STATE_SIZE - 2, Placeless),
+    "no_xy_yaw": (10, TiltOnly),
     "body": (10, BodyFrame),
     "body_motion": (9, BodyMotion),
 }
@@ -175,8 +193,8 @@ def restricted(
     """A network that reads and writes only part of a multirotor's state; by default all of it, as the paper's.
 
     Args:
-        inputs: "all" of x; "no_xy", without p_x and p_y; "body", seen from the body (see `BodyFrame`); "body_motion",
-            that without the height.
+        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`); "body",
+            seen from the body (see `BodyFrame`); "body_motion", that without the height.
         outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "motion", with ṗ and body rates as well (`Motion`).
         norm: as in `residual_network`.
 

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
-from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless
+from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor, Terms
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, check_start
@@ -37,7 +37,7 @@ def portable(kind: type) -> type:
 
 
 _FIELDS = (Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor, ResidualNetwork, RigidBody)
-_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)

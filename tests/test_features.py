@@ -113,6 +113,17 @@ def test_a_world_frame_network_does_see_yaw():
     assert (jnp.abs(deployed(field, turned(x, 1.0), u) - deployed(field, x, u))[BODY_RATES].max(0) > 1e-3).all()
 
 
+@pytest.mark.parametrize("outputs", ["all", "accelerations"])
+def test_without_yaw_a_turned_vehicle_is_the_same_in_the_axes_of_the_world(outputs):
+    """The attitude alone is turned; the velocity, which a wind of the world acts on, is not."""
+    field, (x, u) = view("no_xy_yaw", outputs), samples()
+    for yaw in (0.3, 2.0, -3.0):
+        other = x.at[QUATERNION].set(turned(x, yaw)[QUATERNION])
+        np.testing.assert_allclose(deployed(field, other, u), deployed(field, x, u), atol=1e-12)
+        moved = deployed(field, x.at[VELOCITY].set(turned(x, yaw)[VELOCITY]), u)
+        assert (jnp.abs(moved - deployed(field, x, u)).max(0) > 1e-3).all()
+
+
 def test_the_body_s_view_of_a_state():
     """Nose down by a right angle about y: the world's down is the body's forward, the world's x the body's up."""
     q = rotation.from_axis_angle(jnp.array([0.0, 1.0, 0.0]), jnp.asarray(np.pi / 2))
