@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
@@ -20,7 +21,7 @@ from hybrid_jax.state import BODY_RATES, State
 Scalar = Float[Array, ""]
 Path = Callable[[Scalar], tuple[Float[Array, "3"], Scalar]]
 
-X, Y, Z = jnp.eye(3).tolist()
+X, Y, Z = np.eye(3).tolist()
 
 
 def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
