@@ -194,8 +194,8 @@ class Controller:
         dampings = jnp.clip(point.damping * jnp.array(FACTORS, gradient.dtype), self.damping, MOST)
 
         def attempt(damping):
-            factor = jax.scipy.linalg.cho_factor(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype))
-            step = jax.scipy.linalg.cho_solve(factor, gradient).reshape(point.free.shape)
+            step = _solved(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
+            step = step.reshape(point.free.shape)
             free = jnp.clip(point.free - step, -FREE, FREE)
             states, cost = self._predict(model, reference, x, free)
             return _Point(free, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping)
@@ -236,6 +236,16 @@ class Controller:
 
         none = jnp.zeros((STATE_SIZE, self.steps, INPUT_SIZE), x.dtype)
         return jax.lax.scan(interval, none, (stages, jnp.arange(self.steps)))[1].reshape(self.steps, STATE_SIZE, -1)
+
+
+@jax.custom_batching.sequential_vmap
+def _solved(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
+    """matrix⁻¹ vector by Cholesky, one matrix after the other.
+
+    On a CPU a batch of factorisations is shared out to the threads on which devices run as well; two devices that do so
+    at once wait for each other for ever.
+    """
+    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)
 
 
 def _with_jacobian(function, x):
