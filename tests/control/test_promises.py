@@ -1,0 +1,46 @@
+"""What a plan promises and what it costs: laws of their comparison."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control import Controller, Disturbed, advance, fly, hover, realised, sample
+from hybrid_jax.control.cost import plan_cost
+from hybrid_jax.control.promises import Promises, excess, least_promise, promises
+
+CONTROLLER = Controller(hj.IRIS)
+BODY = hj.rigid_body(hj.IRIS)
+
+
+def test_promises_are_those_of_the_calls_one_by_one():
+    reference = sample(hover(), CONTROLLER, 0.3)
+
+    def plant(x, u, t):
+        return advance(Disturbed(BODY, jnp.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0])), x, u, CONTROLLER.period)
+
+    @jax.jit
+    def both():
+        flight = fly(plant, BODY, reference, reference[0], CONTROLLER)
+        found = promises(plant, flight, reference, CONTROLLER, [5, 20])
+        return found, flight.plans.cost[20], realised(plant, flight, reference, CONTROLLER, 20)
+
+    found, promised, cost = both()
+    np.testing.assert_allclose([found.promised[1], found.realised[1]], [promised, cost], rtol=1e-5)
+    assert found.realised[1] > 2 * found.promised[1]
+
+
+def test_the_least_promise_is_the_cost_of_being_so_far_off():
+    reference = sample(hover(), CONTROLLER, 0.01)[:20]
+    off = plan_cost(CONTROLLER.weights, reference, reference.at[:, 1].add(0.005), jnp.zeros((20, 4)))
+    np.testing.assert_allclose(off, least_promise(CONTROLLER), rtol=1e-4)
+    with pytest.raises(ValueError, match="distance must be"):
+        least_promise(CONTROLLER, 0.0)
+
+
+def test_excess_is_zero_for_a_promise_kept_and_does_not_explode_near_zero():
+    kept = Promises(jnp.array([1.0, 3.0]), jnp.array([1.0, 3.0]))
+    assert excess(kept, 0.07) == 0
+    assert excess(Promises(kept.promised, 1.1 * kept.realised), 0.07) == pytest.approx(0.1, rel=1e-5)
+    assert excess(Promises(jnp.array([0.0, 0.0]), jnp.array([0.007, 0.0])), 0.07) == pytest.approx(0.05, rel=1e-5)
