@@ -1,7 +1,7 @@
-"""A picture of the vehicle (Fig. 6). `python -m hybrid_jax.sim.render FILE.png` draws it with MuJoCo's own renderer.
+"""Pictures of the vehicle. `python -m hybrid_jax.sim.render FILE.png` draws it (Fig. 6) with MuJoCo's own renderer.
 
-MuJoCo chooses its OpenGL when it is first imported, so `picture` draws in a process of its own and tries one way after
-the other.
+MuJoCo chooses its OpenGL when it is first imported, so `picture` and `frames` draw in a process of its own and try one
+way after the other.
 """
 
 # MuJoCo's compiled modules carry no type stubs.
@@ -10,11 +10,17 @@ the other.
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float, UInt8
 
 WIDTH, HEIGHT = 1600, 1200  # pixels
 WAYS = ("egl", "osmesa")
 ALTITUDE = 0.30  # m
+FRAME_WIDTH, FRAME_HEIGHT = 320, 240
+FRAMES = "--frames"
 ATTITUDE = (0.995, -0.04, 0.07, 0.05)  # (w, x, y, z), not quite unit; MuJoCo normalises it
 
 
@@ -26,14 +32,32 @@ def picture(path: str | Path) -> None:
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: a picture's name must end in .png")
+    _drawn([str(path)], path)
+
+
+def frames(poses: Float[np.ndarray, "n 7"], place: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "n h w 3"]:
+    """The vehicle in these poses, position [m] and quaternion, seen from ahead, and a red mark at a place [m].
+
+    Raises:
+        ValueError: this machine cannot draw without a screen; says what to install.
+    """
+    with tempfile.TemporaryDirectory() as folder:
+        asked, drawn = Path(folder) / "poses.npy", Path(folder) / "frames.npy"
+        np.save(asked, np.vstack([np.pad(place, (0, 4)), poses]))
+        _drawn([FRAMES, str(asked), str(drawn)], "frames")
+        return np.load(drawn)
+
+
+def _drawn(arguments: list[str], what: str | Path) -> None:
+    """Run this module in a process of its own, in whichever way works."""
     chosen = os.environ.get("MUJOCO_GL")
     for way in (chosen,) if chosen else WAYS:
         environment = {**os.environ, "MUJOCO_GL": way}
-        command = [sys.executable, "-m", "hybrid_jax.sim.render", str(path)]
+        command = [sys.executable, "-m", "hybrid_jax.sim.render", *arguments]
         if subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0:
             return
     raise ValueError(
-        f"{path}: no renderer without a screen works here: install the system package libosmesa6 or libegl1 "
+        f"{what}: no renderer without a screen works here: install the system package libosmesa6 or libegl1 "
         "(set MUJOCO_GL to osmesa or egl to insist on one)"
     )
 
@@ -55,9 +79,38 @@ def draw(path: str | Path) -> None:
         matplotlib.image.imsave(path, renderer.render())
 
 
+def draw_frames(asked: str | Path, drawn: str | Path) -> None:
+    """Render in this process the poses in a file of `frames`, into another file."""
+    import mujoco
+
+    from hybrid_jax.sim.model import build_model
+    from hybrid_jax.vehicle import IRIS
+
+    place, *poses = np.load(asked)
+    model = build_model(IRIS)
+    data = mujoco.MjData(model)
+    camera = mujoco.MjvCamera()
+    camera.lookat, camera.distance, camera.azimuth, camera.elevation = place[:3], 1.5, 180.0, -12.0
+    images = []
+    with mujoco.Renderer(model, FRAME_HEIGHT, FRAME_WIDTH) as renderer:
+        for pose in poses:
+            data.qpos[:7] = pose
+            mujoco.mj_forward(model, data)
+            renderer.update_scene(data, camera=camera)
+            mark = renderer.scene.geoms[renderer.scene.ngeom]
+            kind, red = mujoco.mjtGeom.mjGEOM_SPHERE, np.array([0.85, 0.1, 0.1, 1.0], np.float32)
+            mujoco.mjv_initGeom(mark, kind, np.full(3, 0.03), place[:3], np.eye(3).ravel(), red)
+            renderer.scene.ngeom += 1
+            images.append(renderer.render().copy())
+    np.save(drawn, np.stack(images))
+
+
 def main(arguments: list[str]) -> int:
     """The command line: draw, here where MUJOCO_GL says how, otherwise in whichever way works. Exit code 2 and one line
     if none does."""
+    if len(arguments) == 3 and arguments[0] == FRAMES:
+        draw_frames(*arguments[1:])
+        return 0
     if len(arguments) != 1:
         print("render: give one file name, FILE.png", file=sys.stderr)
         return 2
