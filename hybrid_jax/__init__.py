@@ -8,7 +8,7 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 - least_squares, uncertainty, linear_adaptation, expert_augmentation: other ways to adapt, and how sure θ_p is.
 - hosts, lanes, sweep: every seed, size and rate a lane of one compiled program, on all devices of all hosts.
 - models, datasets, archive, files: what is kept.
-- rows, summary, claims, report, standings, ablations and the figures: what is told.
+- rows, summary, paired, claims, report, standings, ablations, closed_loop_* and the figures: what is told.
 - sim: the MuJoCo MJX quadrotor, its forces and its pilot.
 - flights: recorded flights, read, checked and cleaned.
 - control: closed-loop flight with any field: controller, references, disturbance observer.

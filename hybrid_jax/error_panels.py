@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
@@ -41,7 +42,7 @@ def draw_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0
     axes.set(xscale="log", xlim=limits, ylim=(len(lines) - 0.4, -0.6), title=title)
     axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
     axes.set_yticks(range(len(lines)), [line.name for line in lines])
-    _tick_errors(axes, *limits)
+    tick_errors(axes.xaxis, *limits)
     for y, line in enumerate(lines):
         mean = _draw_line(axes, y, line.errors, line.colour, limits)
         if line.marked and limits[0] < mean < limits[1]:
@@ -66,6 +67,15 @@ def add_legend(figure: Figure, failed: bool) -> None:
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2)
 
 
+def tick_errors(axis: Axis, low: float, high: float) -> None:
+    """Numbers at 1, 2, 5 of a decade; at round steps where a log axis is shorter, at decades where it is longer."""
+    decades = math.log10(high / low)
+    locator = LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.2 else (1.0,))
+    axis.set_major_locator(MaxNLocator(5) if decades < 0.8 else locator)
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
 def _limits(errors: Iterable[np.ndarray], floor: float) -> _Limits:
     """Around all errors within REACH of the smallest mean, so that one failed run does not flatten the rest."""
     drawn = [values[(values > 1 / DRAWABLE) & (values < DRAWABLE)] for values in errors]
@@ -75,15 +85,6 @@ def _limits(errors: Iterable[np.ndarray], floor: float) -> _Limits:
     near = np.concatenate([*drawn, [floor]])
     near = near[(near >= min(means) / REACH) & (near <= min(means) * REACH)]
     return near.min() / MARGIN, near.max() * MARGIN
-
-
-def _tick_errors(axes: Axes, low: float, high: float) -> None:
-    """Numbers at 1, 2, 5 of a decade; at round steps where the axis is shorter, at decades where it is longer."""
-    decades = math.log10(high / low)
-    locator = LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.2 else (1.0,))
-    axes.xaxis.set_major_locator(MaxNLocator(5) if decades < 0.8 else locator)
-    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.xaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: _Limits) -> float:

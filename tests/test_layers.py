@@ -10,15 +10,16 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     "state rotation files hosts runtime",
     "checks",
-    "vehicle archive lanes trajectories rows",
-    "vector_field datasets summary",
+    "vehicle archive lanes trajectories rows paired",
+    "vector_field datasets summary closed_loop_rows",
     "rigid_body residual rollout environment",
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation",
     "training expert_augmentation channels",
-    "sweep schedule error_panels report_page flight_figures standings",
-    "report comparison_figures ablations",
+    "sweep schedule error_panels report_page flight_figures standings closed_loop_tables",
+    "report comparison_figures ablations closed_loop_claims closed_loop_figures",
+    "closed_loop_paths",
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 # What each sub-package may import of the core: none of them learns or reports, and none knows another.
