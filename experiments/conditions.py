@@ -93,6 +93,13 @@ def drawn(seed: int, config: Config) -> np.ndarray:
     return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
 
 
+def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
+    """How a network sees rotor speeds."""
+    # Around hover, in tenths of it: then they are of the size of the other inputs.
+    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+    return {"hover": hover, "raw": InputScaling()}[config.inputs]
+
+
 def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
     if config.guess_off is None:
         return guess(vehicle, key, low=config.guess[0], high=config.guess[1])
@@ -100,15 +107,13 @@ def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBo
 
 
 def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
-    # Around hover, in tenths of it: then rotor speeds are of the size of the other inputs.
-    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
     return restricted(
         key,
         inputs=config.residual_inputs,
         outputs=config.residual_outputs,
         hidden=config.hidden,
         norm=config.norm,
-        scaling={"hover": hover, "raw": InputScaling()}[config.inputs],
+        scaling=input_scaling(vehicle, config),
     )
 
 

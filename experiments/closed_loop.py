@@ -1,0 +1,193 @@
+"""Does ten seconds of flight make the vehicle fly better? Every model as what a predictive controller believes in.
+
+python -m experiments.closed_loop --help
+"""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
+
+from rich.console import Console
+
+from experiments import command
+from experiments.call_times import call_times
+from experiments.closed_loop_ablation import Option, networks, unnormalised, variants
+from experiments.closed_loop_lanes import Airspace, Block
+from experiments.closed_loop_report import Outcome, write
+from experiments.common_field import CommonField
+from experiments.flyers import Trained, fleet, train
+from experiments.protocol import QUICK, SMOKE, Config, ResidualInputs, distinct, preset_like
+from hybrid_jax import checks, hosts
+from hybrid_jax.closed_loop_rows import Flyer
+from hybrid_jax.control import Controller
+from hybrid_jax.lanes import count, lane
+from hybrid_jax.rigid_body import rigid_body
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
+from hybrid_jax.vehicle import IRIS
+
+NAME = "closed_loop"
+DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
+Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
+Crew = dict[Flyer, CommonField]
+ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
+
+
+@dataclass(frozen=True)
+class ClosedLoopConfig(Config):
+    """Train as param_shift and external_force do (what they left in --cache is used), then fly both targets with a
+    model predictive controller that carries each model in turn: adapted with the smallest and the largest of --sizes.
+    """
+
+    seconds: float = 10.0
+    """Length of a flight [s]."""
+    references: tuple[Reference, ...] = get_args(Reference)
+    """What is flown at home."""
+    away: float = 60.0
+    """Distance from home [m] of the flights that are flown there as well."""
+    away_references: tuple[Reference, ...] = ABLATED
+    """What is flown there."""
+    bandwidth: float = 10.0
+    """Of the disturbance observer [rad/s]."""
+    safe_inputs: ResidualInputs = "no_xy_yaw"
+    """What the safe network sees (see --residual-inputs); it adds to v̇ and ω̇ alone."""
+    safe_source: int = 10_000
+    """Source trajectories of the safe network, if --source-train is more."""
+    safe_epochs: int = 2000
+    """Its cap on epochs, if --max-epochs is more."""
+    ablation: tuple[Option, ...] = get_args(Option)
+    """What to undo of the safe network. networks: what it reads and writes. statistics: batch statistics of the
+    target. quaternion: renormalised in each step of a prediction."""
+    ablation_source: int = 3000
+    """Source trajectories of the ablation's networks."""
+    ablation_epochs: int = 400
+    """Their cap on epochs."""
+    calls: int = 300
+    """Calls of the controller to time alone."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        for option in ("references", "away_references"):
+            distinct(f"--{option.replace('_', '-')}", getattr(self, option))
+        for option in ("seconds", "away", "bandwidth"):
+            checks.positive(f"--{option}", getattr(self, option))
+        if self.seconds < 1.0:
+            raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
+        if self.calls < 1:
+            raise ValueError(f"--calls must be at least 1, got {self.calls}")
+        if self.residual_outputs != "all":
+            raise ValueError(
+                "--residual-outputs accelerations: no_physics must write all derivatives; see the safe model"
+            )
+        if self.safe_inputs == "body" or self.residual_inputs == "body" or self.norm == "layer":
+            raise ValueError("--residual-inputs and --safe-inputs body, and --norm layer, cannot be flown here")
+
+
+PRESETS = {
+    "paper": ClosedLoopConfig(),
+    "quick": preset_like(
+        ClosedLoopConfig, QUICK, sizes=(100, 1000), seconds=6.0, references=ABLATED, away_references=("hover",),
+        ablation=(),
+    ),
+    "smoke": preset_like(
+        ClosedLoopConfig, SMOKE, sizes=(20,), seconds=1.0, references=("hover", "low_pass"), away_references=("hover",),
+        ablation=("statistics",), ablation_source=40, ablation_epochs=3, calls=20,
+    ),
+}  # fmt: skip
+
+
+def experiment(config: ClosedLoopConfig, console: Console) -> None:
+    """Train, fly and write what came of it."""
+    outcome = Outcome()
+    trained = models(config, console, outcome)
+    few, many = min(config.sizes), max(config.sizes)
+    crews = {domain.name: fleet(domain, IRIS, trained, few, many, config) for domain in DOMAINS}
+    capacity = max(sum(map(count, crew.values())) for crew in crews.values())
+
+    def airspace(controller: Controller) -> Airspace:
+        folder = config.cache / "closed_loop"
+        return Airspace(controller, config.seconds, config.bandwidth, capacity, folder, console, config.fresh)
+
+    usual = airspace(Controller(IRIS))
+    fly_models(config, usual, crews, outcome)
+    if config.ablation:
+        fly_ablation(config, usual, airspace(Controller(IRIS, unit_quaternion=False)), console, outcome)
+    outcome.speeds = speeds(config, trained)
+    if hosts.first():
+        write(NAME, config, outcome, Console())
+
+
+def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
+    """How long a call takes: with physics alone, with the paper's network and with the safe one."""
+    few = min(config.sizes)
+    fields = {Flyer("nominal"): rigid_body(IRIS)}
+    fields |= {
+        Flyer(name, few): lane(trained[name].adapted[PARAMETER_SHIFT.name, few], 0) for name in ("hybrid", "safe")
+    }
+    return {flyer.name: call_times(field, Controller(IRIS), config.calls) for flyer, field in fields.items()}
+
+
+def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:
+    """Every model of the table, by its name there."""
+    trained = {}
+    for name, model in MODELS.items():
+        trained[name] = _train(name, model, config, console, outcome)
+    # Of the sizes only the two that fly: nobody else has trained this network.
+    sizes = tuple(dict.fromkeys((min(config.sizes), max(config.sizes))))
+    seen: dict[str, Any] = {"residual_inputs": config.safe_inputs, "residual_outputs": "accelerations"}
+    own = limited(shared(config, sizes=sizes, pool=config.pooled(), **seen), config.safe_source, config.safe_epochs)
+    trained["safe"] = _train("safe", "hybrid", own, console, outcome)
+    return trained
+
+
+def fly_models(config: ClosedLoopConfig, space: Airspace, crews: dict[str, Crew], outcome: Outcome) -> None:
+    """Every model along every reference, at home and away."""
+    for domain in DOMAINS:
+        crew = crews[domain.name]
+        outcome.home += [space.fly(Block(domain, reference, 0.0, crew)) for reference in config.references]
+        alone = {flyer: model for flyer, model in crew.items() if not flyer.observer}
+        outcome.away += [space.fly(Block(domain, name, config.away, alone)) for name in config.away_references]
+
+
+def fly_ablation(
+    config: ClosedLoopConfig, usual: Airspace, drifting: Airspace, console: Console, outcome: Outcome
+) -> None:
+    """Train the ablation's networks and fly them, one change at a time."""
+    few = shared(config, sizes=(min(config.sizes),), pool=config.pooled())
+    small = limited(few, config.ablation_source, config.ablation_epochs)
+    trained, seconds, notes = networks(config.ablation, IRIS, small, console, DOMAINS)
+    outcome.seconds |= seconds
+    outcome.notes += notes
+    places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
+    for domain in DOMAINS:
+        crew = variants(config.ablation, domain, IRIS, trained, small)
+        outcome.ablation += [usual.fly(Block(domain, *place, crew)) for place in places]
+        if "quaternion" in config.ablation:
+            crew = unnormalised(domain, IRIS, trained, small)
+            outcome.ablation += [drifting.fly(Block(domain, *place, crew)) for place in places]
+
+
+def shared(config: ClosedLoopConfig, **changes: Any) -> Config:
+    """What the configuration shares with other experiments, and so with what these have trained."""
+    return Config(**{name: getattr(config, name) for name in Config.__dataclass_fields__} | changes)
+
+
+def limited(config: Config, source: int, epochs: int) -> Config:
+    """The configuration with at most so much source flight and so many epochs."""
+    return replace(config, source_train=min(config.source_train, source), max_epochs=min(config.max_epochs, epochs))
+
+
+def _train(name: str, model: str, config: Config, console: Console, outcome: Outcome) -> Trained:
+    found, stages = train(name, model, IRIS, config, console, DOMAINS)
+    outcome.seconds |= {f"{name}, {stage}": seconds for stage, seconds in stages.seconds.items()}
+    outcome.notes += [f"{name}: {note}" for note in stages.notes()]
+    return found
+
+
+def main() -> None:
+    """The command line."""
+    about = "Does ten seconds of flight make the vehicle fly better? A model predictive controller carries every model."
+    command.run(NAME, about, experiment, presets=PRESETS)
+
+
+if __name__ == "__main__":
+    main()

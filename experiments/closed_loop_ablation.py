@@ -1,0 +1,70 @@
+"""What makes a network safe for control, one option at a time: what it reads and writes, and how it is flown."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any, Literal
+
+from rich.console import Console
+
+from experiments.common_field import CommonField
+from experiments.flyers import Trained, in_common, train, with_statistics_of
+from experiments.protocol import Config, ResidualInputs, ResidualOutputs
+from hybrid_jax.closed_loop_rows import Flyer
+from hybrid_jax.sim.domain import Domain
+from hybrid_jax.vehicle import Vehicle
+
+Option = Literal["networks", "statistics", "quaternion"]
+PAPER, SAFE = "paper: all of x → all 13", "safe: no p_x, p_y, yaw → v̇, ω̇"
+NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
+    PAPER: ("all", "all"),
+    "no p_x, p_y → all 13": ("no_xy", "all"),
+    "all of x → v̇, ω̇": ("all", "accelerations"),
+    "no p_x, p_y → v̇, ω̇": ("no_xy", "accelerations"),
+    SAFE: ("no_xy_yaw", "accelerations"),
+}
+COMPARED = (PAPER, SAFE)  # what is flown in the wrong way as well
+
+
+def networks(
+    options: Sequence[Option], vehicle: Vehicle, config: Config, console: Console, domains: Sequence[Domain]
+) -> tuple[dict[str, Trained], dict[str, float], list[str]]:
+    """The trained networks by name, the seconds of their stages, and notes on these."""
+    trained, seconds, notes = {}, {}, []
+    for name, (inputs, outputs) in NETWORKS.items():
+        if "networks" in options or name in COMPARED:
+            other = replace(config, residual_inputs=inputs, residual_outputs=outputs)
+            trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, other, console, domains)
+            seconds |= {f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()}
+            notes += [f"{name}: {note}" for note in stages.notes()]
+    return trained, seconds, notes
+
+
+def variants(
+    options: Sequence[Option], domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], config: Config
+) -> dict[Flyer, CommonField]:
+    """What flies with the usual controller: each network, and with the statistics of the source."""
+    (few,) = config.sizes
+    fields: dict[Flyer, Any] = {flyer(name, few): found.adapted[domain.name, few] for name, found in trained.items()}
+    if "statistics" in options and config.norm == "batch":
+        for name in COMPARED:
+            field = trained[name].adapted[domain.name, few]
+            wrong = with_statistics_of(trained[name].source, field)
+            fields[flyer(name, few, "batch statistics of the source")] = wrong
+    return {who: in_common(field, vehicle, config) for who, field in fields.items()}
+
+
+def unnormalised(
+    domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], config: Config
+) -> dict[Flyer, CommonField]:
+    """What flies with a controller whose predictions let the quaternion's length drift."""
+    (few,) = config.sizes
+    return {
+        flyer(name, few, "|q| not renormalised"): in_common(trained[name].adapted[domain.name, few], vehicle, config)
+        for name in COMPARED
+    }
+
+
+def flyer(name: str, few: int, how: str = "") -> Flyer:
+    """A network under the name of what was changed."""
+    model = "safe" if name == SAFE else "hybrid"
+    return Flyer(model, few, variant=f"{name.partition(':')[0]}, {how}" if how else name)

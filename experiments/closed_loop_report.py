@@ -1,0 +1,194 @@
+"""What the closed-loop experiment leaves in its folder: report.json, rows.csv, report.md and the figures."""
+
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from matplotlib.figure import Figure
+from rich.console import Console
+
+from experiments.closed_loop_lanes import DRAW_EVERY, PATHS, Flights
+from hybrid_jax import closed_loop_figures as figures
+from hybrid_jax.closed_loop_claims import Speed, claims
+from hybrid_jax.closed_loop_paths import paths, strip
+from hybrid_jax.closed_loop_rows import FlightRow, Flyer, to_csv
+from hybrid_jax.closed_loop_tables import ablation_tables, gap_tables, speed_table, tables
+from hybrid_jax.control import Controller, sample
+from hybrid_jax.environment import environment
+from hybrid_jax.figures import save_figure
+from hybrid_jax.files import json_text, json_value, write_whole
+from hybrid_jax.report import print_tables
+from hybrid_jax.report_page import sections
+from hybrid_jax.report_tables import Table, verdicts
+from hybrid_jax.rows import NAMES
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
+from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
+from hybrid_jax.state import POSITION
+from hybrid_jax.vehicle import IRIS
+
+SHOWN_TIMES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # s, of the strip
+HEAD = """# closed_loop
+
+A model predictive controller flies the simulated quadrotor after a change that its models have or have not adapted to:
+other moments of inertia (parameter shift), or a side wind of 4 N with a sine of 1 N (external force). Every 0.01 s it
+plans 1 s ahead with the model that it carries; nothing else differs between the flights of a column. The truth's state
+is known to it without noise.
+
+- **nominal physics**: the rigid body as in the data sheet, never trained
+- **physics**: the same, its Ix, Iy, k fitted to N target trajectories of 0.1 s
+- **hybrid**: physics plus the paper's network, trained on source flight (source), then on N target trajectories
+- **no-physics**: the paper's network alone
+- **safe hybrid**: a hybrid whose network sees neither p_x, p_y nor yaw and adds to v̇ and ω̇ alone
+- **true vehicle, mean wind**: the simulator's own equations and the wind's mean, the best that no clock can beat
+- **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
+
+RMSE: over the flight after its start. A flight crashed if it went below the ground or 10 m astray, and then counts as
+infinitely far off. Promised: what the plan of a call costs by the model; realised: what its inputs, flown for 1 s
+without another call, cost in the truth; of calls every 0.5 s.
+"""
+
+
+@dataclass
+class Outcome:
+    """All that the report is made of.
+
+    Attributes:
+        home, away, ablation: blocks of flights.
+        speeds: by model, see `call_times`.
+        seconds: of the stages of training.
+        notes: on these.
+    """
+
+    home: list[Flights] = field(default_factory=list)
+    away: list[Flights] = field(default_factory=list)
+    ablation: list[Flights] = field(default_factory=list)
+    speeds: dict[str, dict[str, float]] = field(default_factory=dict)
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def flights(self) -> list[Flights]:
+        """All blocks."""
+        return [*self.home, *self.away, *self.ablation]
+
+
+def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
+    """Write everything, report.json last, and print the tables."""
+    out, few = config.out / name, min(config.sizes)
+    rows, ablated = (rows_of(blocks) for blocks in ([*outcome.home, *outcome.away], outcome.ablation))
+    judged = claims(rows, few, speed_of(outcome, config.seconds, few))
+    told = [
+        verdicts(judged)._replace(title="What was to be reached"),
+        *tables(rows),
+        *gap_tables(rows),
+        *ablation_tables(ablated),
+        speed_table(outcome.speeds),
+    ]
+    drawn, missing = draw(rows, ablated, outcome, few)
+    for file, (figure, _) in drawn.items():
+        save_figure(figure, out / file)
+    seconds = outcome.seconds | {f"flights {block.block.name}": block.seconds for block in outcome.flights()}
+    record = {
+        "experiment": name,
+        "config": config.described(),
+        "environment": environment(seconds),
+        "rows": [asdict(row) for row in rows],
+        "ablation": [asdict(row) for row in ablated],
+        "claims": [asdict(claim) for claim in judged if claim.holds is not None],
+        "not_judged": [{"id": c.id, "text": c.text, "why": c.measured} for c in judged if c.holds is None],
+        "speed": outcome.speeds,
+        "figures": {f"{file}.png": caption for file, (_, caption) in drawn.items()},
+        "notes": [*missing, *outcome.notes],
+    }
+    for file, text in texts(json_value(record), told, to_csv([*rows, *ablated])).items():
+        write_whole(out / file, text)
+    print_tables(console, told)
+
+
+def texts(record: dict[str, Any], told: Sequence[Table], csv: str) -> dict[str, str]:
+    """The text of each file; the record, as JSON values, last."""
+    used = json.dumps(record["config"], indent=1, ensure_ascii=False)
+    page = sections(HEAD.strip(), told, record["figures"], record["notes"], record["environment"], used)
+    return {"rows.csv": csv, "report.md": page, "report.json": json_text(record)}
+
+
+def rows_of(blocks: Sequence[Flights]) -> list[FlightRow]:
+    """The rows of all flights."""
+    return [row for block in blocks for row in block.rows()]
+
+
+def speed_of(outcome: Outcome, seconds: float, few: int) -> Speed:
+    """How fast it was."""
+    call = outcome.speeds[Flyer("hybrid", few).name]
+    blocks = outcome.flights()
+    return Speed(
+        call_ms=call["processor_ms"],
+        median_ms=call["median_ms"],
+        lane_seconds=seconds * sum(len(block.block.keys()) for block in blocks),
+        seconds=sum(block.seconds for block in blocks),
+        processor_seconds=sum(block.processor_seconds for block in blocks),
+        devices=blocks[0].devices,
+    )
+
+
+def draw(
+    rows: Sequence[FlightRow], ablated: Sequence[FlightRow], outcome: Outcome, few: int
+) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
+    """Figures with their captions by file, and notes on what could not be drawn."""
+    made: dict[str, tuple[Figure, str]] = {}
+    followed = (Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few), Flyer("oracle"))
+    for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
+        name = NAMES[domain]
+        made[f"errors_{domain}"] = figures.errors(rows, domain), f"Position RMSE of all seeds of all models, {name}"
+        made[f"gap_{domain}"] = figures.shares(rows, domain), f"How much of the gap to the truth is closed, {name}"
+        made[f"paths_{domain}"] = flown_paths(outcome.home, domain, followed), f"Flights of seed 0, {name}"
+        if ablated:
+            made[f"ablation_{domain}"] = figures.ablation(ablated, domain), f"The safe network's options, {name}"
+    made["promises"] = figures.promised(rows, followed), "Promised and realised cost of plans"
+    made["away"] = figures.far_from_home(rows), "The same flights far from home"
+    try:
+        made["strip"] = rendered(outcome.home, few), "Hover in the wind, rendered; the red mark is the reference"
+    except ValueError as error:  # no renderer
+        return made, [f"The strip of pictures is missing: {error}."]
+    return made, []
+
+
+def flown_paths(blocks: Sequence[Flights], domain: str, flyers: Sequence[Flyer]) -> Figure:
+    """The flights of seed 0 of some models beside their references."""
+    own = {block.block.reference: block for block in blocks if block.block.domain.name == domain}
+    chosen = [name for name in ("hover", "figure_eight", "low_pass") if name in own]
+    flights = {name: {flyer: own[name].states(flyer) for flyer in flyers} for name in chosen}
+    controller = Controller(IRIS)
+    dt = DRAW_EVERY * controller.period
+    wanted = {}
+    for name in chosen:
+        length = len(own[name].states(flyers[0]))
+        states = sample(PATHS[name], controller, dt * (length - 1))
+        wanted[name] = np.asarray(states[: DRAW_EVERY * length : DRAW_EVERY])
+    return paths(flights, wanted, dt, f"{NAMES[domain].capitalize()}: flights of one seed")
+
+
+def rendered(blocks: Sequence[Flights], few: int) -> Figure:
+    """Hover in the wind, before and after adaptation, as pictures.
+
+    Raises:
+        ValueError: this machine cannot draw without a screen, or nothing hovered.
+    """
+    found = [b for b in blocks if (b.block.domain.name, b.block.reference) == (EXTERNAL_FORCE.name, "hover")]
+    if not found:
+        raise ValueError("nothing hovered in the wind")
+    dt = DRAW_EVERY * Controller(IRIS).period
+    place = np.asarray(PATHS["hover"](jnp.zeros(()))[0])
+    flyers = (Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few))
+    states = np.stack([found[0].states(flyer) for flyer in flyers])
+    times = [t for t in SHOWN_TIMES if t < dt * states.shape[1]]
+    shown = states[:, [round(t / dt) for t in times]]
+    if not np.isfinite(shown).all():
+        raise ValueError("a flight is not finite")
+    images = frames(shown[..., :7].reshape(-1, 7), place).reshape(*shown.shape[:2], FRAME_HEIGHT, FRAME_WIDTH, 3)
+    pictures = {flyer.name: images[i] for i, flyer in enumerate(flyers)}
+    off = np.linalg.norm(shown[..., POSITION] - place, axis=-1)
+    errors = {flyer.name: off[i] for i, flyer in enumerate(flyers)}
+    return strip(pictures, times, errors, "Hover in the wind: the red mark is where to stay")

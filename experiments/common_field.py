@@ -1,0 +1,151 @@
+"""One vector field of which every model that flies is a special case, so that all of them are lanes of one program."""
+
+from dataclasses import asdict
+from typing import Any
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import rotation
+from hybrid_jax.features import Accelerations, Placeless, TiltOnly, View
+from hybrid_jax.residual import BatchNorm, Bias, InputScaling, ResidualNetwork
+from hybrid_jax.rigid_body import RigidBody, nominal, rigid_body
+from hybrid_jax.sim.domain import Domain
+from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
+from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid
+from hybrid_jax.vehicle import Vehicle
+
+UP_SIZE = 3
+NOW = 0.0  # s: forces that are known here do not change with time
+
+Scalar = Float[Array, ""]
+
+
+class CommonField(AbstractVectorField):
+    """ẋ = s f_p(x, u) + (drag, ground effect, a steady force) + f_d(x, Rᵀe_z, u).
+
+    Attributes:
+        share: s, 1, or 0 for a network alone.
+        body: f_p.
+        drag: [kg/s].
+        ground: 1 with ground effect, 0 without.
+        push: steady force [N, world].
+        network: f_d; reads the state and the direction of the world's up in the body. Its norm is a bias.
+    """
+
+    share: Scalar
+    body: RigidBody
+    drag: Scalar
+    ground: Scalar
+    push: Float[Array, "3"]
+    network: ResidualNetwork
+
+    def __call__(self, x: State, u: Input) -> State:
+        up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
+        learned = self.network(jnp.concatenate([x, up]), u)
+        return self.share * self.body(x, u) + self._forces(x, u) + learned
+
+    def _forces(self, x: State, u: Input) -> State:
+        vehicle, theta = self.body.vehicle, self.body.theta()
+        known = eqx.tree_at(lambda p: p.drag_coefficient, parameters_of(vehicle), self.drag)
+        now = jnp.asarray(NOW, x.dtype)
+        air, ground = drag(x, u, now, known), ground_effect(x, u, now, known)
+        torque = rotation.rotate(rotation.conjugate(x[QUATERNION]), self.ground * ground.torque)
+        inertia = jnp.stack([theta["Ix"], theta["Iy"], jnp.asarray(vehicle.inertia[2], x.dtype)])
+        force = air.force + self.ground * ground.force + self.push
+        still = jnp.zeros_like(x, shape=VELOCITY.start)
+        return jnp.concatenate([still, force / vehicle.mass, torque / inertia])
+
+
+def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
+    """A rigid body, a network or their hybrid in the common form; a single one, so map it over stacked ones.
+
+    Args:
+        hidden, scaling: of the networks of all lanes.
+
+    Raises:
+        ValueError: a field of another kind, or a network whose norm is no affine map of a sample.
+    """
+    match field:
+        case Hybrid(physics=RigidBody() as body):
+            share, network = 1.0, wide(field.residual)
+        case RigidBody() as body:
+            share, network = 1.0, silent(hidden, scaling)
+        case _:
+            share, network, body = 0.0, wide(field), rigid_body(vehicle)
+    return CommonField(jnp.asarray(share), body, jnp.zeros(()), jnp.zeros(()), jnp.zeros(3), network)
+
+
+def true_field(domain: Domain, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
+    """The true vehicle of a domain under its own forces, of the wind the mean: the best model without a clock.
+
+    Args:
+        vehicle: that of the other lanes, from which the true one may differ in Ix, Iy and k.
+    """
+    truth = nominal(domain.vehicle)
+    body = RigidBody({name: jnp.log(truth[name] / value) for name, value in nominal(vehicle).items()}, vehicle)
+    push = jnp.array([0.0, WIND_MEAN if wind in domain.forces else 0.0, 0.0])
+    air = jnp.asarray(domain.drag_coefficient)
+    return CommonField(jnp.ones(()), body, air, jnp.ones(()), push, silent(hidden, scaling))
+
+
+def silent(hidden: int, scaling: InputScaling) -> ResidualNetwork:
+    """A network that returns zero."""
+    reads = STATE_SIZE + UP_SIZE + INPUT_SIZE
+    return ResidualNetwork(
+        weight_in=jnp.zeros((hidden, reads)),
+        norm=Bias(jnp.zeros(hidden)),
+        weight_out=jnp.zeros((STATE_SIZE, hidden)),
+        bias_out=jnp.zeros(STATE_SIZE),
+        scaling=scaling,
+    )
+
+
+def wide(field: Any) -> ResidualNetwork:
+    """The network in a view as one that reads [x, Rᵀe_z, u] and writes all of ẋ, as it is deployed.
+
+    Raises:
+        ValueError: as `common`.
+    """
+    columns, rows = np.arange(STATE_SIZE), np.arange(STATE_SIZE)
+    while isinstance(field, View):
+        match field:
+            case Placeless():
+                columns = columns[2:]
+            case TiltOnly():
+                up = STATE_SIZE + np.arange(UP_SIZE)
+                columns = np.concatenate([[2], up, columns[VELOCITY], columns[BODY_RATES]])
+            case Accelerations():
+                rows = rows[VELOCITY.start :]
+            case _:
+                raise ValueError(f"--residual-inputs: a network behind {type(field).__name__} cannot be flown here")
+        field = field.field
+    if not isinstance(field, ResidualNetwork):
+        raise ValueError(f"a model must be a rigid body, a network or a hybrid of these, got {type(field).__name__}")
+    weight, shift = _affine(field)
+    empty = silent(len(shift), field.scaling)
+    columns = np.concatenate([columns, STATE_SIZE + UP_SIZE + np.arange(INPUT_SIZE)])
+    return ResidualNetwork(
+        weight_in=empty.weight_in.at[:, columns].set(weight),
+        norm=Bias(shift),
+        weight_out=empty.weight_out.at[rows].set(field.weight_out),
+        bias_out=empty.bias_out.at[rows].set(field.bias_out),
+        scaling=field.scaling,
+    )
+
+
+def _affine(network: ResidualNetwork) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
+    match network.norm:
+        case BatchNorm():
+            return network.norm.fold(network.weight_in)
+        case Bias():
+            return network.weight_in, network.norm.shift
+    raise ValueError(f"--norm: a network with {type(network.norm).__name__} cannot be flown here, only batch or none")
+
+
+def described(field: CommonField) -> dict[str, Any]:
+    """What is the same for all lanes, as JSON values."""
+    return {"vehicle": asdict(field.body.vehicle), "scaling": [*asdict(field.network.scaling).values()]}

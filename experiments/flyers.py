@@ -1,0 +1,102 @@
+"""What flies: every model of the closed loop, trained or known, by who it is; all stages come from the shared cache."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from rich.console import Console
+
+from experiments.common_field import CommonField, common, true_field
+from experiments.conditions import input_scaling
+from experiments.protocol import Config
+from experiments.stages import Stages, stages_of
+from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
+from hybrid_jax.closed_loop_rows import Flyer
+from hybrid_jax.lanes import lane
+from hybrid_jax.residual import BatchNorm, InputScaling
+from hybrid_jax.rigid_body import rigid_body
+from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.vector_field import AbstractVectorField
+from hybrid_jax.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class Trained:
+    """A model before and after adaptation, one lane a seed; `adapted` by domain and N."""
+
+    source: AbstractVectorField
+    adapted: dict[tuple[str, int], AbstractVectorField]
+
+
+def train(
+    name: str, model: str, vehicle: Vehicle, config: Config, console: Console, domains: Sequence[Domain]
+) -> tuple[Trained, Stages]:
+    """Pre-train a model and adapt it to each domain.
+
+    Args:
+        name: of the stages, for people.
+        model: what `experiments.conditions` calls it.
+    """
+    console.print(name, style="bold", highlight=False)
+    stages = stages_of(config, console)
+    start = pretrained(model, vehicle, config, stages, flown(SOURCE, source_splits(config), config, stages)).best
+    sizes, _ = places(config.sizes, config)
+    found = {}
+    for domain in domains:
+        target = flown(domain, target_splits(config), config, stages)
+        final = adapted(model, "fine_tuned", start, config, stages, target).best
+        for size in config.sizes:
+            found[domain.name, size] = lane(final, np.flatnonzero(np.equal(sizes, size)))
+    return Trained(start, found), stages
+
+
+def fleet(
+    domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], few: int, many: int, config: Config
+) -> dict[Flyer, CommonField]:
+    """All that flies in a domain, in the common form: a lane for each seed, or one of a model that was not trained.
+
+    Args:
+        trained: "physics", "hybrid", "no_physics", "safe".
+    """
+    fields: dict[Flyer, Any] = {Flyer("nominal"): single(rigid_body(vehicle))}
+    for model, found in trained.items():
+        if model in ("hybrid", "safe"):
+            fields[Flyer(model)] = found.source
+        sizes = (few,) if model == "physics" else dict.fromkeys((few, many))
+        fields |= {Flyer(model, size): found.adapted[domain.name, size] for size in sizes}
+    for flyer in (Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few)):
+        fields[replace(flyer, observer=True)] = fields[flyer]
+    truth = true_field(domain, vehicle, config.hidden, input_scaling(vehicle, config))
+    return {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()} | {
+        Flyer("oracle"): single(truth)
+    }
+
+
+def in_common(fields: AbstractVectorField, vehicle: Vehicle, config: Config) -> CommonField:
+    """Stacked fields as stacked lanes of the common form."""
+    return jax.device_get(_in_common(fields, vehicle, config.hidden, input_scaling(vehicle, config)))
+
+
+@eqx.filter_jit
+def _in_common(fields, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
+    return eqx.filter_vmap(lambda field: common(field, vehicle, hidden, scaling))(fields)
+
+
+def single(field: Any) -> Any:
+    """One field as a stack of one."""
+    return jax.tree.map(lambda leaf: np.asarray(leaf)[None], field)
+
+
+def with_statistics_of(source: AbstractVectorField, field: AbstractVectorField) -> AbstractVectorField:
+    """The field with the running statistics of batch normalisation of another one: the trap of the wrong domain."""
+
+    def norms(tree) -> list[BatchNorm]:
+        nodes = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, BatchNorm))
+        return [node for node in nodes if isinstance(node, BatchNorm)]
+
+    return eqx.tree_at(
+        lambda tree: [norm.running for norm in norms(tree)], field, [norm.running for norm in norms(source)]
+    )
