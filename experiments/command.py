@@ -14,7 +14,7 @@ import tyro
 from filelock import FileLock, Timeout
 from rich.console import Console
 
-from experiments.protocol import PRESETS, Config
+from experiments.protocol import PRESETS, Run
 from experiments.run_record import OtherRun, recorded
 from hybrid_jax import hosts
 from hybrid_jax.runtime import configure
@@ -31,7 +31,7 @@ def run(
     about: str,
     experiment: Callable[[Any, Console], None],
     arguments: Sequence[str] | None = None,
-    presets: Mapping[str, Config] = PRESETS,
+    presets: Mapping[str, Run] = PRESETS,
 ) -> None:
     """Read the command line and run an experiment. Bad input ends in one line on stderr and exit code 2.
 
@@ -89,7 +89,7 @@ def _terminate(signal_number, frame) -> None:
     raise Terminated
 
 
-def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Config] = PRESETS) -> Config:
+def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Run] = PRESETS) -> Run:
     """The configuration of a command line: the preset, and what the other options change of it.
 
     Raises:
@@ -97,7 +97,8 @@ def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Conf
     """
     preset = presets[_preset(arguments)]
     kind = type(preset)
-    description = "\n\n".join((about, kind.__doc__ or "", Config.__doc__ or ""))
+    described = [each.__doc__ or "" for each in kind.__mro__ if issubclass(each, Run)]
+    description = "\n\n".join([about, *described])
     said = io.StringIO()
     try:
         with contextlib.redirect_stderr(said):
@@ -140,4 +141,4 @@ def _preset(arguments: list[str]) -> str:
             if chosen not in PRESETS:
                 raise ValueError(f"--preset must be one of {', '.join(PRESETS)}, got {chosen!r}")
             return chosen
-    return Config.preset
+    return Run.preset

@@ -74,9 +74,9 @@ class Encoding:
 
 
 @dataclass(frozen=True)
-class Config:
-    """What all experiments share. Without options this is the paper's full protocol. Results are written to --out;
-    flights and finished stages are kept in --cache and reused by any run that needs the same ones.
+class Run:
+    """Results are written to --out; flights and finished stages are kept in --cache and reused by any run that needs
+    the same ones.
     """
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
@@ -91,6 +91,33 @@ class Config:
     """Share of a sweep's time that saving its state may take; what a kill can cost grows as this shrinks."""
     seeds: int = 10
     """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
+    distributed: bool = False
+    """Be one of several processes, on one machine or many, that share the lanes: start the same command for each.
+    Process 0 writes. Who is who says the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU) or the next three options."""
+    coordinator: str | None = None
+    """With --distributed: host:port of process 0, a port that is free there and that all can reach."""
+    processes: int | None = None
+    """With --distributed: how many there are."""
+    process_id: int | None = None
+    """With --distributed: which of them this is, from 0."""
+
+    def __post_init__(self):
+        if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
+            raise ValueError("--coordinator, --processes and --process-id need --distributed")
+        if self.seeds < 1:
+            raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
+        if not 0 < self.saving <= 1:
+            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
+
+    def described(self) -> dict[str, Any]:
+        """All that fixes the results: where files lie, how often state is saved and where it runs do not."""
+        return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
+
+
+@dataclass(frozen=True)
+class Config(Run):
+    """What all experiments in simulation share. Without options this is the paper's full protocol."""
+
     sizes: tuple[int, ...] = TABLE_SIZES
     """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
@@ -131,20 +158,10 @@ class Config:
     """Cap; a run that hits it is marked in the report."""
     rates: Rates = Rates()
     patience: Patience = Patience()
-    distributed: bool = False
-    """Be one of several processes, on one machine or many, that share the lanes: start the same command for each.
-    Process 0 writes. Who is who says the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU) or the next three options."""
-    coordinator: str | None = None
-    """With --distributed: host:port of process 0, a port that is free there and that all can reach."""
-    processes: int | None = None
-    """With --distributed: how many there are."""
-    process_id: int | None = None
-    """With --distributed: which of them this is, from 0."""
 
     def __post_init__(self):
-        if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
-            raise ValueError("--coordinator, --processes and --process-id need --distributed")
-        for name in ("seeds", "source_train", "validation", "test", "hidden", "batch_size", "max_epochs"):
+        Run.__post_init__(self)
+        for name in ("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
         if not self.sizes or min(self.sizes) < self.batch_size:
@@ -157,18 +174,12 @@ class Config:
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
         if self.noise < 0 or (self.guess_off is not None and self.guess_off <= 0):
             raise ValueError(f"--noise must be >= 0, --guess-off > 0, got {self.noise} and {self.guess_off}")
-        if not 0 < self.saving <= 1:
-            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
         if not 0 < self.guess[0] < self.guess[1]:
             raise ValueError(f"--guess must be two factors, low < high, above 0, got {self.guess}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
             group, entry = name.split(".")
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
-
-    def described(self) -> dict[str, Any]:
-        """All that fixes the results: where files lie, how often state is saved and where it runs do not."""
-        return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
     def pooled(self) -> int:
         """The number of target trajectories from which a seed draws."""

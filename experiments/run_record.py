@@ -7,7 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.protocol import Config
+from experiments.protocol import Run
 from hybrid_jax.datasets import versions
 from hybrid_jax.environment import PACKAGES
 from hybrid_jax.files import aside, json_text, json_value, read_json, write_whole
@@ -22,7 +22,7 @@ class OtherRun(ValueError):
 
 
 @contextmanager
-def recorded(folder: Path, config: Config, say: Callable[[str], None]) -> Iterator[None]:
+def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
     """Note in a folder that a run was begun there, and at the end that it is finished.
 
     A run that ends in bad input was not begun: what was noted before stands again.
@@ -52,7 +52,7 @@ def recorded(folder: Path, config: Config, say: Callable[[str], None]) -> Iterat
     _write(folder, record, "finished")
 
 
-def describe(config: Config) -> dict[str, Any]:
+def describe(config: Run) -> dict[str, Any]:
     """All that fixes the results, as JSON values, and the time [UTC, ISO 8601]."""
     options = config.described()
     given = {name: value for name, value in options.items() if isinstance(value, Path)}

@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.checkpoints import Checkpoints
 from experiments.interrupts import Held
 from experiments.progress import SweepLine, clock
-from experiments.protocol import Config
+from experiments.protocol import Run
 from experiments.run_record import require_same
 from hybrid_jax import hosts
 from hybrid_jax.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
@@ -143,7 +143,7 @@ class Stages:
         self._console.print(line, highlight=False, soft_wrap=True)
 
 
-def stages_of(config: Config, console: Console) -> Stages:
+def stages_of(config: Run, console: Console) -> Stages:
     """The stages of an experiment, in its cache folder."""
     return Stages(config.cache / "sweeps", console, config.saving, config.fresh)
 
