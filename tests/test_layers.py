@@ -10,15 +10,15 @@ ROOT = Path(__file__).parents[1]
 FLOORS = (
     "state rotation files hosts runtime",
     "checks",
-    "vehicle archive lanes trajectories rows paired",
+    "vehicle archive lanes trajectories rows paired flight_rows",
     "vector_field datasets summary closed_loop_rows",
     "rigid_body residual rollout environment",
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
-    "objective report_tables figures uncertainty linear_adaptation",
+    "objective report_tables figures uncertainty linear_adaptation flight_claims",
     "training expert_augmentation channels",
-    "sweep schedule error_panels report_page flight_figures standings closed_loop_tables",
-    "report comparison_figures ablations closed_loop_claims closed_loop_figures",
+    "sweep schedule error_panels report_page flight_figures standings closed_loop_tables flight_tables",
+    "report comparison_figures ablations closed_loop_claims closed_loop_figures recorded_flight_figures",
     "closed_loop_paths",
 )
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}

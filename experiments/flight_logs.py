@@ -1,0 +1,160 @@
+"""Folders of logs: read, checked against the vehicle, cleaned as asked for, and what of this a report must say."""
+
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import jax
+import numpy as np
+
+from experiments.flight_protocol import Cleaning, RealFlightConfig
+from hybrid_jax.flights.cleaning import align_motors, delay_motors, lag_motors, low_pass, resample, windows
+from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
+from hybrid_jax.flights.consistency import FAILS, check_log
+from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.segments import gaps, repeats, segments
+from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.flights.ulog import read_ulog
+from hybrid_jax.trajectories import Trajectories, concatenate
+from hybrid_jax.vehicle import Vehicle
+
+SUFFIXES = (".csv", ".csv.gz", ".ulg")
+
+
+@dataclass(frozen=True)
+class Flown:
+    """The flights of one folder.
+
+    Attributes:
+        label: what they are for: "source", "target" or "test".
+        logs: cleaned.
+        records: of each flight, as JSON values: its samples, its gaps, the checks on it as it was read, what was done.
+    """
+
+    label: str
+    logs: list[FlightLog]
+    records: list[dict[str, Any]]
+
+
+def fly_in(option: str, folder: Path, vehicle: Vehicle, time_constant: float, config: RealFlightConfig) -> Flown:
+    """All flights of a folder.
+
+    Args:
+        option: by which the folder was given, without dashes.
+        time_constant: of the vehicle's rotors behind the log's motor values [s].
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    columns = None if config.columns is None else load_column_map(config.columns)
+    logs, records = [], []
+    for path in _files(option, folder):
+        raw = _read(path, columns, config)
+        log, done = cleaned(raw, config.cleaning, vehicle)
+        if time_constant:
+            log, said = lag_motors(log, time_constant)
+            done.append(said)
+        logs.append(log)
+        records.append({"folder": option} | _record(raw, log, vehicle, done))
+    return Flown(option, logs, records)
+
+
+def require_one_rate(flown: Sequence[Flown]) -> float:
+    """The interval [s] between samples, the same in all flights.
+
+    Raises:
+        ValueError: two flights of which it differs.
+    """
+    logs = [log for each in flown for log in each.logs]
+    for log in logs:
+        if log.dt != logs[0].dt:
+            raise ValueError(
+                f"{log.name}: samples are {log.dt:g} s apart, those of {logs[0].name} {logs[0].dt:g} s; "
+                f"give all the same with --cleaning.resample {max(log.dt, logs[0].dt):g}"
+            )
+    return logs[0].dt
+
+
+def cleaned(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightLog, list[str]]:
+    """The log after each change that was asked for, and a line for each."""
+    done: list[str] = []
+
+    def apply(changed: tuple[FlightLog, str]) -> FlightLog:
+        done.append(changed[1])
+        return changed[0]
+
+    if cleaning.resample is not None:
+        log = apply(resample(log, cleaning.resample, cleaning.longest_gap))
+    if cleaning.low_pass is not None:
+        log = apply(low_pass(log, cleaning.low_pass))
+    if cleaning.align:
+        log = apply(align_motors(log, vehicle))
+    if cleaning.delay:
+        log = apply(delay_motors(log, cleaning.delay))
+    return log, done
+
+
+@dataclass(frozen=True)
+class Windows:
+    """Windows of some flights, float32, one every `stride` samples, and how many each flight has, in order."""
+
+    windows: Trajectories
+    sizes: list[int]
+    stride: int
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+
+def cut(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> Windows:
+    """All windows within segments without gaps; flights too short for one are left out.
+
+    Raises:
+        ValueError: no flight is as long as a window, or samples that are not evenly spaced.
+    """
+    long = [log for log in logs if any(part.stop - part.start > steps for part in segments(log))]
+    if not long:
+        names = ", ".join(flight_of(log) for log in logs)
+        raise ValueError(f"no window of {steps} intervals without gaps in {names}; bridge gaps or shorten --horizon")
+    parts = [windows(log, steps, stride) for log in long]
+    both = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
+    return Windows(both, [len(part) for part in parts], stride)
+
+
+def _files(option: str, folder: Path) -> list[Path]:
+    if not folder.is_dir():
+        raise ValueError(f"--{option} {folder}: no such folder")
+    files = sorted(path for path in folder.iterdir() if path.name.lower().endswith(SUFFIXES))
+    if not files:
+        raise ValueError(f"--{option} {folder}: holds no flights ({', '.join(SUFFIXES)})")
+    return files
+
+
+def _read(path: Path, columns: ColumnMap | None, config: RealFlightConfig) -> FlightLog:
+    if path.name.lower().endswith(".ulg"):
+        try:
+            return read_ulog(path, polynomial=config.polynomial)
+        except ImportError as error:
+            raise ValueError(f"{path}: {error}") from error
+    log = read_csv(path) if columns is None else read_mapped(path, columns)
+    if len(log) < 2:
+        raise ValueError(f"{path}: row 2, field t: one sample is no flight; leave the file out")
+    return log
+
+
+def _record(raw: FlightLog, log: FlightLog, vehicle: Vehicle, done: list[str]) -> dict[str, Any]:
+    checks = [asdict(check) for check in check_log(raw, vehicle)]
+    return {
+        "flight": flight_of(raw),
+        "samples": len(raw),
+        "seconds": round(float(raw.t[-1] - raw.t[0]), 3),
+        "dt": raw.dt,
+        "gaps": int(gaps(raw).sum()),
+        "repeated_samples": int(repeats(raw).sum()),
+        "used_samples": sum(part.stop - part.start for part in segments(log)),
+        "done": done,
+        "fails": sum(check["verdict"] == FAILS for check in checks),
+        "checks": checks,
+    }

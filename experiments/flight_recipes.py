@@ -1,0 +1,100 @@
+"""How a model of a real vehicle is trained: stages as data, of source flights and of N windows of the target's."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Literal
+
+from hybrid_jax.schedule import Stage
+
+Model = Literal["hybrid", "no_physics", "physics_only"]
+Physics = Literal["multirotor", "torque_off", "frozen_rates"]
+RecipeName = Literal["staged", "short", "torque_off", "frozen_rates"]
+
+REFERENCE = 1000  # N for which the epochs of an adaptation are given
+NETWORK_ALONE = 5e-3  # rate of a network without physics in the steps that are the physics' own
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage of training.
+
+    Attributes:
+        physics, residual: Adam's learning rates; a residual of 0 leaves the network as it is.
+        steps: intervals of each window that are trained on.
+        epochs, patience: the most epochs, and how many without a better validation end the stage.
+    """
+
+    physics: float
+    residual: float
+    steps: int
+    epochs: int
+    patience: int = 20
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A way to train every model.
+
+    Attributes:
+        about: what it is, for the report.
+        window: intervals of the windows that are cut, validated on, and whose baseline errors weigh the channels.
+        source: what is done with plenty of source flights.
+        adaptation: what is done with N windows of the target, from the source's model.
+        scratch: what is done with N windows of the target, from the nominal vehicle.
+        physics: of the hybrid and of physics-only.
+        learn: names of `multirotor.SHAPES` in place of the vehicle's own; none keeps those.
+    """
+
+    about: str
+    window: int
+    source: tuple[Step, ...]
+    adaptation: tuple[Step, ...]
+    scratch: tuple[Step, ...]
+    physics: Physics = "multirotor"
+    learn: tuple[str, ...] = ()
+
+
+_SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
+_ADAPTATION = (Step(1e-2, 0, 10, 40, 15), Step(3e-3, 3e-3, 10, 40, 15), Step(1e-3, 1e-3, 25, 30, 10))
+_SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25, 30, 10))
+_BRIEF = (Step(2e-2, 0, 25, 10, 5), Step(2e-3, 2e-3, 25, 5, 5), Step(1e-3, 1e-3, 50, 5, 5))
+
+RECIPES: Mapping[str, Recipe] = {
+    "staged": Recipe("physics, then all on 10 steps, then all on 25", 25, _SOURCE, _ADAPTATION, _SCRATCH),
+    "short": Recipe("physics, then all on 10 steps", 25, _SOURCE[:2], _ADAPTATION[:2], _SCRATCH[:2]),
+    "torque_off": Recipe(
+        "the rotors' torque is not used; a few epochs on 25 and 50 steps",
+        *(50, _BRIEF, _BRIEF, _BRIEF),
+        physics="torque_off",
+        learn=("k", "drag", "aerodynamic_moment", "rate_damping"),
+    ),
+    "frozen_rates": Recipe(
+        "thrust and drag with rates frozen, turned by the network alone; a few epochs on 25 and 50 steps",
+        *(50, _BRIEF, _BRIEF, _BRIEF),
+        physics="frozen_rates",
+        learn=("k", "drag"),
+    ),
+}
+
+
+def stage_of(step: Step, model: str, share: float = 1.0) -> Stage:
+    """The stage of one model.
+
+    Args:
+        share: of the epochs and of the patience.
+    """
+    epochs, patience = (max(1, round(share * count)) for count in (step.epochs, step.patience))
+    match model:
+        case "hybrid":
+            rates = {"physics": step.physics, "residual": step.residual}
+        case "no_physics":
+            # It has no physics to begin with, and is given as many epochs.
+            rates = {"residual": step.residual or NETWORK_ALONE}
+        case _:
+            rates = {"": step.physics}
+    return Stage(rates, step.steps, epochs, patience)
+
+
+def share_of_epochs(size: int) -> float:
+    """Few windows make few steps an epoch, so N windows are given √(1000 / N) times the epochs of 1000."""
+    return (REFERENCE / size) ** 0.5

@@ -1,0 +1,201 @@
+"""Models tested on flights that they have not seen, and the rows that they make."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from experiments.flight_folds import Fold, apart
+from experiments.flight_logs import Windows, cut
+from experiments.flight_models import Lane, Trained, by_lane
+from experiments.flight_protocol import NANODRONE_STEPS, RealFlightConfig
+from hybrid_jax import least_squares, linear_adaptation, schedule
+from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, by_name, finite
+from hybrid_jax.flight_scores import FlightErrors, flight_errors, mean_by_step
+from hybrid_jax.lanes import count, lane, stack
+from hybrid_jax.multirotor import POSITIVE, Multirotor
+from hybrid_jax.training import STATUS_NAMES, STOPPED
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.uncertainty import physics_covariance
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid
+
+LEVEL = 1.959964  # standard deviations of a 95 % interval
+INTERVAL_STEPS = 10  # of the windows that intervals of θ_p are made from: many of them are independent
+ROUND = 25  # their number is a multiple of it
+ADAPTED = ("fine_tuned", "scratch")
+
+
+@dataclass(frozen=True)
+class Trial:
+    """What was tested in one fold: which windows, under which options.
+
+    Attributes:
+        windows: from every sample of the test flights, as long as the longest horizon.
+    """
+
+    fold: Fold
+    windows: Trajectories
+    config: RealFlightConfig
+
+
+@dataclass(frozen=True)
+class Scored:
+    """A row, and its errors at every step: RMS and mean over windows, (4, t) in the order of QUANTITIES."""
+
+    row: FlightRow
+    rms: np.ndarray
+    mean: np.ndarray
+
+
+def trial_of(fold: Fold, config: RealFlightConfig) -> Trial:
+    """The fold's test windows."""
+    return Trial(fold, cut(fold.test, config.longest).windows, config)
+
+
+def score(trial: Trial, field: AbstractVectorField, **known: Any) -> Scored:
+    """A field, tested.
+
+    Args:
+        known: the row's other attributes.
+    """
+    errors = flight_errors(field, trial.windows)
+    rms = np.array([np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors])
+    mean = np.array(mean_by_step(errors))
+    row = FlightRow(fold=trial.fold.name, windows=len(trial.windows), scores=scores(rms, mean, trial.config), **known)
+    return Scored(row, rms, mean)
+
+
+def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mapping[str, Mapping[str, float | None]]:
+    """RMSE at each horizon and, by the nanodrone protocol, the mean errors of 50 steps, summed."""
+    found = {str(steps): rms[:, steps - 1] for steps in config.horizon}
+    if config.protocol == "nanodrone":
+        found[SUM] = mean[:, :NANODRONE_STEPS].sum(axis=1)
+    return {label: dict(zip(QUANTITIES, map(finite, values), strict=True)) for label, values in found.items()}
+
+
+def score_lanes(
+    trial: Trial,
+    model: str,
+    mode: str,
+    recipe: str,
+    lanes: Sequence[Lane],
+    trained: Trained,
+    parameters: Sequence[Mapping[str, Any]],
+) -> list[Scored]:
+    """All lanes of a model, tested.
+
+    Args:
+        parameters: of each lane, from `parameters`.
+    """
+
+    def known(index: int, each: Lane) -> dict[str, Any]:
+        return {
+            "n_train": len(each.subset) if mode in ADAPTED else 0,
+            "seed": each.seed,
+            "recipe": recipe,
+            "val_loss": finite(trained.val_loss[index]),
+            "epochs": int(trained.epochs[index]),
+            "status": STATUS_NAMES.get(int(trained.status[index]), STATUS_NAMES[STOPPED]),
+            **parameters[index],
+        }
+
+    return [
+        score(trial, lane(trained.fields, index), model=model, mode=mode, **known(index, each))
+        for index, each in enumerate(lanes)
+    ]
+
+
+def parameters(fields: Any, lanes: Sequence[Lane], training: Windows) -> list[dict[str, Any]]:
+    """θ_p of each lane and its intervals, from those of its windows that share no sample."""
+    if theta_of(fields) is None:
+        return [{} for _ in lanes]
+    short = schedule.cut(training.windows, min(INTERVAL_STEPS, training.windows.horizon))
+    spacing = -(-short.horizon // training.stride)
+    found: list[dict[str, Any]] = []
+    # Lanes of one size are a program together; a round number of windows is the same for most sizes and folds.
+    for _, group in groupby(range(len(lanes)), lambda index: len(lanes[index].subset)):
+        indices = list(group)
+        own = [apart(lanes[index].subset, training.sizes, spacing) for index in indices]
+        most = min(map(len, own)) // ROUND * ROUND
+        own = [places[np.linspace(0, len(places) - 1, most).round().astype(int)] for places in own]
+        found += _parameters(lane(fields, np.array(indices)), own, short)
+    return found
+
+
+def _parameters(fields: Any, own: Sequence[np.ndarray], windows: Trajectories) -> list[dict[str, Any]]:
+    if len(own[0]) <= least_squares.parametrise(lane(fields, 0))[0].size:
+        thetas = [theta_of(lane(fields, index)) or {} for index in range(len(own))]
+        return [{"theta": by_name(theta, finite)} for theta in thetas]
+
+    def ends(lane, windows: Trajectories):
+        field, places = lane
+        return _ends(field, physics_covariance(field, windows[places]))
+
+    def one(index: int) -> dict[str, Any]:
+        value, low, high = (by_name(lane(end, index), finite) for end in found)
+        return {"theta": value, "theta_interval": {name: [low[name], high[name]] for name in value}}
+
+    found = by_lane(ends, (fields, stack(list(own))), windows)
+    return [one(index) for index in range(len(own))]
+
+
+def theta_of(field: AbstractVectorField) -> Mapping[str, Any] | None:
+    """θ_p of the multirotor inside a field; None where nothing of it is learned."""
+    bodies = [node for node in jax.tree.leaves(field, is_leaf=_is_body) if _is_body(node)]
+    return bodies[0].theta() if bodies and bodies[0].deviations else None
+
+
+def _is_body(node: Any) -> bool:
+    return isinstance(node, Multirotor)
+
+
+def _ends(field: AbstractVectorField, covariance: Float[Array, "p p"]):
+    """θ_p in SI units and the ends of its 95 % intervals: symmetric, or in the logarithm where it is positive."""
+    theta, rebuild = least_squares.parametrise(field)
+
+    def straight(theta):
+        found = theta_of(rebuild(theta)) or {}
+        return {name: jnp.log(value) if name in POSITIVE else value for name, value in found.items()}
+
+    middle, slopes = straight(theta), jax.jacfwd(straight)(theta)
+
+    def end(sign: float):
+        def one(name: str):
+            error = jnp.sqrt(jnp.einsum("...i,ij,...j->...", slopes[name], covariance, slopes[name]))
+            value = middle[name] + sign * LEVEL * error
+            return jnp.exp(value) if name in POSITIVE else value
+
+        return {name: one(name) for name in middle}
+
+    return end(0), end(-1), end(1)
+
+
+def linear_residuals(
+    base: AbstractVectorField, windows: Trajectories, subsets: Sequence[np.ndarray], validation: Trajectories
+) -> Any:
+    """Stacked fields: the base plus a linear residual, fitted to each subset of the windows (all of one size)."""
+
+    def one(subset, windows, validation):
+        return linear_adaptation.adapted(linear_adaptation.linear_residual, base, windows[subset], validation).field
+
+    return by_lane(one, stack(list(subsets)), windows, validation)
+
+
+def on(base: AbstractVectorField, linear: Any) -> list[AbstractVectorField]:
+    """The linear residuals of stacked fields on another base."""
+    return [Hybrid(base, lane(linear, index).residual) for index in range(count(linear.residual))]
+
+
+def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:
+    """The mean over quantities and horizons of RMSE over a baseline's: what a recipe is chosen by."""
+
+    def rms(part, steps: int) -> float:
+        return float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float))))
+
+    pairs = [(own, other, steps) for own, other in zip(errors, baseline, strict=True) for steps in horizons]
+    return float(np.mean([rms(own, steps) / rms(other, steps) for own, other, steps in pairs]))

@@ -1,0 +1,155 @@
+"""Your own logs: learn from flights before a change, adapt to a few after it, score on flights not seen.
+
+python -m experiments.real_flight --help
+"""
+
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
+
+from rich.console import Console
+
+from experiments import command
+from experiments.flight_folds import Fold, hold_out_validation, thinned
+from experiments.flight_logs import Flown, cut, fly_in, require_one_rate
+from experiments.flight_models import Craft
+from experiments.flight_outcome import Outcome, write_outcome
+from experiments.flight_protocol import LEARN, PRESETS, RealFlightConfig
+from experiments.flight_study import study
+from experiments.flight_tests import INTERVAL_STEPS, relative_error
+from experiments.simulated_logs import write_logs
+from hybrid_jax import hosts
+from hybrid_jax.flight_scores import flight_errors
+from hybrid_jax.flights.cleaning import lag_motors
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.rotor_lag import choose_time_constant
+from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.multirotor import multirotor
+from hybrid_jax.vehicle import read_tables
+from hybrid_jax.vehicle_description import LAG, VehicleDescription, load_description
+
+NAME = "real_flight"
+ABOUT = "How well can a model of your own vehicle predict flights that it has not seen?"
+GUIDE = """\
+real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--test FOLDER], or --simulated.
+
+  No logs at hand?  python -m experiments.real_flight --simulated --preset smoke
+  writes logs of a simulated vehicle before and after a change to runs/real_flight/logs and learns from them: the files
+  show what yours should look like.
+
+  Your own logs: one file a flight, CSV with the columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 (SI units,
+  z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; or PX4's .ulg. Ten flights of
+  ten seconds before the change and five after it are a good start. docs/real_flight.md says how to bring them.
+
+  Flights of others: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
+  idsia-robotics/nanodrone-sysid-benchmark on GitHub; both need a column map, and their licences are theirs."""
+FITTED = 300  # windows that physics is fitted to for each time constant that is tried
+
+
+def experiment(config: RealFlightConfig, console: Console) -> None:
+    """Read, check and clean the logs, train, test, and write what came of it."""
+    config.require_flights()
+    if config.simulated:
+        vehicle, folders = write_logs(config.out / NAME / "logs", config.data_seed)
+    else:
+        named = {name: getattr(config, name) for name in ("source", "target", "test")}
+        vehicle, folders = config.vehicle, {name: path for name, path in named.items() if path is not None}
+    assert vehicle is not None
+    before, after = crafts(vehicle, config)
+    flown = {
+        name: fly_in(name, folder, craft.vehicle, craft.terms.motor_time_constant, config)
+        for name, folder in folders.items()
+        for craft in [before if name == "source" else after]
+    }
+    dt = require_one_rate(list(flown.values()))
+    if LAG in _description(vehicle).learn:
+        flown = following_rotors(flown, before, config, console)
+    say_checks(flown, console)
+    found = study(before, after, flown, config, console)
+    if hosts.first():
+        write_outcome(Outcome(NAME, config, before, after, flown, dt, found), Console())
+
+
+def crafts(path: Path, config: RealFlightConfig) -> tuple[Craft, Craft]:
+    """The vehicle of the source, and that of target and test.
+
+    Raises:
+        ValueError: the file, the key and what was expected, in one line.
+    """
+    found = [load_description(path), load_description(path, config.target_variant)]
+    learn = config.learn or tuple(name for name in _description(path).learn if name != LAG)
+    before, after = (Craft(each.vehicle, each.terms, learn) for each in found)
+    return before, after
+
+
+def _description(path: Path) -> VehicleDescription:
+    """What the file says, and what is learned where it does not say."""
+    found = load_description(path)
+    return found if "learn" in read_tables(path) else replace(found, learn=LEARN)
+
+
+def say_checks(flown: Mapping[str, Flown], console: Console) -> None:
+    """A line for each log whose checks fail; the whole table is in the report."""
+    for each in flown.values():
+        for record in each.records:
+            for check in record["checks"]:
+                if check["verdict"] == "fails":
+                    line = f"{each.label}/{record['flight']}: {check['name']}: {check['suggestion']}"
+                    console.print(line, highlight=False, soft_wrap=True, style="yellow")
+
+
+def following_rotors(
+    flown: Mapping[str, Flown], craft: Craft, config: RealFlightConfig, console: Console
+) -> dict[str, Flown]:
+    """All logs with rotors that follow their motor values by the time constant with which physics predicts best.
+
+    It is chosen on the source's validation flights, by physics that is fitted to the training flights.
+    """
+    train, validation = hold_out_validation(flown["source"].logs, config)
+    baseline = craft.thrust()
+
+    def error(logs: list[FlightLog]) -> float:
+        fold = Fold("", logs[: len(train)], logs[len(train) :], [])
+        windows = thinned(cut(fold.train, INTERVAL_STEPS).windows, FITTED)
+        judged = cut(fold.validation, INTERVAL_STEPS).windows
+        fitted = fit_physics(multirotor(craft.vehicle, craft.learn, craft.terms), windows).field
+        return relative_error(flight_errors(fitted, judged), flight_errors(baseline, judged), (INTERVAL_STEPS,))
+
+    chosen, _ = choose_time_constant([*train, *validation], error)
+    console.print(f"rotors follow with a time constant of {1000 * chosen:.1f} ms", highlight=False)
+    return {name: _lagged(each, chosen) for name, each in flown.items()}
+
+
+def _lagged(flown: Flown, time_constant: float) -> Flown:
+    changed = [lag_motors(log, time_constant) for log in flown.logs]
+    records = [
+        record | {"done": [*record["done"], said]} for record, (_, said) in zip(flown.records, changed, strict=True)
+    ]
+    return Flown(flown.label, [log for log, _ in changed], records)
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """The command line. With no flights named, it says how to get some."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    if not any(word.startswith(("--simulated", "--source", "--vehicle", "--help", "-h")) for word in given):
+        print(GUIDE, file=sys.stderr)
+        sys.exit(command.BAD_INPUT)
+    command.run(NAME, ABOUT, experiment, spaced(given), PRESETS)
+
+
+def spaced(arguments: Sequence[str]) -> list[str]:
+    """Numbers that are joined by commas, such as 10,50, as the separate words that options take."""
+    words: list[str] = []
+    for word in arguments:
+        option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
+        numbers = value.split(",")
+        if len(numbers) > 1 and all(number.isdecimal() for number in numbers):
+            words += [*([option] if equals else []), *numbers]
+        else:
+            words.append(word)
+    return words
+
+
+if __name__ == "__main__":
+    main()
