@@ -45,7 +45,7 @@ def folds_of(learned: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
     Raises:
         ValueError: too few flights, or names, for it.
     """
-    if tested is not None and not config.takes_turns:
+    if tested is not None and (config.target is not None or config.folds_by == "flight"):
         return [_fold("test", learned, tested, config)]
     of = NAMES_OF[config.folds_by]
     names = {of(log) for log in learned if tested is None or of(log) in {of(other) for other in tested}}

@@ -214,12 +214,6 @@ def all_windows(lessons: Lessons, more: Trajectories) -> Lessons:
     )
 
 
-def by_lane(function, lanes: Any, *shared: Any) -> Any:
-    """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
-    run = eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
-    return jax.device_get(run(lanes, shared))
-
-
 def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:
     longest = max(len(each.subset) for each in lanes)
     one = lane(fields, 0)
@@ -244,12 +238,13 @@ def _starts(fields: Any, seeds: Sequence[int], number: int, validation: Trajecto
         return training.start(field, jax.random.fold_in(_key(seed, ORDER), number))
 
     starts = jax.device_get(eqx.filter_jit(eqx.filter_vmap(begin))(fields, np.asarray(seeds)))
-    errors = by_lane(_judged_error, starts, validation, settings)
+    errors = jax.device_get(_errors_at_start(starts, validation, settings))
     return eqx.tree_at(lambda state: state.best_mse, starts, errors)
 
 
-def _judged_error(state: FitState, validation: Trajectories, settings: Settings) -> Float[Array, ""]:
-    return judged(state, validation, settings).best_mse
+@eqx.filter_jit
+def _errors_at_start(states: FitState, validation: Trajectories, settings: Settings) -> Float[Array, " lanes"]:
+    return jax.lax.map(lambda state: judged(state, validation, settings).best_mse, states)
 
 
 def _trained(fields: Any, finals: Sequence[FitState]) -> Trained:

@@ -80,23 +80,29 @@ def write_outcome(outcome: Outcome, console: Console) -> None:
     files = {"rows.csv": to_csv(outcome.rows), "report.md": page, "report.json": json_text(record)}
     for name, content in files.items():
         write_whole(out / name, content)
-    shown_tables = [table for table in tables if table.title != "Logs"]
-    print_tables(console, shown_tables)
+    print_tables(console, [*score_tables(outcome.rows, outcome.dt), *judged(claims)])
+    console.print(
+        f"Fold by fold, parameters, checks of every log: {out / 'report.md'}", highlight=False, soft_wrap=True
+    )
 
 
 def outcome_tables(outcome: Outcome, claims: Sequence[Claim]) -> list[Table]:
     """Scores first, the logs last."""
     rows = outcome.rows
-    judged = [verdicts(claims)._replace(title="What should come of it")] if claims else []
     records = [record for flown in outcome.flown.values() for record in flown.records]
     return [
         *score_tables(rows, outcome.dt),
-        *judged,
+        *judged(claims),
         *fold_tables(rows),
         *choice_tables(outcome.found.choices),
         *parameter_tables(rows, nominal(outcome.before)),
         *log_tables(records),
     ]
+
+
+def judged(claims: Sequence[Claim]) -> list[Table]:
+    """The claims, if there are any."""
+    return [verdicts(claims)._replace(title="What should come of it")] if claims else []
 
 
 def to_record(outcome: Outcome, claims: Sequence[Claim], captions: Mapping[str, str]) -> dict[str, Any]:

@@ -129,8 +129,6 @@ class RealFlightConfig(Run):
             check_names(self.learn)
         if self.simulated and any(getattr(self, name) for name in (*FOLDERS, *FILES)):
             raise ValueError("--simulated makes its own logs: leave --vehicle, --source, --target and --test out")
-        if self.test is not None and self.folds is not None and not self.takes_turns:
-            raise ValueError("--folds part the flights that are tested on: with --test there are none to part")
 
     def require_flights(self) -> None:
         """Refuse a configuration of which nothing can be flown; apart from the other checks, as presets have no paths.
@@ -140,11 +138,6 @@ class RealFlightConfig(Run):
         """
         if not self.simulated and (self.vehicle is None or self.source is None):
             raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; --help says what they are")
-
-    @property
-    def takes_turns(self) -> bool:
-        """Whether flights are tested in folds."""
-        return self.test is None or (self.target is None and self.folds_by == "manoeuvre")
 
     @property
     def longest(self) -> int:
@@ -163,6 +156,7 @@ QUICK = replace(PAPER, preset="quick", seeds=2, n=(100, 1000), folds=2, epochs=0
 SMOKE = replace(
     PAPER, preset="smoke", seeds=1, n=(20,), horizon=(5, 10), folds=2, batch_size=20, hidden=8, validation=20,
     stride=50, epochs=0.05,
+    recipes=("short",), models=("hybrid", "physics_only"),
 )  # fmt: skip
 PRESETS = {"paper": PAPER, "quick": QUICK, "smoke": SMOKE}
 assert {*RecipeName.__args__} == {*RECIPES}

@@ -98,14 +98,15 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
     config = course.config
     pool = max(len(cut(fold.train, RECIPES[name].window)) for fold in found.folds for name in config.recipes)
     taught: dict[tuple[str, str], Taught] = {}
+    first = {name: course.lesson(school, name) for name in config.recipes}
     for number, fold in enumerate(found.folds):
         where, trial = f"fold {number}", trial_of(fold, config)
 
         def tried(recipe: str, where=where, fold=fold) -> list[AbstractVectorField]:
-            return _tried_after(course, where, school, fold, recipe, pool)
+            return _tried_after(course, where, first[recipe], fold, recipe, pool)
 
         recipe = _chosen(course, found, fold, tried)
-        lesson = course.lesson(school, recipe)
+        lesson = first[recipe]
         here = course.lesson_after(fold, recipe, lesson)
         found.scored.extend(_baselines(trial, course.after))
         for model in config.models:
@@ -148,10 +149,9 @@ def _tried(course: Course, where: str, fold: Fold, recipe: str) -> list[Abstract
 
 
 def _tried_after(
-    course: Course, where: str, school: Fold, fold: Fold, recipe: str, pool: int
+    course: Course, where: str, lesson: Lesson, fold: Fold, recipe: str, pool: int
 ) -> list[AbstractVectorField]:
     """Hybrids of the source, fine-tuned on the most windows of a fold."""
-    lesson = course.lesson(school, recipe)
     source = course.taught("choice source", "hybrid", recipe, lesson, min(TRIALS, course.config.seeds))
     here, most = course.lesson_after(fold, recipe, lesson), max(course.config.n)
     return _fields(course.adapted(f"choice {where}", "hybrid", recipe, here, course.carried(source), [most], pool))

@@ -5,14 +5,15 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from experiments.flight_folds import Fold, apart
 from experiments.flight_logs import Windows, cut
-from experiments.flight_models import Lane, Trained, by_lane
+from experiments.flight_models import Lane, Trained
 from experiments.flight_protocol import NANODRONE_STEPS, RealFlightConfig
 from hybrid_jax import least_squares, linear_adaptation, schedule
 from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, by_name, finite
@@ -132,15 +133,11 @@ def _parameters(fields: Any, own: Sequence[np.ndarray], windows: Trajectories) -
         thetas = [theta_of(lane(fields, index)) or {} for index in range(len(own))]
         return [{"theta": by_name(theta, finite)} for theta in thetas]
 
-    def ends(lane, windows: Trajectories):
-        field, places = lane
-        return _ends(field, physics_covariance(field, windows[places]))
-
     def one(index: int) -> dict[str, Any]:
         value, low, high = (by_name(lane(end, index), finite) for end in found)
         return {"theta": value, "theta_interval": {name: [low[name], high[name]] for name in value}}
 
-    found = by_lane(ends, (fields, stack(list(own))), windows)
+    found = jax.device_get(_ends_of_lanes(fields, stack(list(own)), windows))
     return [one(index) for index in range(len(own))]
 
 
@@ -152,6 +149,15 @@ def theta_of(field: AbstractVectorField) -> Mapping[str, Any] | None:
 
 def _is_body(node: Any) -> bool:
     return isinstance(node, Multirotor)
+
+
+@eqx.filter_jit
+def _ends_of_lanes(fields: Any, own: Int[Array, "lanes n"], windows: Trajectories):
+    def one(lane):
+        field, places = lane
+        return _ends(field, physics_covariance(field, windows[places]))
+
+    return jax.lax.map(one, (fields, own))
 
 
 def _ends(field: AbstractVectorField, covariance: Float[Array, "p p"]):
@@ -179,11 +185,15 @@ def linear_residuals(
     base: AbstractVectorField, windows: Trajectories, subsets: Sequence[np.ndarray], validation: Trajectories
 ) -> Any:
     """Stacked fields: the base plus a linear residual, fitted to each subset of the windows (all of one size)."""
+    return jax.device_get(_linear_residuals(base, windows, stack(list(subsets)), validation))
 
-    def one(subset, windows, validation):
+
+@eqx.filter_jit
+def _linear_residuals(base, windows: Trajectories, subsets: Int[Array, "lanes n"], validation: Trajectories):
+    def one(subset):
         return linear_adaptation.adapted(linear_adaptation.linear_residual, base, windows[subset], validation).field
 
-    return by_lane(one, stack(list(subsets)), windows, validation)
+    return jax.lax.map(one, subsets)
 
 
 def on(base: AbstractVectorField, linear: Any) -> list[AbstractVectorField]:

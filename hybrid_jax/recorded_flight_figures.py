@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from hybrid_jax.figures import COLOURS, STYLE
 from hybrid_jax.flight_rows import NAMES, QUANTITIES, SUM, Cell, FlightRow, cell_name, cells, pooled
@@ -53,6 +54,7 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
         for cell, curve in curves.items():
             _draw_curve(axes, cell, dt * np.arange(1, curve.mean.shape[1] + 1), curve.mean[index], curve.std[index])
         axes.set(yscale="log", title=name.replace("_", " ").capitalize(), ylabel=f"{measure} [{unit}]")
+        _tick(axes)
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
     return _with_legend(figure, title, "mean over seeds; band: ± one standard deviation")
@@ -79,7 +81,7 @@ def errors_by_size(rows: Sequence[FlightRow], dt: float, title: str) -> Figure:
     for axes in panels[-1]:
         axes.set(xscale="log", xlabel="N, target windows")
         axes.set_xticks(sizes, [str(size) for size in sizes])
-        axes.xaxis.set_minor_formatter(mpl.ticker.NullFormatter())
+        axes.xaxis.set_minor_formatter(NullFormatter())
     return _with_legend(figure, title, "mean over seeds; bars: ± one standard deviation")
 
 
@@ -153,6 +155,14 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Sequence[FlightRow]], sizes, la
         style: dict[str, Any] = {"color": colour, "linestyle": DASHES[mode], "marker": "o", "markersize": 3.5}
         axes.errorbar(at, means, spread, capsize=2, label=name, **style)
     axes.set_yscale("log")
+    _tick(axes)
+
+
+def _tick(axes: Axes) -> None:
+    """Plain numbers at 1, 2 and 5 of each decade."""
+    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axes.yaxis.set_minor_formatter(NullFormatter())
 
 
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:
