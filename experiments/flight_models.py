@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from experiments.flight_folds import Lessons, padded
+from experiments.flight_logs import Windows
 from experiments.flight_protocol import LEARN
 from experiments.flight_recipes import Recipe, Step, stage_of
 from experiments.stages import Stages
@@ -205,13 +206,11 @@ def refitted(
     return replace(first, fields=fields, epochs=first.epochs + np.sum([final.epoch for final in finals], axis=0))
 
 
-def all_windows(lessons: Lessons, more: Trajectories) -> Lessons:
+def all_windows(lessons: Lessons, more: Windows) -> Lessons:
     """The lessons with further windows to learn from."""
-    train = lessons.train
-    return replace(
-        lessons,
-        train=replace(train, windows=concatenate([train.windows, more]), sizes=[*train.sizes, len(more)]),
-    )
+    old = lessons.train
+    both = concatenate([old.windows, more.windows])
+    return replace(lessons, train=Windows(both, [*old.sizes, *more.sizes], old.stride))
 
 
 def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:

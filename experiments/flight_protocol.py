@@ -117,8 +117,8 @@ class RealFlightConfig(Run):
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
         distinct("--recipes", self.recipes)
         distinct("--models", self.models)
-        distinct("--horizon", self.horizon)
-        distinct("--n", self.n)
+        distinct("--horizon", tuple(map(str, self.horizon)))
+        distinct("--n", tuple(map(str, self.n)))
         if min(self.horizon) < 1:
             raise ValueError(f"--horizon must be at least 1, got {self.horizon}")
         if min(self.n) < self.batch_size:

@@ -54,6 +54,7 @@ def _flights(domain: Domain, count: int, seed: int) -> list[bytes]:
     # A flight that goes wrong is left out, so more are flown; they come by the chunk in any case.
     found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
     sound = np.flatnonzero(~gone_wrong(found.states))[:count]
-    times = DT * np.arange(len(found.states[0]))
+    states, inputs = np.asarray(found.states), np.asarray(found.inputs)
+    times = DT * np.arange(states.shape[1])
     # The last inputs are held on: a log says of each sample what the rotors do next.
-    return [csv_of(times, found.states[i], found.inputs[i][[*range(len(times) - 1), -1]]) for i in sound]
+    return [csv_of(times, states[i], inputs[i][[*range(len(times) - 1), -1]]) for i in sound]

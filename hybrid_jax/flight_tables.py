@@ -79,7 +79,7 @@ def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
     """What is known of each log: its length, gaps, what was done, and every check with its verdict."""
     if not records:
         return []
-    names = [check["name"] for check in records[0]["checks"]]
+    names: list[str] = [check["name"] for check in records[0]["checks"]]
     flights = [(f"{record['folder']}/{record['flight']}", record) for record in records]
     lines = [
         (name, str(record["samples"]), f"{record['seconds']:.1f}", f"{record['dt']:g}", str(record["gaps"]),
@@ -90,7 +90,9 @@ def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
         "Logs", ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "samples in use", "what was done"), lines
     )
     verdicts = [(name, *map(_verdict, record["checks"])) for name, record in flights]
-    checks = Table("Consistency of each log, as it was read", ("flight", *(SHORT.get(n, n) for n in names)), verdicts)
+    checks = Table(
+        "Consistency of each log, as it was read", ("flight", *(SHORT.get(name, name) for name in names)), verdicts
+    )
     advice = [
         (name, check["name"], _value(check), check["suggestion"])
         for name, record in flights
