@@ -87,7 +87,7 @@ def _train(course: Course, found: Study) -> None:
             taught = course.taught(where, model, recipe, lesson, config.seeds)
             if config.refit:
                 taught = course.retaught(where, model, recipe, fold, lesson, taught)
-            known = parameters(taught.trained.fields, taught.lanes, lesson.lessons.train)
+            known = _known(taught, lesson)
             found.scored.extend(score_lanes(trial, model, "source_only", recipe, taught.lanes, taught.trained, known))
             found.taught[number, model, "source_only"] = taught
         found.scored.append(_linear_of_source(trial, course.before, course.before, lesson, "source_only"))
@@ -115,11 +115,11 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
             source = taught[model, recipe]
             carried = course.carried(source)
             found.taught[number, model, "zero_shot"] = carried
-            known = parameters(source.trained.fields, source.lanes, lesson.lessons.train)
+            known = _known(source, lesson)
             found.scored.extend(score_lanes(trial, model, "zero_shot", recipe, carried.lanes, carried.trained, known))
             for mode, start in (("fine_tuned", carried), ("scratch", None)):
                 after = course.adapted(f"{where} {mode}", model, recipe, here, start, config.n, pool)
-                known = parameters(after.trained.fields, after.lanes, here.lessons.train)
+                known = _known(after, here)
                 found.scored.extend(score_lanes(trial, model, mode, recipe, after.lanes, after.trained, known))
                 found.taught[number, model, mode] = after
         found.scored.append(_linear_of_source(trial, course.before, course.after, lesson, "zero_shot"))
@@ -155,6 +155,12 @@ def _tried_after(
     source = course.taught("choice source", "hybrid", recipe, lesson, min(TRIALS, course.config.seeds))
     here, most = course.lesson_after(fold, recipe, lesson), max(course.config.n)
     return _fields(course.adapted(f"choice {where}", "hybrid", recipe, here, course.carried(source), [most], pool))
+
+
+def _known(taught: Taught, lesson: Lesson) -> list[dict[str, Any]]:
+    """θ_p of what was taught, and its intervals."""
+    objective: Any = lesson.settings.objective
+    return parameters(taught.trained.fields, taught.lanes, lesson.lessons.train, objective)
 
 
 def _fields(taught: Taught) -> list[AbstractVectorField]:

@@ -9,23 +9,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Int
 
 from experiments.flight_folds import Fold, apart
 from experiments.flight_logs import Windows, cut
 from experiments.flight_models import Lane, Trained
 from experiments.flight_protocol import NANODRONE_STEPS, RealFlightConfig
 from hybrid_jax import least_squares, linear_adaptation, schedule
-from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, by_name, finite
+from hybrid_jax.channels import ChannelPrediction
+from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, finite
 from hybrid_jax.flight_scores import FlightErrors, flight_errors, mean_by_step
 from hybrid_jax.lanes import count, lane, stack
-from hybrid_jax.multirotor import POSITIVE, Multirotor
+from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.training import STATUS_NAMES, STOPPED
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.uncertainty import physics_covariance
+from hybrid_jax.uncertainty import intervals, physics_covariance
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 
-LEVEL = 1.959964  # standard deviations of a 95 % interval
 INTERVAL_STEPS = 10  # of the windows that intervals of θ_p are made from: many of them are independent
 ROUND = 25  # their number is a multiple of it
 ADAPTED = ("fine_tuned", "scratch")
@@ -111,9 +111,11 @@ def score_lanes(
     ]
 
 
-def parameters(fields: Any, lanes: Sequence[Lane], training: Windows) -> list[dict[str, Any]]:
-    """θ_p of each lane and its intervals, from those of its windows that share no sample."""
-    if theta_of(fields) is None:
+def parameters(
+    fields: Any, lanes: Sequence[Lane], training: Windows, objective: ChannelPrediction
+) -> list[dict[str, Any]]:
+    """θ_p of each lane and its intervals, from those of its windows that share no sample, as the loss counts errors."""
+    if not any(map(_is_body, jax.tree.leaves(fields, is_leaf=_is_body))):
         return [{} for _ in lanes]
     short = schedule.cut(training.windows, min(INTERVAL_STEPS, training.windows.horizon))
     spacing = -(-short.horizon // training.stride)
@@ -123,62 +125,50 @@ def parameters(fields: Any, lanes: Sequence[Lane], training: Windows) -> list[di
         indices = list(group)
         own = [apart(lanes[index].subset, training.sizes, spacing) for index in indices]
         most = min(map(len, own)) // ROUND * ROUND
-        own = [places[np.linspace(0, len(places) - 1, most).round().astype(int)] for places in own]
-        found += _parameters(lane(fields, np.array(indices)), own, short)
+        places = stack([each[np.linspace(0, len(each) - 1, most).round().astype(int)] for each in own])
+        found += _parameters(lane(fields, np.array(indices)), places, short, objective)
     return found
 
 
-def _parameters(fields: Any, own: Sequence[np.ndarray], windows: Trajectories) -> list[dict[str, Any]]:
-    if len(own[0]) <= least_squares.parametrise(lane(fields, 0))[0].size:
-        thetas = [theta_of(lane(fields, index)) or {} for index in range(len(own))]
-        return [{"theta": by_name(theta, finite)} for theta in thetas]
+def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: ChannelPrediction):
+    """θ_p alone where there are no more windows than parameters."""
+    enough = own.shape[1] > least_squares.parametrise(lane(fields, 0))[0].size
+    ends = jax.device_get(_intervals(fields, own, windows, objective) if enough else _values(fields))
 
     def one(index: int) -> dict[str, Any]:
-        value, low, high = (by_name(lane(end, index), finite) for end in found)
-        return {"theta": value, "theta_interval": {name: [low[name], high[name]] for name in value}}
+        theta = {name: finite(interval.value[index]) for name, interval in ends.items()}
+        around = {name: [finite(end[index]) for end in (at.low, at.high)] for name, at in ends.items()}
+        return {"theta": theta, "theta_interval": around if enough else None}
 
-    found = jax.device_get(_ends_of_lanes(fields, stack(list(own)), windows))
     return [one(index) for index in range(len(own))]
 
 
-def theta_of(field: AbstractVectorField) -> Mapping[str, Any] | None:
-    """θ_p of the multirotor inside a field; None where nothing of it is learned."""
-    bodies = [node for node in jax.tree.leaves(field, is_leaf=_is_body) if _is_body(node)]
-    return bodies[0].theta() if bodies and bodies[0].deviations else None
-
-
-def _is_body(node: Any) -> bool:
-    return isinstance(node, Multirotor)
-
-
 @eqx.filter_jit
-def _ends_of_lanes(fields: Any, own: Int[Array, "lanes n"], windows: Trajectories):
+def _intervals(fields: Any, own: Int[Array, "lanes n"], windows: Trajectories, objective: ChannelPrediction):
     def one(lane):
         field, places = lane
-        return _ends(field, physics_covariance(field, windows[places]))
+        return intervals(body_of(field), physics_covariance(field, windows[places], error=objective.error))
 
     return jax.lax.map(one, (fields, own))
 
 
-def _ends(field: AbstractVectorField, covariance: Float[Array, "p p"]):
-    """θ_p in SI units and the ends of its 95 % intervals: symmetric, or in the logarithm where it is positive."""
-    theta, rebuild = least_squares.parametrise(field)
+@eqx.filter_jit
+def _values(fields: Any):
+    def one(field):
+        body = body_of(field)
+        size = least_squares.parametrise(body)[0].size
+        return intervals(body, jnp.zeros((size, size)))
 
-    def straight(theta):
-        found = theta_of(rebuild(theta)) or {}
-        return {name: jnp.log(value) if name in POSITIVE else value for name, value in found.items()}
+    return jax.lax.map(one, fields)
 
-    middle, slopes = straight(theta), jax.jacfwd(straight)(theta)
 
-    def end(sign: float):
-        def one(name: str):
-            error = jnp.sqrt(jnp.einsum("...i,ij,...j->...", slopes[name], covariance, slopes[name]))
-            value = middle[name] + sign * LEVEL * error
-            return jnp.exp(value) if name in POSITIVE else value
+def body_of(field: AbstractVectorField) -> Multirotor:
+    """The multirotor inside a field that has one; all that its physics learns."""
+    return next(filter(_is_body, jax.tree.leaves(field, is_leaf=_is_body)))
 
-        return {name: one(name) for name in middle}
 
-    return end(0), end(-1), end(1)
+def _is_body(node: Any) -> bool:
+    return isinstance(node, Multirotor)
 
 
 def linear_residuals(

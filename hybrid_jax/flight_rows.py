@@ -123,12 +123,12 @@ def to_csv(rows: Sequence[FlightRow]) -> str:
 
 
 def by_name(theta: Mapping[str, Any], read: Callable[[Any], Any]) -> dict[str, Any]:
-    """Parameters entry by entry: "Ix" as it is, "k_rotors[2]" and "aerodynamic_moment[0, 1]" from arrays."""
+    """Parameters entry by entry: "Ix" as it is, "k_rotors[2]" and "aerodynamic_moment[0,1]" from arrays."""
     found = {}
     for name, value in theta.items():
         array = np.asarray(value)
         for place in np.ndindex(array.shape):
-            found[f"{name}[{', '.join(map(str, place))}]" if place else name] = read(array[place])
+            found[f"{name}[{','.join(map(str, place))}]" if place else name] = read(array[place])
     return found
 
 

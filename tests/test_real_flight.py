@@ -21,8 +21,9 @@ from experiments.flight_logs import Windows, cut, fly_in, require_one_rate
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
 from experiments.flight_protocol import RealFlightConfig
 from experiments.flight_recipes import RECIPES, stage_of
-from experiments.flight_tests import parameters, scores, theta_of
+from experiments.flight_tests import body_of, parameters, scores
 from experiments.simulated_logs import csv_of, vehicle_toml
+from hybrid_jax.channels import ChannelPrediction, channels_from
 from hybrid_jax.flight_claims import flight_claims
 from hybrid_jax.flight_rows import QUANTITIES, FlightRow, pooled
 from hybrid_jax.flights.log import FlightLog
@@ -152,8 +153,10 @@ def test_a_model_that_is_carried_over_keeps_its_parameters():
     fields = fresh("hybrid", CRAFT, RECIPES["staged"], 4, 2)
     fields = eqx.tree_at(lambda f: f.physics.deviations["drag"], fields, np.full((2, 3), 0.1, np.float32))
     carried = moved(fields, heavier)
-    for name, value in theta_of(fields).items():
-        np.testing.assert_allclose(theta_of(carried)[name], value, rtol=1e-5)
+    for index in range(2):
+        was, now = (body_of(lane(each, index)).theta() for each in (fields, carried))
+        for name, value in was.items():
+            np.testing.assert_allclose(now[name], value, rtol=1e-5)
     assert carried.physics.vehicle == heavier
 
 
@@ -163,14 +166,17 @@ def test_parameters_of_a_lane_have_intervals_around_them():
     craft = replace(CRAFT, learn=("Ix", "k_rotors"))
     noisy = windows.windows.x + np.random.default_rng(0).normal(0, 1e-3, windows.windows.x.shape).astype(np.float32)
     noisy = Windows(eqx.tree_at(lambda w: w.x, windows.windows, noisy), windows.sizes, windows.stride)
-    for found in parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 2), lanes, noisy):
+    objective = ChannelPrediction(channels_from(CRAFT.thrust(), noisy.windows), 1.0)
+    for found in parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 2), lanes, noisy, objective):
         assert set(found["theta"]) == {"Ix", *(f"k_rotors[{i}]" for i in range(4))}
         for name, (low, high) in found["theta_interval"].items():
             assert 0 < low < found["theta"][name] < high
             # Positive: symmetric in the logarithm.
             np.testing.assert_allclose(low * high, found["theta"][name] ** 2, rtol=1e-4)
     few = [Lane(0, np.arange(3), 1.0)]
-    assert "theta_interval" not in parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 1), few, noisy)[0]
+    (found,) = parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 1), few, noisy, objective)
+    assert found["theta"]["Ix"] == pytest.approx(IRIS.inertia[0])
+    assert found["theta_interval"] is None
 
 
 def test_the_nanodrone_score_is_the_mean_error_of_each_step_summed():
