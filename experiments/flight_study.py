@@ -34,6 +34,7 @@ from hybrid_jax.multirotor import multirotor
 from hybrid_jax.vector_field import AbstractVectorField
 
 TRIALS = 2  # seeds by which a recipe is chosen
+FROM_SCRATCH = ("hybrid",)  # whose scratch tells what the source is worth
 
 
 @dataclass(frozen=True)
@@ -117,7 +118,8 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
             found.taught[number, model, "zero_shot"] = carried
             known = _known(source, lesson)
             found.scored.extend(score_lanes(trial, model, "zero_shot", recipe, carried.lanes, carried.trained, known))
-            for mode, start in (("fine_tuned", carried), ("scratch", None)):
+            starts = {"fine_tuned": carried} | ({"scratch": None} if model in FROM_SCRATCH else {})
+            for mode, start in starts.items():
                 after = course.adapted(f"{where} {mode}", model, recipe, here, start, config.n, pool)
                 known = _known(after, here)
                 found.scored.extend(score_lanes(trial, model, mode, recipe, after.lanes, after.trained, known))

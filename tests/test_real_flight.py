@@ -308,8 +308,8 @@ def test_simulated_logs_go_all_the_way(simulated):
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     assert report["config"]["preset"] == "smoke"
-    # Two folds: hold, thrust, two linear residuals; two models zero-shot, fine-tuned, scratch.
-    assert len(report["rows"]) == 2 * (4 + 2 * 3)
+    # Two folds: hold, thrust, two linear residuals; two models zero-shot and fine-tuned, the hybrid from scratch.
+    assert len(report["rows"]) == 2 * (4 + 2 * 2 + 1)
     for found in report["rows"]:
         assert set(found["scores"]) == {"5", "10"}
         assert all(set(errors) == set(QUANTITIES) for errors in found["scores"].values())
