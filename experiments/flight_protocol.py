@@ -90,7 +90,7 @@ class RealFlightConfig(Run):
     validate_by: Literal["flight", "manoeuvre"] = "flight"
     """How the flights that stop the training are held out of those to learn from."""
     refit: bool = False
-    """Train once more, on the validation flights as well, for as many epochs as were best on these."""
+    """Without --target: train once more, on the validation flights as well, for as many epochs as these found best."""
     recipes: tuple[RecipeName, ...] = ("staged",)
     """Ways to train; of several, the one whose hybrid does best on each fold's validation flights is taken."""
     models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
