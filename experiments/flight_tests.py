@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Int
+from jaxtyping import Int
 
 from experiments.flight_folds import Fold, apart
 from experiments.flight_logs import Windows, cut
@@ -144,7 +144,7 @@ def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: 
 
 
 @eqx.filter_jit
-def _intervals(fields: Any, own: Int[Array, "lanes n"], windows: Trajectories, objective: ChannelPrediction):
+def _intervals(fields: Any, own: Int[np.ndarray, "lanes n"], windows: Trajectories, objective: ChannelPrediction):
     def one(lane):
         field, places = lane
         return intervals(body_of(field), physics_covariance(field, windows[places], error=objective.error))
@@ -179,7 +179,7 @@ def linear_residuals(
 
 
 @eqx.filter_jit
-def _linear_residuals(base, windows: Trajectories, subsets: Int[Array, "lanes n"], validation: Trajectories):
+def _linear_residuals(base, windows: Trajectories, subsets: Int[np.ndarray, "lanes n"], validation: Trajectories):
     def one(subset):
         return linear_adaptation.adapted(linear_adaptation.linear_residual, base, windows[subset], validation).field
 

@@ -139,9 +139,9 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     source, target = (
         {name: blank(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
-    pretrained = pretraining(model, vehicle, config)
-    adapted = adaptation(model, "target_only", fresh, config)
-    for (states, plans), windows in ((pretrained, source), (adapted, target)):
+    before = pretraining(model, vehicle, config)
+    after = adaptation(model, "target_only", fresh, config)
+    for (states, plans), windows in ((before, source), (after, target)):
         compile_sweep(states, plans, windows["train"], windows["validation"], shared)
         compile_evaluation(states.best, target["test"], EVERY, shared)
 
