@@ -115,8 +115,11 @@ class Controller:
     def begin(self) -> Plan:
         """The plan before the first call: hover throughout."""
         middle, half = self._range()
-        free = jnp.arctanh((self.vehicle.hover_speed - middle) / half)
-        return Plan(jnp.full((self.steps, INPUT_SIZE), free), jnp.asarray(jnp.inf), jnp.asarray(FIRST))
+        free = math.atanh((self.vehicle.hover_speed - middle) / half)
+        # Of the type that later plans have, or a compiled call would be compiled twice.
+        return Plan(
+            jnp.full((self.steps, INPUT_SIZE), free, float), jnp.asarray(jnp.inf, float), jnp.asarray(FIRST, float)
+        )
 
     def speeds(self, plan: Plan) -> Float[Array, "t 4"]:
         """The rotor speeds [rad/s] of a plan, between the limits."""
