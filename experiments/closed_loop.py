@@ -89,8 +89,8 @@ PRESETS = {
         ablation=(),
     ),
     "smoke": preset_like(
-        ClosedLoopConfig, SMOKE, sizes=(20,), seconds=1.0, references=("hover", "low_pass"), away_references=("hover",),
-        ablation=("statistics",), ablation_source=40, ablation_epochs=3, calls=20,
+        ClosedLoopConfig, SMOKE, sizes=(20,), source_train=20, seconds=1.0, references=("hover", "low_pass"),
+        away_references=("hover",), ablation=("statistics",), calls=20,
     ),
 }  # fmt: skip
 

@@ -27,6 +27,7 @@ MARKERS = dict(zip(REFERENCES, "os^Dv*", strict=True))
 SHARES = (-25.0, 125.0)  # %: what lies beyond is marked at the edge
 KEPT = 0.1
 COSTS = ("promised", "realised")
+NEAREST = 0.01  # cm: where the model of a hovering vehicle is right, it does not move
 LEAST = 1e-3  # of a cost, for a logarithmic axis
 XLABEL = "position RMSE [cm]  (log scale)"
 
@@ -41,7 +42,7 @@ def errors(rows: Sequence[FlightRow], domain: str) -> Figure:
     found = {cell[1]: group for cell, group in cells(rows).items() if cell[0] == domain and not cell[2]}
     if not found:
         raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
-    figure, panels = _grid(len(found), max(map(len, found.values())))
+    figure, panels = _grid(len(found), [flyer.name for group in found.values() for flyer in group])
     for axes, (reference, group) in zip(panels, sorted(found.items(), key=_place), strict=False):
         draw_panel(axes, [_line(flyer, group[flyer]) for flyer in group], REFERENCES[reference])
         axes.set_xlabel(XLABEL)
@@ -62,7 +63,7 @@ def ablation(rows: Sequence[FlightRow], domain: str) -> Figure:
     found = {cell: group for cell, group in cells(rows).items() if cell[0] == domain}
     if not found:
         raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
-    figure, panels = _grid(len(found), max(map(len, found.values())))
+    figure, panels = _grid(len(found), [flyer.variant for group in found.values() for flyer in group])
     for axes, ((_, reference, away), group) in zip(panels, found.items(), strict=False):
         lines = [Line(f.variant, _centimetres(flown), TINTS[f.model]) for f, flown in group.items()]
         draw_panel(axes, lines, REFERENCES[reference] + (f", {away:g} m from home" if away else ""))
@@ -113,7 +114,7 @@ def shares(rows: Sequence[FlightRow], domain: str) -> Figure:
     references = [reference for reference in REFERENCES if any(reference in line for line in found.values())]
     if not references:
         raise ValueError(f"rows must hold a source model and the true vehicle in {domain}")
-    figure, panels = _grid(len(references), len(found), width=2.6)
+    figure, panels = _grid(len(references), [flyer.name for flyer in found], width=2.6)
     for axes, reference in zip(panels, references, strict=False):
         axes.set(xlim=SHARES, ylim=(len(found) - 0.4, -0.6))
         axes.set_title(REFERENCES[reference], pad=16)
@@ -162,10 +163,12 @@ def promised(rows: Sequence[FlightRow], flyers: Sequence[Flyer]) -> Figure:
     return figure
 
 
-def _grid(count: int, lines: int, width: float = 3.2) -> tuple[Figure, list[Axes]]:
+def _grid(count: int, names: Sequence[str], width: float = 3.2) -> tuple[Figure, list[Axes]]:
+    """Panels for as many references, with room for a line of each of these names, which may stand there twice."""
     columns = 2 if count == 4 else min(count, 3)
-    rows = -(-count // columns)
-    figure = Figure(figsize=(width * columns + 2.4, rows * (1.0 + 0.25 * lines) + 0.9), layout="constrained")
+    rows, room = -(-count // columns), 0.085 * max(map(len, names))
+    size = width * columns + room, rows * (1.0 + 0.25 * len(set(names))) + 0.9
+    figure = Figure(figsize=size, layout="constrained")
     panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
     for i, axes in enumerate(panels):
         axes.tick_params(labelleft=i % columns == 0)  # the lines are those of the first column
@@ -187,7 +190,9 @@ def _line(flyer: Flyer, rows: Sequence[FlightRow]) -> Line:
 
 
 def _draw_away(axes: Axes, home: Mapping[Flyer, list[FlightRow]], away: Mapping[Flyer, list[FlightRow]]) -> None:
-    means = {flyer: [float(np.mean(_centimetres(place[flyer]))) for place in (home, away)] for flyer in away}
+    means = {
+        flyer: [max(float(np.mean(_centimetres(place[flyer]))), NEAREST) for place in (home, away)] for flyer in away
+    }
     finite = [value for pair in means.values() for value in pair if math.isfinite(value)] or [1.0]
     axes.set(xscale="log", xlim=(min(finite) / 1.4, max(finite) * 1.8), ylim=(len(away) - 0.4, -0.6), xlabel=XLABEL)
     tick_errors(axes.xaxis, *axes.get_xlim())
