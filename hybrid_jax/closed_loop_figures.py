@@ -204,8 +204,19 @@ def _draw_away(axes: Axes, home: Mapping[Flyer, list[FlightRow]], away: Mapping[
         crashed = sum(row.crashed for row in away[flyer])
         words = f"{crashed} of {len(away[flyer])} crash" if crashed else f"{there:.2g}"
         axes.plot(min(there, edge), y, "x" if crashed else ">", color=TINTS[flyer.model], markersize=7, clip_on=False)
-        style = {"va": "center", "fontsize": 7, "ha": "right" if crashed else "left", "annotation_clip": False}
-        axes.annotate(words, (min(there, edge), y), (-8 if crashed else 7, 0), textcoords="offset points", **style)
+        style = {
+            "va": "bottom" if crashed else "center",
+            "fontsize": 7,
+            "ha": "right" if crashed else "left",
+            "annotation_clip": False,
+        }
+        axes.annotate(
+            words,
+            (min(there, edge), y),
+            (-8 if crashed else 7, 4 if crashed else 0),
+            textcoords="offset points",
+            **style,
+        )
 
 
 def _draw_share(axes: Axes, y: int, share, tint: str) -> None:
@@ -221,9 +232,9 @@ def _draw_share(axes: Axes, y: int, share, tint: str) -> None:
     axes.plot(np.clip(value, *SHARES), y, marker, color=tint, markersize=5, clip_on=False, markerfacecolor=filled)
     if not inside:
         left = value < SHARES[0]
-        at, align = ((8, 0), "left") if left else ((-8, 0), "right")
+        at, align = ((6, 3), "left") if left else ((-6, 3), "right")
         axes.annotate(f"{value:.0f}", (np.clip(value, *SHARES), y), at, textcoords="offset points", fontsize=7,
-                      va="center", ha=align)  # fmt: skip
+                      va="bottom", ha=align)  # fmt: skip
 
 
 def _draw_promises(axes: Axes, groups: Mapping[str, Mapping[Flyer, list[FlightRow]]], flyers: Sequence[Flyer]) -> None:

@@ -45,7 +45,9 @@ def gap_tables(rows: Sequence[FlightRow]) -> list[Table]:
             for flyer, line in shares.items()
         ]
         title = f"Share of the gap from the source model to the true vehicle that is closed [%], {NAMES[domain]}"
-        made.append(Table(f"{title} (95 % interval, paired over seeds)", _header(columns), lines))
+        made.append(
+            Table(f"{title} (95 % interval, paired over the seeds that did not crash)", _header(columns), lines)
+        )
     return made
 
 
