@@ -181,7 +181,8 @@ def _place(item) -> int:
 
 
 def _centimetres(rows: Sequence[FlightRow]) -> np.ndarray:
-    return np.array([100 * row.error for row in rows])
+    """Position RMSE; what is nearer than NEAREST is drawn there."""
+    return np.array([max(100 * row.error, NEAREST) for row in rows])
 
 
 def _line(flyer: Flyer, rows: Sequence[FlightRow]) -> Line:
@@ -190,9 +191,7 @@ def _line(flyer: Flyer, rows: Sequence[FlightRow]) -> Line:
 
 
 def _draw_away(axes: Axes, home: Mapping[Flyer, list[FlightRow]], away: Mapping[Flyer, list[FlightRow]]) -> None:
-    means = {
-        flyer: [max(float(np.mean(_centimetres(place[flyer]))), NEAREST) for place in (home, away)] for flyer in away
-    }
+    means = {flyer: [float(np.mean(_centimetres(place[flyer]))) for place in (home, away)] for flyer in away}
     finite = [value for pair in means.values() for value in pair if math.isfinite(value)] or [1.0]
     axes.set(xscale="log", xlim=(min(finite) / 1.4, max(finite) * 1.8), ylim=(len(away) - 0.4, -0.6), xlabel=XLABEL)
     tick_errors(axes.xaxis, *axes.get_xlim())
