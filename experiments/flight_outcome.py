@@ -143,7 +143,7 @@ def head(outcome: Outcome) -> str:
 {flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outcome.found.folds)} folds by \
 {config.folds_by}; {len(rows)} tests, {config.seeds} seeds.
 
-- **hybrid**: a multirotor that learns {", ".join(outcome.before.learn)}, plus a small network seen from the body
+- **hybrid**: a multirotor that learns {", ".join(outcome.before.learn)} (or what its recipe says), plus a small network seen from the body
 - **no-physics**: the same network with ṗ = v and the attitude's kinematics
 - **physics-only**: the multirotor alone
 - **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its defects
