@@ -137,13 +137,14 @@ def head(outcome: Outcome) -> str:
         if "target" in outcome.flown
         else "Models learn from flights and predict "
     )
+    learned = ", ".join(outcome.before.learn)
     return f"""# {outcome.name}
 
 {adapted}flights that they have not seen, open loop from every sample with the recorded rotor speeds.
 {flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outcome.found.folds)} folds by \
 {config.folds_by}; {len(rows)} tests, {config.seeds} seeds.
 
-- **hybrid**: a multirotor that learns {", ".join(outcome.before.learn)} (or what its recipe says), plus a small network seen from the body
+- **hybrid**: a multirotor that learns {learned} (or what its recipe says), plus a small network seen from the body
 - **no-physics**: the same network with ṗ = v and the attitude's kinematics
 - **physics-only**: the multirotor alone
 - **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its defects
