@@ -16,7 +16,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "2"))
-EPOCHS = "400"
+EPOCHS = "600"
+TRIES = 5
 SMALL = [
     "--preset", "smoke", "--models", "hybrid", "--saving", "1", "--max-epochs", EPOCHS,
     "--patience.hybrid-pretraining.minimum", EPOCHS, "--patience.hybrid-minimum", *[EPOCHS] * 5,
@@ -66,7 +67,10 @@ class Place:
         return any(self.cache.glob("sweeps/*.begun/*.orbax-checkpoint-tmp*"))
 
     def checkpoints(self):
-        return sorted(path for path in self.cache.glob("sweeps/*.begun/*") if path.name.isdecimal())
+        try:
+            return sorted(path for path in self.cache.glob("sweeps/*.begun/*") if path.name.isdecimal())
+        except FileNotFoundError:  # the sweep has ended while we looked
+            return []
 
 
 @pytest.fixture(scope="module")
@@ -132,12 +136,18 @@ def test_a_killed_run_goes_on_by_itself_to_the_same_bits(number, place, whole):
 
 
 def interrupted(place, checkpoints=2):
-    """Kill a run as soon as it has saved so many checkpoints of a sweep."""
-    with subprocess.Popen(place.command(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT) as process:
-        while len(place.checkpoints()) < checkpoints and process.poll() is None:
-            time.sleep(0.0005)
-        process.kill()
-    assert process.returncode == -9
+    """Kill a run as soon as it has saved so many checkpoints of a sweep; another, if a busy machine let it run on."""
+    for _ in range(TRIES):
+        place.clear()
+        with subprocess.Popen(
+            place.command(), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, cwd=ROOT
+        ) as process:
+            while len(place.checkpoints()) < checkpoints and process.poll() is None:
+                time.sleep(0.0005)
+            process.kill()
+        if process.returncode == -9 and len(place.checkpoints()) >= checkpoints:
+            return
+    pytest.fail(f"none of {TRIES} runs could be killed in time")
 
 
 def test_a_truncated_checkpoint_is_set_aside_and_the_one_before_it_used(place, whole):
