@@ -1,17 +1,22 @@
 """How this process uses the machine: one JAX device for each CPU core, and compiled programs kept between runs."""
 
+import contextlib
 import os
+import zlib
 from pathlib import Path
 
 import jax
 
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
+PROGRAM = "*-cache"
+VERIFIED = ".verified"
 
 
 def configure(cache: Path) -> None:
     """Set both up; call it before the first array is made, because JAX's devices are fixed by then.
 
-    Programs are kept in the cache folder, or where JAX's own variable JAX_COMPILATION_CACHE_DIR says.
+    Programs are kept in the cache folder, or where JAX's own variable JAX_COMPILATION_CACHE_DIR says. Those that a
+    kill left half written are deleted: JAX would warn of each in every run, compile it anew and never replace it.
 
     Raises:
         ValueError: the folder cannot be made.
@@ -19,6 +24,7 @@ def configure(cache: Path) -> None:
     programs = Path(os.environ.get(PROGRAMS) or cache / "programs")
     try:
         programs.mkdir(parents=True, exist_ok=True)
+        _delete_half_written(programs)
     except OSError as error:
         where = f"{PROGRAMS} {programs}" if os.environ.get(PROGRAMS) else f"--cache {cache}"
         raise ValueError(f"{where}: cannot be written: {error.strerror}") from error
@@ -33,3 +39,23 @@ def configure(cache: Path) -> None:
 def cores() -> int:
     """The CPU cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def _delete_half_written(programs: Path) -> None:
+    verified = programs / VERIFIED
+    since = verified.stat().st_mtime_ns if verified.exists() else 0
+    verified.touch()  # before looking, so that what is written meanwhile is verified next time
+    for path in programs.glob(PROGRAM):
+        with contextlib.suppress(FileNotFoundError):  # another process that starts was faster
+            if path.stat().st_mtime_ns >= since and _half_written(path.read_bytes()):
+                path.unlink()
+
+
+def _half_written(program: bytes) -> bool:
+    """Whether it is a zlib stream that ends too early; what zstandard wrote, where that is installed, is not judged."""
+    stream = zlib.decompressobj()
+    try:
+        stream.decompress(program)
+    except zlib.error:
+        return False
+    return not stream.eof

@@ -34,3 +34,12 @@ def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
     assert compiled > 0
     (tmp_path / "here").rename(tmp_path / "there")
     assert hits_and_misses(tmp_path / "there") == [compiled, 0]
+
+
+def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
+    _, compiled = hits_and_misses(tmp_path)
+    whole, empty = sorted((tmp_path / "programs").glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
+    os.truncate(whole, whole.stat().st_size - 1)
+    os.truncate(empty, 0)
+    assert hits_and_misses(tmp_path) == [compiled - 2, 2]
+    assert hits_and_misses(tmp_path) == [compiled, 0]
