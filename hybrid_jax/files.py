@@ -28,7 +28,8 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
             os.fsync(file.fileno())  # or a power cut could leave the new name on no content
         os.replace(temporary, path)
     except OSError as error:
-        raise OSError(error.errno, error.strerror, str(path)) from error  # a full disk names no file
+        # A full disk names no file.
+        raise OSError(f"{path}: cannot be saved: {error.strerror}; what was saved before is intact") from error
     finally:
         temporary.unlink(missing_ok=True)
 
