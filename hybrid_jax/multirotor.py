@@ -1,12 +1,14 @@
 """f_p of a real multirotor: the rigid body with what else physics knows of it, and with what is learned chosen by name.
 
-    m v̇ = R (T e_z − D Rᵀv) − m g e_z,    J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+    ṗ = R S Rᵀv,    m v̇ = R (T e_z − D Rᵀv) − m g e_z,    J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
 
 T and τ are thrust and torque of the four rotors about a centre of mass that need not be the origin of their positions;
 a rotor's thrust is k_i u_i², with one k or four. Linear rotor drag D, the moment A that grows with the velocity in the
 body frame and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
 dynamics subject to rotor drag for accurate tracking of high-speed trajectories", 2018 (A there has the other sign). The
-gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it.
+gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it. The gain S is no
+physics but the estimator's: what its velocity must be multiplied with, along each axis of the body, to be that of its
+position. A few percent are common, and 0.1 s ahead they are most of the error in position.
 
 The rotors' lag behind what a log says of them is no part of the field but a change to the log: as four more states they
 would start each window unknown, and a window is about as long as the lag. A log knows their past; see
@@ -37,6 +39,7 @@ SIGNED = {
     "drag": (3,),
     "aerodynamic_moment": (3, 3),
     "rate_damping": (3,),
+    "velocity_gain": (3,),
 }
 SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
 
@@ -54,6 +57,7 @@ class Terms:
         drag: D [N s/m].
         aerodynamic_moment: A, one row for each of the three moments [N s].
         rate_damping: B [N m s].
+        velocity_gain: S, of the position's derivative over the velocity in a log.
         motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
 
     Raises:
@@ -65,6 +69,7 @@ class Terms:
     drag: Three = (0.0, 0.0, 0.0)
     aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     rate_damping: Three = (0.0, 0.0, 0.0)
+    velocity_gain: Three = (1.0, 1.0, 1.0)
     motor_time_constant: float = 0.0
 
     def __post_init__(self):
@@ -183,6 +188,7 @@ def _units(vehicle: Vehicle) -> dict[str, float]:
         "drag": weight / SPEED,
         "aerodynamic_moment": weight * arm / SPEED,
         "rate_damping": weight * arm / RATE,
+        "velocity_gain": 1.0,
     }
 
 
@@ -191,19 +197,33 @@ def _derivative(vehicle: Vehicle, constants: Constants, x: Rows, u: Rows) -> Flo
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
     acceleration = (thrust / vehicle.mass) * rotation.body_z(q) + gravity
-    drag, moment, damping = (constants[name] for name in ("drag", "aerodynamic_moment", "rate_damping"))
-    if _is_present(drag) or _is_present(moment):
-        attitude = _matrix(q)
-        velocity = [_dot(column, v) for column in zip(*attitude, strict=True)]
-        if _is_present(drag):
-            force = [-(coefficient / vehicle.mass) * part for coefficient, part in zip(drag, velocity, strict=True)]
-            acceleration = acceleration + jnp.stack([_dot(row, force) for row in attitude])
-        if _is_present(moment):
-            torque = [part + _dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+    moved, slowed, torque = _by_velocity(vehicle, constants, q, v, torque)
+    damping = constants["rate_damping"]
     if _is_present(damping):
         torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
     inertia = tuple(constants[name][0] for name in ("Ix", "Iy", "Iz"))
-    return jnp.concatenate([jnp.stack(v), rotation.derivative(q, omega), acceleration, euler(inertia, torque, omega)])
+    turned = rotation.derivative(q, omega), euler(inertia, torque, omega)
+    return jnp.concatenate([jnp.stack(v) + moved, turned[0], acceleration + slowed, turned[1]])
+
+
+def _by_velocity(vehicle: Vehicle, constants: Constants, q: Rows, v: Rows, torque):
+    """What the velocity in the body frame adds to ṗ and to v̇, and the torque with its moment."""
+    gain, drag, moment = (constants[name] for name in ("velocity_gain", "drag", "aerodynamic_moment"))
+    is_scaled, is_dragged, is_turned = _is_present(gain, absent=1.0), _is_present(drag), _is_present(moment)
+    if not (is_scaled or is_dragged or is_turned):
+        return 0.0, 0.0, torque
+    attitude = _matrix(q)
+    velocity = [_dot(column, v) for column in zip(*attitude, strict=True)]
+
+    def in_world(factors) -> Array:
+        parts = [factor * part for factor, part in zip(factors, velocity, strict=True)]
+        return jnp.stack([_dot(row, parts) for row in attitude])
+
+    moved = in_world([factor - 1.0 for factor in gain]) if is_scaled else 0.0
+    slowed = in_world([-(coefficient / vehicle.mass) for coefficient in drag]) if is_dragged else 0.0
+    if is_turned:
+        torque = [part + _dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+    return moved, slowed, torque
 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
