@@ -81,10 +81,12 @@ def fresh(model: str, craft: Craft, recipe: Recipe, hidden: int, seeds: int) -> 
     hover = InputScaling(craft.vehicle.hover_speed, craft.vehicle.hover_speed / 10)
     physics = craft.physics(recipe)
 
+    # Without physics there is no other term that could make an estimator's position and velocity agree.
+    outputs = "motion" if model == "no_physics" else recipe.outputs
+
     def network(key: PRNGKeyArray) -> AbstractVectorField:
-        return silenced(
-            restricted(key, inputs="body_motion", outputs="motion", hidden=hidden, norm="none", scaling=hover)
-        )
+        seen: dict[str, Any] = {"inputs": "body_motion", "outputs": outputs, "norm": "none", "scaling": hover}
+        return silenced(restricted(key, hidden=hidden, **seen))
 
     def build(seed):
         match model:
@@ -113,10 +115,11 @@ def moved(field: Any, vehicle: Vehicle) -> Any:
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(field))
 
 
-def settings_of(craft: Craft, lessons: Lessons, batch_size: int) -> Settings:
+def settings_of(craft: Craft, lessons: Lessons, recipe: Recipe, batch_size: int) -> Settings:
     """Each channel weighed by the error of nominal thrust with frozen rates at the end of the training windows."""
-    scales = channels_from(craft.thrust(), lessons.train.windows)
-    return Settings(batch_size, objective=ChannelPrediction(scales, HUBER))
+    position, *others = channels_from(craft.thrust(), lessons.train.windows)  # in the state's order
+    position = replace(position, scale=recipe.position * position.scale)
+    return Settings(batch_size, objective=ChannelPrediction((position, *others), HUBER))
 
 
 @dataclass(frozen=True)

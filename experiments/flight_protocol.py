@@ -10,7 +10,7 @@ from experiments.protocol import Run, distinct
 from hybrid_jax.multirotor import check_names
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
-LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping")
+LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_gain")
 NANODRONE_STEPS = 50
 FOLDERS = ("source", "target", "test")
 FILES = ("vehicle", "columns")

@@ -43,6 +43,9 @@ class Recipe:
         scratch: what is done with N windows of the target, from the nominal vehicle.
         physics: of the hybrid and of physics-only.
         learn: names of `multirotor.SHAPES` in place of the vehicle's own; none keeps those.
+        outputs: what a hybrid's network adds to; see `hybrid_jax.features.restricted`.
+        position: how many times a simple baseline's error in position counts as 1. Position is the integral of velocity
+            and says of the motion nothing else; where an estimator's two disagree, it would teach wrong accelerations.
     """
 
     about: str
@@ -52,6 +55,8 @@ class Recipe:
     scratch: tuple[Step, ...]
     physics: Physics = "multirotor"
     learn: tuple[str, ...] = ()
+    outputs: Literal["accelerations", "motion"] = "motion"
+    position: float = 1.0
 
 
 _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
@@ -60,8 +65,18 @@ _SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25
 _BRIEF = (Step(2e-2, 0, 25, 10, 5), Step(2e-3, 2e-3, 25, 5, 5), Step(1e-3, 1e-3, 50, 5, 5))
 
 RECIPES: Mapping[str, Recipe] = {
-    "staged": Recipe("physics, then all on 10 steps, then all on 25", 25, _SOURCE, _ADAPTATION, _SCRATCH),
-    "short": Recipe("physics, then all on 10 steps", 25, _SOURCE[:2], _ADAPTATION[:2], _SCRATCH[:2]),
+    "staged": Recipe(
+        "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
+        *(25, _SOURCE, _ADAPTATION, _SCRATCH),
+        outputs="accelerations",
+        position=10.0,
+    ),
+    "short": Recipe(
+        "physics, then all on 10 steps; the network adds to accelerations alone",
+        *(25, _SOURCE[:2], _ADAPTATION[:2], _SCRATCH[:2]),
+        outputs="accelerations",
+        position=10.0,
+    ),
     "torque_off": Recipe(
         "the rotors' torque is not used; a few epochs on 25 and 50 steps",
         *(50, _BRIEF, _BRIEF, _BRIEF),

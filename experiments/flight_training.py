@@ -44,7 +44,7 @@ class Course:
     def lesson(self, fold: Fold, recipe: str) -> Lesson:
         """Plenty of flight before the change; its channels weigh all that is learned of the recipe."""
         found = lessons(fold, RECIPES[recipe].window, self.config.stride, self.config.validation)
-        return Lesson(found, settings_of(self.before, found, self.config.batch_size))
+        return Lesson(found, settings_of(self.before, found, RECIPES[recipe], self.config.batch_size))
 
     def lesson_after(self, fold: Fold, recipe: str, first: Lesson) -> Lesson:
         """Flight after the change, a window at every sample, weighed as before it."""

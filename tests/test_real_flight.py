@@ -32,7 +32,7 @@ from hybrid_jax.multirotor import Terms
 from hybrid_jax.rollout import rollout, rollout_batch
 from hybrid_jax.rotation import angle_between
 from hybrid_jax.schedule import rates_by_group
-from hybrid_jax.state import QUATERNION
+from hybrid_jax.state import POSITION, QUATERNION
 from hybrid_jax.vehicle import IRIS
 
 ROOT = Path(__file__).parents[1]
@@ -100,8 +100,16 @@ def test_weights_of_channels_come_from_training_windows_alone():
     """The same with other validation and test flights."""
     fold = folds_of(LOGS, None, CONFIG)[0]
     other = replace(fold, validation=OTHERS[:2], test=OTHERS[2:])
-    one, two = (settings_of(CRAFT, lessons(each, 5, 2, 10), 100) for each in (fold, other))
+    one, two = (settings_of(CRAFT, lessons(each, 5, 2, 10), RECIPES["staged"], 100) for each in (fold, other))
     assert one.objective == two.objective
+
+
+def test_a_recipe_says_how_little_position_counts_and_nothing_else_changes():
+    few = lessons(folds_of(LOGS, None, CONFIG)[0], 5, 2, 10)
+    recipes = (replace(RECIPES["staged"], position=factor) for factor in (1.0, 10.0))
+    one, ten = (settings_of(CRAFT, few, recipe, 100).objective.channels for recipe in recipes)
+    assert (one[0].start, one[0].stop) == (POSITION.start, POSITION.stop)
+    assert ten == (replace(one[0], scale=10 * one[0].scale), *one[1:])
 
 
 def test_random_draws_are_nested_and_contiguous_ones_are_runs():
