@@ -15,7 +15,7 @@ from experiments.closed_loop_lanes import Airspace, Block
 from experiments.closed_loop_report import Outcome, write
 from experiments.common_field import CommonField
 from experiments.flyers import Trained, fleet, train
-from experiments.protocol import QUICK, SMOKE, Config, ResidualInputs, distinct, preset_like
+from experiments.protocol import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
 from hybrid_jax import checks, hosts
 from hybrid_jax.closed_loop_rows import Flyer
 from hybrid_jax.control import Controller
@@ -54,9 +54,11 @@ class ClosedLoopConfig(Config):
     """Source trajectories of the safe network, if --source-train is more."""
     safe_epochs: int = 2000
     """Its cap on epochs, if --max-epochs is more."""
+    safe_offset: float | None = 0.3
+    """In its adaptation, the rate of its output bias [m/s² or rad/s² a step]; see --rates.offset."""
     ablation: tuple[Option, ...] = get_args(Option)
-    """What to undo of the safe network. networks: what it reads and writes. statistics: batch statistics of the
-    target. quaternion: renormalised in each step of a prediction."""
+    """What to undo of the safe network. networks: what it reads and writes. offset: the rate of its output bias.
+    statistics: batch statistics of the target. quaternion: renormalised in each step of a prediction."""
     ablation_source: int = 3000
     """Source trajectories of the ablation's networks."""
     ablation_epochs: int = 400
@@ -70,6 +72,8 @@ class ClosedLoopConfig(Config):
             distinct(f"--{option.replace('_', '-')}", getattr(self, option))
         for option in ("seconds", "away", "bandwidth"):
             checks.positive(f"--{option}", getattr(self, option))
+        if self.safe_offset is not None:
+            checks.positive("--safe-offset", self.safe_offset)
         if self.seconds < 1.0:
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
         if self.calls < 1:
@@ -134,7 +138,8 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
     # Of the sizes only the two that fly: nobody else has trained this network.
     sizes = tuple(dict.fromkeys((min(config.sizes), max(config.sizes))))
     seen: dict[str, Any] = {"residual_inputs": config.safe_inputs, "residual_outputs": "accelerations"}
-    own = limited(shared(config, sizes=sizes, pool=config.pooled(), **seen), config.safe_source, config.safe_epochs)
+    wanted = shared(config, sizes=sizes, pool=config.pooled(), rates=safe_rates(config), **seen)
+    own = limited(wanted, config.safe_source, config.safe_epochs)
     trained["safe"] = _train("safe", "hybrid", own, console, outcome)
     return trained
 
@@ -152,7 +157,7 @@ def fly_ablation(
     config: ClosedLoopConfig, usual: Airspace, drifting: Airspace, console: Console, outcome: Outcome
 ) -> None:
     """Train the ablation's networks and fly them, one change at a time."""
-    few = shared(config, sizes=(min(config.sizes),), pool=config.pooled())
+    few = shared(config, sizes=(min(config.sizes),), pool=config.pooled(), rates=safe_rates(config))
     small = limited(few, config.ablation_source, config.ablation_epochs)
     trained, seconds, notes = networks(config.ablation, IRIS, small, console, DOMAINS)
     outcome.seconds |= seconds
@@ -169,6 +174,11 @@ def fly_ablation(
 def shared(config: ClosedLoopConfig, **changes: Any) -> Config:
     """What the configuration shares with other experiments, and so with what these have trained."""
     return Config(**{name: getattr(config, name) for name in Config.__dataclass_fields__} | changes)
+
+
+def safe_rates(config: ClosedLoopConfig) -> Rates:
+    """The learning rates of the safe network."""
+    return config.rates if config.safe_offset is None else replace(config.rates, offset=config.safe_offset)
 
 
 def limited(config: Config, source: int, epochs: int) -> Config:

@@ -13,7 +13,7 @@ from hybrid_jax.closed_loop_rows import Flyer
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.vehicle import Vehicle
 
-Option = Literal["networks", "statistics", "quaternion"]
+Option = Literal["networks", "offset", "statistics", "quaternion"]
 PAPER, SAFE = "paper: all of x → all 13", "safe: no p_x, p_y, yaw → v̇, ω̇"
 NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
     PAPER: ("all", "all"),
@@ -22,20 +22,26 @@ NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
     "no p_x, p_y → v̇, ω̇": ("no_xy", "accelerations"),
     SAFE: ("no_xy_yaw", "accelerations"),
 }
-COMPARED = (PAPER, SAFE)  # what is flown in the wrong way as well
+COMPARED = (PAPER, SAFE)  # of what more is undone than what they read and write
+SLOW = "safe, its output bias as slow as the rest"
 
 
 def networks(
     options: Sequence[Option], vehicle: Vehicle, config: Config, console: Console, domains: Sequence[Domain]
 ) -> tuple[dict[str, Trained], dict[str, float], list[str]]:
     """The trained networks by name, the seconds of their stages, and notes on these."""
+    asked = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
+    if "offset" in options:
+        asked[SLOW] = NETWORKS[SAFE]
     trained, seconds, notes = {}, {}, []
-    for name, (inputs, outputs) in NETWORKS.items():
-        if "networks" in options or name in COMPARED:
-            other = replace(config, residual_inputs=inputs, residual_outputs=outputs)
-            trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, other, console, domains)
-            seconds |= {f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()}
-            notes += [f"{name}: {note}" for note in stages.notes()]
+    for name, (inputs, outputs) in asked.items():
+        # An output bias of ṗ or q̇ is no force, and nothing that should move by leaps.
+        offset = config.rates.offset if outputs == "accelerations" and name != SLOW else None
+        rates = replace(config.rates, offset=offset)
+        other = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
+        trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, other, console, domains)
+        seconds |= {f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()}
+        notes += [f"{name}: {note}" for note in stages.notes()]
     return trained, seconds, notes
 
 
@@ -49,7 +55,7 @@ def variants(
         for name in COMPARED:
             field = trained[name].adapted[domain.name, few]
             wrong = with_statistics_of(trained[name].source, field)
-            fields[flyer(name, few, "batch statistics of the source")] = wrong
+            fields[flyer(with_change(name, "batch statistics of the source"), few)] = wrong
     return {who: in_common(field, vehicle, config) for who, field in fields.items()}
 
 
@@ -58,13 +64,18 @@ def unnormalised(
 ) -> dict[Flyer, CommonField]:
     """What flies with a controller whose predictions let the quaternion's length drift."""
     (few,) = config.sizes
+    fields = {name: trained[name].adapted[domain.name, few] for name in COMPARED}
     return {
-        flyer(name, few, "|q| not renormalised"): in_common(trained[name].adapted[domain.name, few], vehicle, config)
-        for name in COMPARED
+        flyer(with_change(name, "|q| not renormalised"), few): in_common(field, vehicle, config)
+        for name, field in fields.items()
     }
 
 
-def flyer(name: str, few: int, how: str = "") -> Flyer:
-    """A network under the name of what was changed."""
-    model = "safe" if name == SAFE else "hybrid"
-    return Flyer(model, few, variant=f"{name.partition(':')[0]}, {how}" if how else name)
+def with_change(name: str, change: str) -> str:
+    """The name of a network of which something else was changed."""
+    return f"{name.partition(':')[0]}, {change}"
+
+
+def flyer(name: str, few: int) -> Flyer:
+    """A network under its name."""
+    return Flyer("safe" if name.startswith("safe") else "hybrid", few, variant=name)

@@ -1,5 +1,6 @@
 """What each lane of a sweep starts from and is asked to do: models by seed, plans by size (paper, App. A)."""
 
+from dataclasses import replace
 from typing import Any
 
 import equinox as eqx
@@ -19,7 +20,7 @@ from hybrid_jax.rigid_body import RigidBody, guess, guess_off
 from hybrid_jax.rollout import SOLVERS
 from hybrid_jax.training import FitState, Plan, make_plan
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.vehicle import Vehicle
 
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
@@ -58,8 +59,9 @@ def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState,
 def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, Plan]:
     """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
     subsets = [drawn(seed, config) for seed in range(config.seeds)]
+    one = lane(fields, 0)
     plans = [
-        _plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size)
+        _with_offset(_plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size), one, config)
         for size in config.sizes
         for subset in subsets
     ]
@@ -137,6 +139,21 @@ def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.nd
     network: Any = rate
     rates = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
     return make_plan(rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight)
+
+
+def _with_offset(plan: Plan, field: AbstractVectorField, config: Config) -> Plan:
+    """The plan with a rate of its own for the output bias of the field's network, if one is asked for."""
+    offset = config.rates.offset
+    if offset is None:
+        return plan
+    learned = eqx.filter(field, trainable(field))
+    each = jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), plan.rates, learned)
+
+    def rate(path, old):
+        is_bias = jax.tree_util.keystr(path[-1:], simple=True) == "bias_out"
+        return np.full_like(old, offset) if is_bias else old
+
+    return replace(plan, rates=jax.tree_util.tree_map_with_path(rate, each))
 
 
 def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> FitState:

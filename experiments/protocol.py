@@ -1,5 +1,6 @@
 """The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
 
+import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -34,6 +35,9 @@ class Rates:
     """The network without physics, fine-tuned (the scan of the paper is damaged in the first four)."""
     no_physics_target_only: float = 1e-4
     """The network without physics, from a fresh start."""
+    offset: float | None = None
+    """The output bias of θ_d [m/s² or rad/s² a step], fine-tuned and target-only; by default as the rest of θ_d. A
+    steady force is in it alone, and at 1e-3 takes thousands of steps, in which the rest learns by heart."""
 
 
 @dataclass(frozen=True)
@@ -174,6 +178,8 @@ class Config(Run):
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
         if self.noise < 0 or (self.guess_off is not None and self.guess_off <= 0):
             raise ValueError(f"--noise must be >= 0, --guess-off > 0, got {self.noise} and {self.guess_off}")
+        if self.rates.offset is not None and not 0 < self.rates.offset < math.inf:
+            raise ValueError(f"--rates.offset must be a positive number, got {self.rates.offset}")
         if not 0 < self.guess[0] < self.guess[1]:
             raise ValueError(f"--guess must be two factors, low < high, above 0, got {self.guess}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):

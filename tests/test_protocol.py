@@ -128,6 +128,7 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"guess": (1.2, 0.8)}, "--guess"),
         ({"guess": (-1.0, 0.8)}, "--guess"),
         ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
+        ({"rates": replace(PAPER.rates, offset=0.0)}, "--rates.offset"),
         ({"patience": replace(PAPER.patience, hybrid_minimum=(1, 2))}, "--patience.hybrid-minimum"),
     ],
     ids=str,
@@ -140,3 +141,25 @@ def test_options_that_do_not_fit_are_refused_by_name(change, named):
 def test_smoke_is_small_but_whole():
     assert SMOKE.models == PAPER.models
     assert isinstance(SMOKE.cache, Path)
+
+
+@pytest.mark.parametrize("model", ["hybrid", "no_physics"])
+def test_the_output_bias_has_a_rate_of_its_own_if_asked_for(model):
+    """And all else the rate that it had."""
+    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
+    for (_, _, usual), (_, _, found) in zip(
+        plans_by_lane(model, "fine_tuned"), plans_by_lane(model, "fine_tuned", offset), strict=False
+    ):
+        network = found.rates.residual if model == "hybrid" else found.rates
+        rate = usual.rates.residual if model == "hybrid" else usual.rates
+        assert float(network.bias_out) == np.float32(0.3)
+        others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
+        assert {float(each) for each in others} == {float(rate)}
+        if model == "hybrid":
+            assert {float(each) for each in jax.tree.leaves(found.rates.physics)} == {float(usual.rates.physics)}
+
+
+def test_physics_alone_has_no_output_bias():
+    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
+    for _, _, plan in plans_by_lane("physics_only", "fine_tuned", offset):
+        assert {float(each) for each in jax.tree.leaves(plan.rates)} == {np.float32(SMALL.rates.physics)}
