@@ -23,6 +23,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.vehicle import Vehicle
 
+FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
 
 
@@ -142,18 +143,20 @@ def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.nd
 
 
 def _with_offset(plan: Plan, field: AbstractVectorField, config: Config) -> Plan:
-    """The plan with a rate of its own for the output bias of the field's network, if one is asked for."""
+    """The plan with a rate of its own for v̇ and ω̇ in the output bias of the field's network, if one is asked for."""
     offset = config.rates.offset
     if offset is None:
         return plan
     learned = eqx.filter(field, trainable(field))
     each = jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), plan.rates, learned)
 
-    def rate(path, old):
-        is_bias = jax.tree_util.keystr(path[-1:], simple=True) == "bias_out"
-        return np.full_like(old, offset) if is_bias else old
+    def rate(path, old, part):
+        if jax.tree_util.keystr(path[-1:], simple=True) != "bias_out":
+            return old
+        others = part.shape[-1] - FORCES
+        return np.concatenate([np.full(others, old), np.full(FORCES, offset)]).astype(np.float32)
 
-    return replace(plan, rates=jax.tree_util.tree_map_with_path(rate, each))
+    return replace(plan, rates=jax.tree_util.tree_map_with_path(rate, each, learned))
 
 
 def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> FitState:

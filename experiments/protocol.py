@@ -36,8 +36,8 @@ class Rates:
     no_physics_target_only: float = 1e-4
     """The network without physics, from a fresh start."""
     offset: float | None = None
-    """The output bias of θ_d [m/s² or rad/s² a step], fine-tuned and target-only; by default as the rest of θ_d. A
-    steady force is in it alone, and at 1e-3 takes thousands of steps, in which the rest learns by heart."""
+    """v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default as the rest of
+    θ_d. A steady force is there alone, and at 1e-3 takes thousands of steps, in which the rest learns by heart."""
 
 
 @dataclass(frozen=True)

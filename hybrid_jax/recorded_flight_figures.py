@@ -13,7 +13,7 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
 from hybrid_jax.figures import COLOURS, STYLE
 from hybrid_jax.flight_rows import NAMES, QUANTITIES, SUM, Cell, FlightRow, cell_name, cells, pooled
-from hybrid_jax.state import BODY_RATES, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
 BASELINE_COLOURS = {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
@@ -114,12 +114,15 @@ def residual_by_speed(
 ) -> Figure:
     """How much a network adds to ṗ, v̇ and ω̇ on test flights, against speed: median and quartiles of equal bins.
 
+    A derivative to which none of them adds anything has no panel.
+
     Args:
         residuals: what is added to ẋ at each sample, by the name of the model.
     """
-    figure = Figure(figsize=(12, 4.2), layout="constrained")
-    panels = figure.subplots(1, 3)
-    parts = {"ṗ  [m/s]": slice(0, 3), "v̇  [m/s²]": VELOCITY, "ω̇  [rad/s²]": BODY_RATES}
+    every = {"ṗ  [m/s]": POSITION, "v̇  [m/s²]": VELOCITY, "ω̇  [rad/s²]": BODY_RATES}
+    parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
+    figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
+    panels = figure.subplots(1, max(len(parts), 1), squeeze=False)[0][: len(parts)]
     colours = (COLOURS["hybrid"], COLOURS["no_physics"], COLOURS["physics_only"])
     for axes, (name, part) in zip(panels, parts.items(), strict=True):
         for colour, (model, residual) in zip(colours, residuals.items(), strict=False):
