@@ -41,7 +41,8 @@ is known to it without noise.
 - **physics**: the same, its Ix, Iy, k fitted to N target trajectories of 0.1 s
 - **hybrid**: physics plus the paper's network, trained on source flight (source), then on N target trajectories
 - **no-physics**: the paper's network alone
-- **safe hybrid**: a hybrid whose network sees neither p_x, p_y nor yaw and adds to v̇ and ω̇ alone
+- **safe hybrid**: a hybrid whose network sees neither p_x, p_y nor yaw, adds to v̇ and ω̇ alone, and whose output bias,
+  which is what a steady force is, moves at a rate of its own in adaptation (--safe-offset)
 - **true vehicle, mean wind**: the simulator's own equations and the wind's mean, the best that no clock can beat
 - **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
 
@@ -89,7 +90,7 @@ def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
     drawn, missing = draw(rows, ablated, outcome, few)
     for file, (figure, _) in drawn.items():
         save_figure(figure, out / file)
-    seconds = outcome.seconds | {f"flights {block.block.name}": block.seconds for block in outcome.flights()}
+    seconds = outcome.seconds | seconds_of(outcome.flights())
     record = {
         "experiment": name,
         "config": config.described(),
@@ -117,6 +118,12 @@ def texts(record: dict[str, Any], told: Sequence[Table], csv: str) -> dict[str, 
 def rows_of(blocks: Sequence[Flights]) -> list[FlightRow]:
     """The rows of all flights."""
     return [row for block in blocks for row in block.rows()]
+
+
+def seconds_of(blocks: Sequence[Flights]) -> dict[str, float]:
+    """The seconds of all blocks of a name: what is flown at home is flown again in the ablation."""
+    names = dict.fromkeys(f"flights {block.block.name}" for block in blocks)
+    return {name: sum(each.seconds for each in blocks if f"flights {each.block.name}" == name) for name in names}
 
 
 def speed_of(outcome: Outcome, seconds: float, few: int) -> Speed:
