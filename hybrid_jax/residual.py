@@ -259,25 +259,34 @@ def _forward(epsilon, weight_in, gain, shift, weight_out, bias_out, z):
     hidden = weight_in @ centred
     inverse_deviation = jax.lax.rsqrt(_row_means(jnp.square(hidden)) + epsilon)
     active = jax.nn.relu((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
-    saved = (weight_in, gain, weight_out, centred, hidden, inverse_deviation, active)
+    # The active units are computed again in `_backward`: that takes less than to keep them for forty evaluations.
+    saved = (weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation)
     return weight_out @ active + bias_out[:, None], saved
 
 
 def _backward(_, saved, d_out: Float[Array, "d b"]):
-    weight_in, gain, weight_out, centred, hidden, inverse_deviation, active = saved
+    weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation = saved
     columns = centred.shape[1]
-    d_active = jnp.where(active > 0, weight_out.T @ d_out, 0.0)
+    scale = gain * inverse_deviation
+    normal = scale[:, None] * hidden + shift[:, None]
+    d_active = jnp.where(normal > 0, _transposed(weight_out) @ d_out, 0.0)
     d_scale = columns * _row_means(d_active * hidden)
     # Through the scale γ r, and through r = (mean of h² + ε)^(−½).
     through_deviation = -(d_scale * gain) * inverse_deviation**3 / columns
-    d_hidden = (gain * inverse_deviation)[:, None] * d_active + through_deviation[:, None] * hidden
-    d_centred = weight_in.T @ d_hidden
+    d_hidden = scale[:, None] * d_active + through_deviation[:, None] * hidden
+    d_centred = _transposed(weight_in) @ d_hidden
     d_z = d_centred - _row_means(d_centred)[:, None]
     d_shift, d_bias = columns * _row_means(d_active), columns * _row_means(d_out)
-    return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_out @ active.T, d_bias, d_z
+    d_weight_out = d_out @ jax.nn.relu(normal).T
+    return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
 
 
 _normalised_layer.defvjp(_forward, _backward)
+
+
+def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
+    # As a matrix of its own: a small product that reads its left factor by columns takes half as long again on a CPU.
+    return jax.lax.optimization_barrier(matrix.T)
 
 
 def _row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
