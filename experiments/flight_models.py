@@ -22,7 +22,8 @@ from hybrid_jax.datasets import Dataset
 from hybrid_jax.features import restricted, silenced
 from hybrid_jax.lanes import lane, stack
 from hybrid_jax.models import portable
-from hybrid_jax.multirotor import Multirotor, Terms, carried_to, multirotor
+from hybrid_jax.multirotor import Multirotor, carried_to, multirotor
+from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.objective import Settings
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.schedule import cut, judged, rates_by_group

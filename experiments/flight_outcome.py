@@ -26,7 +26,7 @@ from hybrid_jax.flight_rows import Cell, FlightRow, by_name, cell_name, cells, t
 from hybrid_jax.flight_tables import choice_tables, fold_tables, log_tables, parameter_tables, score_tables
 from hybrid_jax.flights.splits import flight_of
 from hybrid_jax.lanes import lane
-from hybrid_jax.multirotor import nominal_values
+from hybrid_jax.multirotor_terms import nominal_values
 from hybrid_jax.recorded_flight_figures import (
     Curve,
     Restarted,

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from experiments.flight_recipes import RECIPES, Model, RecipeName
 from experiments.protocol import Run, distinct
-from hybrid_jax.multirotor import check_names
+from hybrid_jax.multirotor_terms import check_names
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_gain")

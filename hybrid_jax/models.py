@@ -16,7 +16,8 @@ from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly
-from hybrid_jax.multirotor import Multirotor, Terms
+from hybrid_jax.multirotor import Multirotor
+from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch

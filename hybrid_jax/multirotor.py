@@ -15,8 +15,6 @@ would start each window unknown, and a window is about as long as the lag. A log
 `hybrid_jax.flights.rotor_lag`.
 """
 
-import math
-from dataclasses import dataclass
 from functools import partial
 
 import equinox as eqx
@@ -25,57 +23,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
+from hybrid_jax.multirotor_terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
 from hybrid_jax.rigid_body import LEARNED, AbstractRigidBody, euler
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.vector_field import deploy_batch, evaluate_batch
 from hybrid_jax.vehicle import Vehicle
 
-SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
-POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
-SIGNED = {
-    "torque_gain": (3,),
-    "centre_of_mass": (2,),
-    "drag": (3,),
-    "aerodynamic_moment": (3, 3),
-    "rate_damping": (3,),
-    "velocity_gain": (3,),
-}
-SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
-
 Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
-Three = tuple[float, float, float]
-
-
-@dataclass(frozen=True)
-class Terms:
-    """Nominal values of what a rigid body leaves out; by default there is none of it. Body frame, SI units.
-
-    Attributes:
-        torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
-        centre_of_mass: (x, y) in the frame of the rotors' positions [m].
-        drag: D [N s/m].
-        aerodynamic_moment: A, one row for each of the three moments [N s].
-        rate_damping: B [N m s].
-        velocity_gain: S, of the position's derivative over the velocity in a log.
-        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
-
-    Raises:
-        ValueError: a term of another shape, or that is not finite.
-    """
-
-    torque_gain: Three = (1.0, 1.0, 1.0)
-    centre_of_mass: tuple[float, float] = (0.0, 0.0)
-    drag: Three = (0.0, 0.0, 0.0)
-    aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    rate_damping: Three = (0.0, 0.0, 0.0)
-    velocity_gain: Three = (1.0, 1.0, 1.0)
-    motor_time_constant: float = 0.0
-
-    def __post_init__(self):
-        for name, shape in SIGNED.items():
-            object.__setattr__(self, name, _floats(name, getattr(self, name), shape))
-        checks.not_negative("motor_time_constant", self.motor_time_constant)
 
 
 class Multirotor(AbstractRigidBody):
@@ -109,7 +64,7 @@ class Multirotor(AbstractRigidBody):
 
     def theta(self) -> dict[str, Float[Array, "..."]]:
         """The learned parameters in SI units; see `Vehicle` and `Terms`."""
-        nominal, units = nominal_values(self.vehicle, self.terms), _units(self.vehicle)
+        nominal, units = nominal_values(self.vehicle, self.terms), units_of(self.vehicle)
 
         def value(name: str, deviation: Array) -> Array:
             middle = jnp.reshape(jnp.asarray(nominal[name], deviation.dtype), SHAPES[name])
@@ -145,51 +100,13 @@ def carried_to(field: Multirotor, vehicle: Vehicle) -> Multirotor:
 
     The same deviations would not do: they are relative to the vehicle's nominal values, weight and arm.
     """
-    nominal, units = nominal_values(vehicle, field.terms), _units(vehicle)
+    nominal, units = nominal_values(vehicle, field.terms), units_of(vehicle)
 
     def deviation(name: str, value: Array) -> Array:
         middle = jnp.reshape(jnp.asarray(nominal[name], value.dtype), SHAPES[name])
         return jnp.log(value / middle) if name in POSITIVE else (value - middle) / units[name]
 
     return Multirotor({name: deviation(name, value) for name, value in field.theta().items()}, vehicle, field.terms)
-
-
-def check_names(learn) -> None:
-    """Refuse names of what cannot be learned, or not at once.
-
-    Raises:
-        ValueError: the first such name, and which ones there are.
-    """
-    for name in learn:
-        if name not in tuple(SHAPES):
-            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {checks.shown(name)}")
-    if len(set(learn)) != len(tuple(learn)):
-        raise ValueError(f"learn names something twice: {', '.join(learn)}")
-    if {"k", "k_rotors"} <= set(learn):
-        raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
-
-
-def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
-    """The nominal value of everything in `SHAPES`, number by number; SI units."""
-    ix, iy, iz = ((moment,) for moment in vehicle.inertia)
-    k = vehicle.thrust_coefficient
-    own = {"Ix": ix, "Iy": iy, "Iz": iz, "k": (k,), "k_rotors": (k,) * 4}
-    own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
-    return own | {name: _flat(getattr(terms, name)) for name in SIGNED}
-
-
-def _units(vehicle: Vehicle) -> dict[str, float]:
-    """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
-    weight = vehicle.mass * vehicle.gravity
-    arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / 4
-    return {
-        "torque_gain": 1.0,
-        "centre_of_mass": arm,
-        "drag": weight / SPEED,
-        "aerodynamic_moment": weight * arm / SPEED,
-        "rate_damping": weight * arm / RATE,
-        "velocity_gain": 1.0,
-    }
 
 
 def _derivative(vehicle: Vehicle, constants: Constants, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
@@ -261,23 +178,6 @@ def _dot(a, b) -> Array:
 def _is_present(term, absent: float = 0.0) -> bool:
     """Whether a term is learned, or known and does something."""
     return any(not isinstance(number, float) or number != absent for number in term)
-
-
-def _flat(value) -> tuple[float, ...]:
-    return tuple(number for row in value for number in (row if isinstance(row, tuple) else (row,)))
-
-
-def _floats(name: str, value, shape: tuple[int, ...]):
-    """Nested tuples of Python's own floats, which can be hashed and written to files."""
-    if not isinstance(value, tuple) or len(value) != shape[0]:
-        raise ValueError(
-            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {checks.shown(value)}"
-        )
-    if shape[1:]:
-        return tuple(_floats(name, row, shape[1:]) for row in value)
-    for number in value:
-        checks.number(name, number)
-    return tuple(map(float, value))
 
 
 @deploy_batch.register

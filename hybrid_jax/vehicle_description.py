@@ -17,7 +17,8 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 
 from hybrid_jax import checks
-from hybrid_jax.multirotor import SHAPES, Multirotor, Terms, check_names, multirotor
+from hybrid_jax.multirotor import Multirotor, multirotor
+from hybrid_jax.multirotor_terms import SHAPES, Terms, check_names
 from hybrid_jax.rigid_body import LEARNED
 from hybrid_jax.vehicle import Vehicle, as_tuple, read_tables, vehicle_of
 

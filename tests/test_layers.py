@@ -11,7 +11,7 @@ FLOORS = (
     "state rotation files hosts runtime",
     "checks",
     "vehicle archive lanes trajectories rows paired flight_rows",
-    "vector_field datasets summary closed_loop_rows",
+    "vector_field datasets summary closed_loop_rows multirotor_terms",
     "rigid_body residual rollout environment",
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",

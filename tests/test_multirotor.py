@@ -10,7 +10,8 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from hybrid_jax import Hybrid, load, rigid_body, save
-from hybrid_jax.multirotor import SHAPES, SIGNED, Multirotor, Terms, carried_to, multirotor
+from hybrid_jax.multirotor import Multirotor, carried_to, multirotor
+from hybrid_jax.multirotor_terms import SHAPES, SIGNED, Terms
 from hybrid_jax.rigid_body import RigidBody, moves_a_rigid_body
 from hybrid_jax.rollout import rollout_batch
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY

@@ -3,7 +3,8 @@
 import pytest
 
 from hybrid_jax import rigid_body
-from hybrid_jax.multirotor import Multirotor, Terms
+from hybrid_jax.multirotor import Multirotor
+from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.vehicle import load_vehicle
 from hybrid_jax.vehicle_description import VehicleDescription, load_description
 

@@ -8,7 +8,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.features import FROM_THE_BODY, INPUTS, OUTPUTS, restricted
-from hybrid_jax.multirotor import SHAPES, Terms, multirotor
+from hybrid_jax.multirotor import multirotor
+from hybrid_jax.multirotor_terms import SHAPES, Terms
 from hybrid_jax.residual import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.rigid_body import RigidBody, guess
 from hybrid_jax.state import QUATERNION, VELOCITY

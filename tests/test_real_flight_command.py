@@ -1,0 +1,138 @@
+"""From folders of logs, sound but for one thing, to a report: what is read, what is refused, what is left behind."""
+
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
+
+import hybrid_jax
+from experiments import real_flight
+from experiments.flight_folds import folds_of
+from experiments.flight_logs import cut, fly_in, require_one_rate
+from experiments.simulated_logs import vehicle_toml
+from hybrid_jax.flight_rows import QUANTITIES
+from hybrid_jax.vehicle import IRIS
+
+ROOT = Path(__file__).parents[1]
+
+
+def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
+    source = write(tmp_path / "source", LOGS[:2])
+    cleaning = replace(CONFIG.cleaning, resample=0.02, low_pass=20.0, delay=0.02)
+    found = fly_in("source", source, IRIS, 0.01, replace(CONFIG, cleaning=cleaning))
+    assert [record["flight"] for record in found.records] == ["chirp_run1", "chirp_run2"]
+    for record in found.records:
+        assert [line.split()[0] for line in record["done"]] == ["resampled", "low-pass", "motors", "rotors"]
+        assert record["samples"] == SAMPLES
+        assert len(record["checks"]) == 9
+    assert require_one_rate([found]) == 0.02
+
+
+def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
+    slow = [replace(LOGS[1], t=2 * LOGS[1].t)]
+    found = fly_in("source", write(tmp_path, [LOGS[0], *slow]), IRIS, 0.0, CONFIG)
+    with pytest.raises(ValueError, match=r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"):
+        require_one_rate([found])
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"n": (50,)}, "--n must each be at least --batch-size 100"),
+        ({"horizon": (0,)}, "--horizon must be at least 1"),
+        ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
+        ({"learn": ("wings",)}, "learn must be names of"),
+        ({"epochs": 0.0}, "--epochs must be a positive number"),
+    ],
+)
+def test_options_that_do_not_fit_are_refused(options, said):
+    with pytest.raises(ValueError, match=said):
+        replace(CONFIG, **options)
+
+
+def test_too_few_flights_are_refused():
+    with pytest.raises(ValueError, match="--folds-by flight: all flights are of one name"):
+        folds_of(LOGS[:1], None, CONFIG)
+    with pytest.raises(ValueError, match="--validate-by flight: 1 flights of one name"):
+        folds_of(LOGS[:1], OTHERS, CONFIG)
+    with pytest.raises(ValueError, match="no window of 200 intervals"):
+        cut(LOGS, 200)
+
+
+def test_without_flights_it_says_how_to_get_some(capsys):
+    with pytest.raises(SystemExit) as stop:
+        real_flight.main([])
+    assert stop.value.code == 2
+    assert "--simulated" in capsys.readouterr().err
+
+
+def test_numbers_may_be_joined_by_commas():
+    given = ["--n", "100,300", "--horizon=10,50", "--source", "a,b", "--epochs", "0.5"]
+    expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "a,b", "--epochs", "0.5"]
+    assert real_flight.spaced(given) == expected
+
+
+def command(*options, folder):
+    arguments = ["--out", str(folder / "out"), "--cache", str(folder / "cache"), *options]
+    run = [sys.executable, "-m", "experiments.real_flight", "--preset", "smoke", *arguments]
+    return subprocess.run(run, capture_output=True, text=True, cwd=ROOT, env=os.environ | {"MPLBACKEND": "agg"})
+
+
+def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
+    (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
+    source = write(tmp_path / "source", LOGS[:3])
+    text = (
+        "t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3\n"
+        + "0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600\n"
+        + "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600\n"
+    )
+    (source / "bad.csv").write_text(text)
+    run = command("--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source), folder=tmp_path)
+    assert run.returncode == 2
+    (line,) = run.stderr.strip().splitlines()
+    assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
+    left = (tmp_path / "out" / "real_flight").iterdir()
+    assert [path.name for path in left] == [".lock"]  # nothing is written half
+
+
+@pytest.fixture(scope="module")
+def simulated(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("simulated")
+    run = command("--simulated", folder=folder)
+    assert run.returncode == 0, run.stderr
+    return folder / "out" / "real_flight", run
+
+
+def test_simulated_logs_go_all_the_way(simulated):
+    out, run = simulated
+    report = json.loads((out / "report.json").read_text())
+    assert {"versions", "hardware", "seconds"} <= set(report["environment"])
+    assert report["config"]["preset"] == "smoke"
+    # Two folds: hold, thrust, two linear residuals; two models zero-shot and fine-tuned, the hybrid from scratch.
+    assert len(report["rows"]) == 2 * (4 + 2 * 2 + 1)
+    for found in report["rows"]:
+        assert set(found["scores"]) == {"5", "10"}
+        assert all(set(errors) == set(QUANTITIES) for errors in found["scores"].values())
+        assert (found["theta"] is None) == (found["model"] not in ("hybrid", "physics_only"))
+    for fold in report["folds"]:
+        assert not set(fold["test"]) & {*fold["train"], *fold["validation"]}
+    assert sum(map(len, report["logs"].values())) == 16
+    page = (out / "report.md").read_text()
+    for figure in report["figures"]:
+        assert (out / figure).read_bytes().startswith(b"\x89PNG")
+        assert f"({figure})" in page
+    assert "Consistency of each log" in page
+    assert "Traceback" not in run.stderr
+
+
+def test_models_of_a_run_load_and_predict(simulated):
+    out, _ = simulated
+    model = hybrid_jax.load(out / "models" / "fold0-hybrid-fine_tuned-20-seed0.npz")
+    assert model.about["dt"] == DT
+    assert np.isfinite(model.predict(LOGS[0].x[0], LOGS[0].u[:5], DT)).all()
