@@ -43,6 +43,8 @@ is known to it without noise.
 - **no-physics**: the paper's network alone
 - **safe hybrid**: a hybrid whose network sees neither p_x, p_y nor yaw, adds to v̇ and ω̇ alone, and whose output bias,
   which is what a steady force is, moves at a rate of its own in adaptation (--safe-offset)
+- **safe, nine numbers**: the safe hybrid of the source, its network left as it is; least squares fits Ix, Iy, k and a
+  constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation flights
 - **true vehicle, mean wind**: the simulator's own equations and the wind's mean, the best that no clock can beat
 - **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
 
@@ -145,7 +147,8 @@ def draw(
 ) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
     """Figures with their captions by file, and notes on what could not be drawn."""
     made: dict[str, tuple[Figure, str]] = {}
-    followed = (Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few), Flyer("oracle"))
+    adapted = (Flyer("hybrid", few), Flyer("safe", few), Flyer("nine", few))
+    followed = (Flyer("nominal"), Flyer("hybrid"), *adapted, Flyer("oracle"))
     for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
         name = NAMES[domain]
         made[f"errors_{domain}"] = figures.errors(rows, domain), f"Position RMSE of all seeds of all models, {name}"

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
+from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import Accelerations, Placeless, TiltOnly, View
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, nominal, rigid_body
@@ -61,7 +62,9 @@ class CommonField(AbstractVectorField):
 
 
 def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
-    """A rigid body, a network or their hybrid in the common form; a single one, so map it over stacked ones.
+    """A rigid body, a network or their hybrid, which may have a constant disturbance, in the common form.
+
+    A single one, so map it over stacked ones.
 
     Args:
         hidden, scaling: of the networks of all lanes.
@@ -70,6 +73,9 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
         ValueError: a field of another kind, or a network whose norm is no affine map of a sample.
     """
     match field:
+        case Hybrid(physics=Hybrid(physics=RigidBody() as body, residual=ConstantDisturbance() as steady)):
+            share, network = 1.0, wide(field.residual)
+            network = eqx.tree_at(lambda f: f.bias_out, network, network.bias_out + steady.of_all)
         case Hybrid(physics=RigidBody() as body):
             share, network = 1.0, wide(field.residual)
         case RigidBody() as body:

@@ -10,15 +10,19 @@ import numpy as np
 from rich.console import Console
 
 from experiments.common_field import CommonField, common, true_field
-from experiments.conditions import input_scaling
+from experiments.conditions import input_scaling, settings
 from experiments.protocol import Config
+from experiments.rivals import by_lane, subsets
 from experiments.stages import Stages, stages_of
 from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
 from hybrid_jax.closed_loop_rows import Flyer
+from hybrid_jax.disturbance import with_disturbance
 from hybrid_jax.lanes import lane
+from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.residual import BatchNorm, InputScaling
 from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import Vehicle
 
@@ -53,21 +57,39 @@ def train(
     return Trained(start, found), stages
 
 
+def solved(
+    source: AbstractVectorField, few: int, config: Config, console: Console, domains: Sequence[Domain]
+) -> tuple[Trained, Stages]:
+    """Hybrids of the source, of which θ_p and a constant disturbance are fitted to each domain by least squares."""
+    stages, solver = stages_of(config, console), settings(config).solver
+
+    def one(lane, pool: Trajectories) -> AbstractVectorField:
+        field, subset = lane
+        return fit_physics(with_disturbance(field), pool[subset], solver).field
+
+    def of(domain: Domain) -> AbstractVectorField:
+        pool = flown(domain, target_splits(config), config, stages).splits["train"]
+        return stages.timed(f"least squares {domain.name}", lambda: by_lane(one, (source, subsets(few, config)), pool))
+
+    return Trained(source, {(domain.name, few): of(domain) for domain in domains}), stages
+
+
 def fleet(
     domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], few: int, many: int, config: Config
 ) -> dict[Flyer, CommonField]:
     """All that flies in a domain, in the common form: a lane for each seed, or one of a model that was not trained.
 
     Args:
-        trained: "physics", "hybrid", "no_physics", "safe".
+        trained: "physics", "hybrid", "no_physics", "safe", "nine".
     """
     fields: dict[Flyer, Any] = {Flyer("nominal"): single(rigid_body(vehicle))}
     for model, found in trained.items():
         if model in ("hybrid", "safe"):
             fields[Flyer(model)] = found.source
-        sizes = (few,) if model == "physics" else dict.fromkeys((few, many))
+        sizes = (few,) if model in ("physics", "nine") else dict.fromkeys((few, many))
         fields |= {Flyer(model, size): found.adapted[domain.name, size] for size in sizes}
-    for flyer in (Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few)):
+    observed = Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few), Flyer("nine", few)
+    for flyer in observed:
         fields[replace(flyer, observer=True)] = fields[flyer]
     truth = true_field(domain, vehicle, config.hidden, input_scaling(vehicle, config))
     return {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()} | {

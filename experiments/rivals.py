@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -16,6 +17,7 @@ from experiments.stages import Stages
 from experiments.study import domain_name, places
 from hybrid_jax import linear_adaptation
 from hybrid_jax.datasets import Dataset
+from hybrid_jax.disturbance import with_disturbance
 from hybrid_jax.expert_augmentation import prediction_mse
 from hybrid_jax.lanes import lane, stack
 from hybrid_jax.least_squares import fit_physics, physics_of
@@ -30,7 +32,7 @@ from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, thaw
 PAST = 10  # intervals of a test window before the ones to predict
 Method = Literal[
     "hybrid", "no_physics", "physics_only", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer",
-    "least_squares", "linear_residual",
+    "least_squares", "constant_disturbance", "linear_residual",
 ]  # fmt: skip
 
 
@@ -90,7 +92,7 @@ class Solved:
             return field, deployed_mse(field, validation, solver=shared.solver), jnp.asarray(steps), jnp.asarray(status)
 
         def solve(size: int):
-            lanes = (case.pretrained["hybrid"].best, _subsets(size, config))
+            lanes = (case.pretrained["hybrid"].best, subsets(size, config))
             return by_lane(one, lanes, case.target.splits["train"], case.target.splits["validation"])
 
         def work():
@@ -130,8 +132,12 @@ def augmented(case: Case, name: str) -> Lanes:
 
 
 def with_intervals(case: Case, lanes: Lanes) -> Lanes:
-    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p was adapted."""
-    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in ("theta_d_only", *CLOSED_FORM):
+    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p alone was adapted.
+
+    With a network an interval takes it as given; of θ_p and a disturbance that trade with each other it would not do.
+    """
+    without = ("theta_d_only", "constant_disturbance", *CLOSED_FORM)
+    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:
         return lanes
     solver = settings(case.config).solver
 
@@ -143,7 +149,7 @@ def with_intervals(case: Case, lanes: Lanes) -> Lanes:
     def of_size(index: int, size: int):
         seeds = case.config.seeds
         fields = lane(lanes.fields, np.arange(index * seeds, (index + 1) * seeds))
-        return by_lane(one, (fields, _subsets(size, case.config)), case.target.splits["train"])
+        return by_lane(one, (fields, subsets(size, case.config)), case.target.splits["train"])
 
     parts = case.stages.timed(
         f"intervals {lanes.model} {case.name}",
@@ -164,7 +170,8 @@ def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
     return jax.device_get(run(lanes, shared))
 
 
-def _subsets(size: int, config: Config) -> np.ndarray:
+def subsets(size: int, config: Config) -> np.ndarray:
+    """The target trajectories that each seed draws, as indices (seeds, size)."""
     return stack([drawn(seed, config)[:size] for seed in range(config.seeds)])
 
 
@@ -175,8 +182,8 @@ def _ridge(method) -> Solved:
     return Solved(solve)
 
 
-def _least_squares(field, train, validation, shared):
-    found = fit_physics(field, train, shared.solver)
+def _least_squares(field, train, validation, shared, begun=lambda field: field):
+    found = fit_physics(begun(field), train, shared.solver)
     status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
     return found.field, found.steps, status
 
@@ -193,5 +200,6 @@ METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
     "theta_p_only": tuned("hybrid", lambda field: Hybrid(field.physics, Frozen(field.residual))),
     "theta_d_only": tuned("hybrid", lambda field: Hybrid(Frozen(field.physics), field.residual)),
     "least_squares": Solved(_least_squares),
+    "constant_disturbance": Solved(partial(_least_squares, begun=with_disturbance)),
     **CLOSED_FORM,
 }

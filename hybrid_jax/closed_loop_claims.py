@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from hybrid_jax.claims import Claim
-from hybrid_jax.closed_loop_rows import LEARNED, REFERENCES, Cells, FlightRow, Flyer, cells
+from hybrid_jax.closed_loop_rows import LEARNED, REFERENCES, SOURCES, Cells, FlightRow, Flyer, cells
 from hybrid_jax.closed_loop_tables import ORACLE, gaps
 from hybrid_jax.paired import mean_difference
 
@@ -62,7 +62,7 @@ class _Evidence:
 
     @property
     def source(self) -> Flyer:
-        return Flyer(self.model)
+        return Flyer(SOURCES[self.model])
 
     @property
     def adapted(self) -> Flyer:
@@ -70,7 +70,7 @@ class _Evidence:
 
 
 def claims(rows: Sequence[FlightRow], few: int, speed: Speed | None) -> list[Claim]:
-    """Judge what was to be reached, for the paper's network and for the safe one.
+    """Judge what was to be reached, for the paper's network and for both ways to adapt the safe one.
 
     Args:
         few: the N with which the adapted models were trained.
@@ -78,7 +78,7 @@ def claims(rows: Sequence[FlightRow], few: int, speed: Speed | None) -> list[Cla
     found = cells(rows)
     made = []
     for number, text, judge in _RULES:
-        for letter, model in (("a", "hybrid"), ("b", "safe")):
+        for letter, model in zip("abc", SOURCES, strict=True):
             evidence = _Evidence(found, model, few)
             words = f"{LEARNED[model]}: {text}"
             made.append(_judged(f"R{number}{letter}", words, lambda e=evidence, j=judge: j(e)))

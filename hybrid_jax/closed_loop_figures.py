@@ -21,6 +21,7 @@ TINTS = {
     "hybrid": COLOURS["hybrid"],
     "no_physics": COLOURS["no_physics"],
     "safe": "#CC79A7",
+    "nine": "#882255",
     "oracle": "black",
 }
 MARKERS = dict(zip(REFERENCES, "os^Dv*", strict=True))

@@ -16,7 +16,14 @@ REFERENCES = {  # name → for people
     "low_pass": "low pass",
     "upset": "upset, 6 rad/s",
 }
-LEARNED = {"physics": "physics", "hybrid": "hybrid", "no_physics": "no-physics", "safe": "safe hybrid"}
+LEARNED = {
+    "physics": "physics",
+    "hybrid": "hybrid",
+    "no_physics": "no-physics",
+    "safe": "safe hybrid",
+    "nine": "safe, nine numbers",
+}
+SOURCES = {"hybrid": "hybrid", "safe": "safe", "nine": "safe"}  # hybrids → what each was before it was adapted
 KNOWN = {"nominal": "nominal physics", "oracle": "true vehicle, mean wind"}
 MODELS = (*KNOWN, *LEARNED)
 
@@ -26,7 +33,8 @@ class Flyer:
     """What the controller believes in.
 
     Attributes:
-        model: one of MODELS; "safe" is a hybrid whose network reads and writes less.
+        model: one of MODELS; "safe" is a hybrid whose network reads and writes less, "nine" the same of which θ_p and
+            a constant disturbance alone are adapted.
         n_train: target trajectories that it was adapted to; 0 for none.
         observer: whether a disturbance observer corrects it in flight.
         variant: what was changed of the model or the controller, in an ablation; empty for nothing.

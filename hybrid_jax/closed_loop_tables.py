@@ -4,7 +4,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from hybrid_jax.closed_loop_rows import REFERENCES, Cells, FlightRow, Flyer, cells, paired
+from hybrid_jax.closed_loop_rows import REFERENCES, SOURCES, Cells, FlightRow, Flyer, cells, paired
 from hybrid_jax.paired import Interval, share_of_gap
 from hybrid_jax.report_tables import Table
 from hybrid_jax.rows import DOMAINS, NAMES
@@ -57,8 +57,8 @@ def gaps(found: Cells, domain: str) -> dict[Flyer, dict[str, Interval]]:
     for reference in REFERENCES:
         group = found.get((domain, reference, 0.0), {})
         for flyer, rows in group.items():
-            source = Flyer("safe" if flyer.model == "safe" else "hybrid")
-            adapts = flyer.model in ("hybrid", "safe") and (flyer.n_train or flyer.observer)
+            source = Flyer(SOURCES.get(flyer.model, "hybrid"))
+            adapts = flyer.model in SOURCES and (flyer.n_train or flyer.observer)
             if adapts and source in group and ORACLE in group:
                 before, after, best = (paired(group[other], rows) for other in (source, flyer, ORACLE))
                 shares.setdefault(flyer, {})[reference] = share_of_gap(before, after, best)

@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
+from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
@@ -37,7 +38,10 @@ def portable(kind: type) -> type:
     return kind
 
 
-_FIELDS = (Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor, ResidualNetwork, RigidBody)
+_FIELDS = (
+    *(ConstantDisturbance, Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor),
+    *(ResidualNetwork, RigidBody),
+)
 _VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:

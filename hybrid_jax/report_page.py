@@ -26,6 +26,7 @@ _MODELS = {
     "regression in closed form, as in Neural-Fly",
     "least_squares": "the hybrid of before the change, of which only θ_p is fitted anew, by nonlinear least squares "
     "(Levenberg–Marquardt)",
+    "constant_disturbance": "the same, of θ_p and six numbers beside it: a force and a torque that do not change",
     "linear_residual": "the hybrid of before the change as it is, plus a linear map fitted to what it leaves over",
 }
 _MODES = {

@@ -11,7 +11,10 @@ from typing import Any
 
 DOMAIN_OF = {"param_shift": "parameter_shift", "external_force": "external_force"}  # of the experiments on one target
 DOMAINS = tuple(DOMAIN_OF.values())
-RIVALS = ("expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares", "linear_residual")
+RIVALS = (
+    *("expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares", "constant_disturbance"),
+    "linear_residual",
+)
 MODELS = ("hybrid", "no_physics", "physics_only", *RIVALS)
 # A rival starts from the source's hybrid, whose error is the L^S of its ρ; the other models are their own.
 SOURCE_OF: dict[str, str] = dict.fromkeys(RIVALS, "hybrid")
@@ -26,6 +29,7 @@ NAMES = {name: name.replace("_", "-") for name in MODELS + MODES} | {  # for peo
     "theta_d_only": "θ_d only",
     "last_layer": "last layer (ridge)",
     "least_squares": "least squares on θ_p",
+    "constant_disturbance": "least squares on θ_p and a constant disturbance",
     "linear_residual": "source + linear residual",
 }
 _ENDS = {name: (f"{name}_low", f"{name}_high") for name in THETA}  # columns of an interval in CSV

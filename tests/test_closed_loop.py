@@ -19,6 +19,7 @@ from experiments.flyers import in_common, single, with_statistics_of
 from experiments.protocol import SMOKE
 from hybrid_jax.closed_loop_rows import FlightRow, Flyer
 from hybrid_jax.control import Controller, fly, performance, sample
+from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import restricted
 from hybrid_jax.residual import BatchNorm, InputScaling
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
@@ -48,6 +49,9 @@ MODELS = {
     "without a norm": hj.Hybrid(BODY, network(norm="none")),
     "no place": hj.Hybrid(BODY, network("no_xy", "all")),
     "safe": hj.Hybrid(BODY, network("no_xy_yaw", "accelerations")),
+    "disturbed": hj.Hybrid(
+        hj.Hybrid(BODY, ConstantDisturbance(jnp.arange(6.0))), network("no_xy_yaw", "accelerations")
+    ),
 }
 
 
@@ -159,8 +163,8 @@ def test_the_report_keeps_its_contract(folder):
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     rows = [FlightRow(**row) for row in report["rows"]]
-    # Nominal, and with observer, oracle; 20 of physics, no-physics; source and 20 of two hybrids; three observers more.
-    assert len(rows) == 2 * (2 * 12 + 1 * 8)
+    # Nominal, oracle; 20 of physics, no-physics, nine numbers; source and 20 of two hybrids; and five with observers.
+    assert len(rows) == 2 * (2 * 14 + 1 * 9)
     assert {row.distance for row in rows} == {0.0, 60.0}
     assert {row["variant"] for row in report["ablation"]} > {"safe, batch statistics of the source"}
     assert {claim["id"] for claim in report["claims"] + report["not_judged"]} >= {"R1a", "R6b", "R7", "R8"}

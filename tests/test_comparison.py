@@ -10,7 +10,10 @@ from test_experiments import ROW, command, refused
 import hybrid_jax
 from hybrid_jax.report import load_report
 
-METHODS = ("hybrid", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares")
+METHODS = (
+    *("hybrid", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares"),
+    "constant_disturbance",
+)
 DOMAINS = ("parameter_shift", "external_force")
 
 
@@ -48,10 +51,11 @@ def test_the_report_keeps_its_contract(folder):
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
     source = field(folder, domain, "hybrid", "source_only", 0)
-    for model in ("theta_p_only", "least_squares"):
+    for model in ("theta_p_only", "least_squares", "constant_disturbance"):
         adapted = field(folder, domain, model)
         assert eqx.tree_equal(adapted.residual, source.residual)
-        assert not eqx.tree_equal(adapted.physics, source.physics)
+        physics = adapted.physics.physics if model == "constant_disturbance" else adapted.physics
+        assert not eqx.tree_equal(physics, source.physics)
     only_network, last = (field(folder, domain, model) for model in ("theta_d_only", "last_layer"))
     for adapted in (only_network, last):
         assert eqx.tree_equal(adapted.physics, source.physics)
@@ -62,7 +66,11 @@ def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
 
 def test_intervals_stand_around_what_was_fitted(folder):
     for row in json.loads((folder / "report.json").read_text())["rows"]:
-        adapted = row["mode"] == "fine_tuned" and row["model"] not in ("theta_d_only", "last_layer")
+        adapted = row["mode"] == "fine_tuned" and row["model"] not in (
+            "theta_d_only",
+            "last_layer",
+            "constant_disturbance",
+        )
         assert (row["theta_interval"] is not None) == adapted
         for name, (low, high) in (row["theta_interval"] or {}).items():
             assert low < row["theta"][name] < high

@@ -12,7 +12,7 @@ FLOORS = (
     "checks",
     "vehicle archive lanes trajectories rows paired flight_rows",
     "vector_field datasets summary closed_loop_rows multirotor_terms",
-    "rigid_body residual rollout environment",
+    "rigid_body residual rollout environment disturbance",
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation flight_claims",
