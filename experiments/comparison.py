@@ -157,7 +157,7 @@ def coverage_notes(covered: Sequence[CoverageRow]) -> list[str]:
 
 def main() -> None:
     """The command line."""
-    about = "Nine ways to adapt to ten seconds of flight, in both experiments (Table 2)."
+    about = "Ten ways to adapt to ten seconds of flight, in both experiments (Table 2)."
     command.run(NAME, about, experiment, presets=PRESETS)
 
 
