@@ -132,9 +132,9 @@ def augmented(case: Case, name: str) -> Lanes:
 
 
 def with_intervals(case: Case, lanes: Lanes) -> Lanes:
-    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p alone was adapted.
+    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p was adapted.
 
-    With a network an interval takes it as given; of θ_p and a disturbance that trade with each other it would not do.
+    It takes a network as given, and a disturbance would be too: there is none where θ_p and one were fitted together.
     """
     without = ("theta_d_only", "constant_disturbance", *CLOSED_FORM)
     if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:
