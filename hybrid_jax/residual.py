@@ -6,7 +6,6 @@ in deployment; a linear map stands in for the whole network where the data are t
 
 from abc import abstractmethod
 from collections.abc import Callable
-from functools import partial
 
 import equinox as eqx
 import jax
@@ -14,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
+from hybrid_jax.normalised_layer import normalised_layer, row_means
 from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, deploy_batch, evaluate_batch, observe
 
 
@@ -76,12 +76,12 @@ class BatchNorm(Normalisation):
         return hidden + _beside(bias, hidden)
 
     def layers(self, weight_in, weight_out, bias_out, z):
-        return _normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
+        return normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
     def observed(self, hidden):
         """The running statistics moved towards the batch's by the momentum."""
-        mean = _row_means(hidden)
-        batch = Statistics(mean, _row_means(jnp.square(hidden - mean[:, None])))
+        mean = row_means(hidden)
+        batch = Statistics(mean, row_means(jnp.square(hidden - mean[:, None])))
         running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
 
@@ -241,57 +241,6 @@ def _(field: ResidualNetwork, x, u):
 @evaluate_batch.register
 def _(field: LinearResidual, x, u):
     return field(x, u)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _normalised_layer(epsilon, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """W₂ relu(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
-
-    The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
-    on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
-    """
-    return _forward(epsilon, weight_in, gain, shift, weight_out, bias_out, z)[0]
-
-
-def _forward(epsilon, weight_in, gain, shift, weight_out, bias_out, z):
-    # W₁ (z − z̄) is W₁ z less its mean, and needs no subtraction of two large numbers for its variance.
-    centred = z - _row_means(z)[:, None]
-    hidden = weight_in @ centred
-    inverse_deviation = jax.lax.rsqrt(_row_means(jnp.square(hidden)) + epsilon)
-    active = jax.nn.relu((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
-    # The active units are computed again in `_backward`: that takes less than to keep them for forty evaluations.
-    saved = (weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation)
-    return weight_out @ active + bias_out[:, None], saved
-
-
-def _backward(_, saved, d_out: Float[Array, "d b"]):
-    weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation = saved
-    columns = centred.shape[1]
-    scale = gain * inverse_deviation
-    normal = scale[:, None] * hidden + shift[:, None]
-    d_active = jnp.where(normal > 0, _transposed(weight_out) @ d_out, 0.0)
-    d_scale = columns * _row_means(d_active * hidden)
-    # Through the scale γ r, and through r = (mean of h² + ε)^(−½).
-    through_deviation = -(d_scale * gain) * inverse_deviation**3 / columns
-    d_hidden = scale[:, None] * d_active + through_deviation[:, None] * hidden
-    d_centred = _transposed(weight_in) @ d_hidden
-    d_z = d_centred - _row_means(d_centred)[:, None]
-    d_shift, d_bias = columns * _row_means(d_active), columns * _row_means(d_out)
-    d_weight_out = d_out @ jax.nn.relu(normal).T
-    return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
-
-
-_normalised_layer.defvjp(_forward, _backward)
-
-
-def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
-    # As a matrix of its own: a small product that reads its left factor by columns takes half as long again on a CPU.
-    return jax.lax.optimization_barrier(matrix.T)
-
-
-def _row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
-    # A row times the transposed: on a CPU less than half of what the matrix times a column takes.
-    return (jnp.full((1, rows.shape[1]), 1 / rows.shape[1], rows.dtype) @ rows.T)[0]
 
 
 def _output(weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], hidden: Float[Array, "h b"]) -> Batch:

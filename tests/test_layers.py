@@ -8,7 +8,7 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 FLOORS = (
-    "state rotation files hosts runtime",
+    "state rotation files hosts runtime normalised_layer",
     "checks",
     "vehicle archive lanes trajectories rows paired flight_rows",
     "vector_field datasets summary closed_loop_rows multirotor_terms",
