@@ -39,6 +39,11 @@ class ConstantDisturbance(AbstractVectorField):
         return jnp.concatenate([jnp.zeros(VELOCITY.start, self.acceleration.dtype), self.acceleration])
 
 
+def disturbed(field: AbstractVectorField, acceleration: Float[Array, "6"]) -> Hybrid:
+    """ẋ = f(x, u) + [0, 0, a, α]: any field and a constant disturbance, as in `ConstantDisturbance`."""
+    return Hybrid(field, ConstantDisturbance(acceleration))
+
+
 def with_disturbance(field: Hybrid) -> Hybrid:
     """A hybrid whose physics has a constant disturbance of zero beside it, which `least_squares.fit_physics` fits too.
 
@@ -48,8 +53,7 @@ def with_disturbance(field: Hybrid) -> Hybrid:
     if not isinstance(field, Hybrid):
         raise ValueError(f"field must be a Hybrid, got {checks.shown(field)}")
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(field.physics, eqx.is_inexact_array)))
-    none = ConstantDisturbance(jnp.zeros(SIZE, jnp.result_type(*dtypes, jnp.float32)))
-    return Hybrid(Hybrid(field.physics, none), field.residual)
+    return Hybrid(disturbed(field.physics, jnp.zeros(SIZE, jnp.result_type(*dtypes, jnp.float32))), field.residual)
 
 
 @evaluate_batch.register(ConstantDisturbance)

@@ -7,8 +7,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control.observer import Disturbed
-from hybrid_jax.disturbance import ConstantDisturbance, with_disturbance
+from hybrid_jax.disturbance import disturbed, with_disturbance
 from hybrid_jax.features import restricted
 from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.rollout import rollout_batch
@@ -37,7 +36,7 @@ def flights(field, count=20, steps=10):
 
 
 def test_parameters_and_push_are_found_together_and_the_network_stays():
-    truth = hj.Hybrid(hj.Hybrid(body(**RATIOS), ConstantDisturbance(PUSH)), network())
+    truth = hj.Hybrid(disturbed(body(**RATIOS), PUSH), network())
     found = fit_physics(with_disturbance(hj.Hybrid(body(), network())), flights(truth))
     assert found.converged
     for name, ratio in RATIOS.items():
@@ -48,23 +47,23 @@ def test_parameters_and_push_are_found_together_and_the_network_stays():
 
 def test_without_one_the_parameters_pay_for_the_push():
     """What it is for: were the push within reach of θ_p, nobody would need it."""
-    truth = hj.Hybrid(hj.Hybrid(body(**RATIOS), ConstantDisturbance(PUSH)), network())
+    truth = hj.Hybrid(disturbed(body(**RATIOS), PUSH), network())
     windows = flights(truth)
     alone = fit_physics(hj.Hybrid(body(), network()), windows)
     assert alone.mse > 100 * fit_physics(with_disturbance(hj.Hybrid(body(), network())), windows).mse
 
 
-def test_it_is_the_disturbance_of_the_observer_for_one_state_and_for_many():
+def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
     x, u = flights(body(), count=5).x[:, 0], jnp.full((5, 4), 600.0)
-    field = hj.Hybrid(body(), ConstantDisturbance(PUSH))
-    one = jax.vmap(Disturbed(body(), PUSH))(x, u)
+    field = disturbed(body(), PUSH)
+    one = jax.vmap(body())(x, u).at[:, 7:].add(PUSH)
     np.testing.assert_allclose(jax.vmap(field)(x, u), one, rtol=1e-6)
     for many in (evaluate_batch, deploy_batch):
         np.testing.assert_allclose(many(field, x.T, u.T).T, one, rtol=1e-5, atol=1e-5)
 
 
 def test_a_model_with_one_is_kept(tmp_path):
-    field = hj.Hybrid(hj.Hybrid(body(), ConstantDisturbance(PUSH)), network())
+    field = hj.Hybrid(disturbed(body(), PUSH), network())
     hj.save(tmp_path / "model.npz", field)
     assert eqx.tree_equal(hj.load(tmp_path / "model.npz").field, field)
 

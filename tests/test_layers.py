@@ -26,7 +26,7 @@ FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.spl
 NEEDS = {
     "sim": {"state", "rotation", "files", "checks", "vehicle", "trajectories", "datasets"},
     "flights": {"state", "vehicle", "trajectories"},
-    "control": {"state", "rotation", "checks", "vehicle", "vector_field", "rollout"},  # any field, however learned
+    "control": {"state", "rotation", "checks", "vehicle", "vector_field", "rollout", "disturbance"},  # any field
     "export": {"state", "checks", "archive", "vector_field", "rollout"},  # likewise
 }
 

@@ -27,12 +27,10 @@ Your own vehicle, with a model of it and whatever turns rotor speeds into the ne
 from hybrid_jax.control.controller import Controller, Plan, advance
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import Flight, Performance, fly, performance, realised
-from hybrid_jax.control.observer import Disturbed
 from hybrid_jax.control.references import figure_eight, hover, low_pass, sample, step, upset
 
 __all__ = [
     "Controller",
-    "Disturbed",
     "Flight",
     "Performance",
     "Plan",

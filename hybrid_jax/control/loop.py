@@ -12,6 +12,7 @@ from hybrid_jax.control import observer
 from hybrid_jax.control.attitude import heading
 from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import plan_cost
+from hybrid_jax.disturbance import disturbed
 from hybrid_jax.state import POSITION, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vector_field import AbstractVectorField
 
@@ -28,7 +29,7 @@ class Flight(eqx.Module):
         x: states, from the start on.
         u: rotor speeds held over each period [rad/s].
         plans: the controller's plan at each call; their costs are what it promised.
-        disturbance: what the observer took for it at each call, as in `Disturbed`.
+        disturbance: what the observer took for it at each call, as in `observer.Estimate`.
     """
 
     x: Float[Array, "*n t+1 13"]
@@ -84,7 +85,7 @@ def fly(
     def tick(carry, i):
         x, plan, estimate = carry
         estimate = observer.correct(estimate, x, bandwidth, controller.period)
-        believed = observer.Disturbed(model, estimate.disturbance)
+        believed = disturbed(model, estimate.disturbance)
         u, plan = controller(believed, controller.horizon(reference, i), x, plan)
         estimate = observer.predict(estimate, model, x, u, controller.period)
         x = plant(x, u, i * controller.period)

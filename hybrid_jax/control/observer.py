@@ -11,32 +11,18 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.control.attitude import one_sheet
 from hybrid_jax.control.controller import advance
+from hybrid_jax.disturbance import disturbed
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
 from hybrid_jax.vector_field import AbstractVectorField
 
 Disturbance = Float[Array, "6"]
 
 
-class Disturbed(AbstractVectorField):
-    """ẋ = f(x, u) + [0, 0, d]: any field with a constant disturbance, an estimate that is not meant to be trained.
-
-    Attributes:
-        field: f.
-        disturbance: d, acceleration [m/s², world] and angular acceleration [rad/s², body].
-    """
-
-    field: AbstractVectorField
-    disturbance: Disturbance
-
-    def __call__(self, x: State, u: Input) -> State:
-        return self.field(x, u).at[VELOCITY.start :].add(self.disturbance)
-
-
 class Estimate(eqx.Module):
     """What the observer carries from one period to the next.
 
     Attributes:
-        disturbance: d, as in `Disturbed`.
+        disturbance: d, acceleration [m/s², world] and angular acceleration [rad/s², body].
         expected: v [m/s] and ω [rad/s] that are expected at the next sample.
     """
 
@@ -59,5 +45,5 @@ def correct(estimate: Estimate, x: State, bandwidth: Float[Array, ""] | float, p
 def predict(estimate: Estimate, field: AbstractVectorField, x: State, u: Input, period: float) -> Estimate:
     """The estimate that expects what the disturbed field does with u held from x for one period [s]."""
     x = x.at[QUATERNION].set(one_sheet(x[QUATERNION]))
-    ahead = advance(Disturbed(field, estimate.disturbance), x, u, period)
+    ahead = advance(disturbed(field, estimate.disturbance), x, u, period)
     return Estimate(estimate.disturbance, ahead[VELOCITY.start : BODY_RATES.stop])

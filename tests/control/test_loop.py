@@ -9,7 +9,6 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax.control import (
     Controller,
-    Disturbed,
     Flight,
     advance,
     figure_eight,
@@ -21,6 +20,7 @@ from hybrid_jax.control import (
     sample,
     upset,
 )
+from hybrid_jax.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
@@ -32,7 +32,7 @@ def plant(field):
 
 
 def judged(wind, reference, x0, bandwidth):
-    flight = fly(plant(Disturbed(BODY, wind)), BODY, reference, x0, CONTROLLER, bandwidth)
+    flight = fly(plant(disturbed(BODY, wind)), BODY, reference, x0, CONTROLLER, bandwidth)
     return flight, performance(flight, reference, CONTROLLER)
 
 
@@ -90,7 +90,7 @@ def test_a_true_model_keeps_its_promise_and_a_wrong_one_does_not():
     def kept(wind):
         flight = judged(wind, reference, reference[0], 0.0)[0]
         calls = jnp.arange(50, 200, 25)
-        costs = jax.vmap(lambda i: realised(plant(Disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
+        costs = jax.vmap(lambda i: realised(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
         return costs / flight.plans.cost[calls]
 
     np.testing.assert_allclose(kept(jnp.zeros(6)), 1.0, rtol=0.01)

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Disturbed, advance, observer
+from hybrid_jax.control import advance, observer
+from hybrid_jax.disturbance import disturbed
 from hybrid_jax.residual import InputScaling
 
 DT = 0.01
@@ -39,14 +40,14 @@ def fields():
 @pytest.mark.parametrize("name", ["physics", "hybrid", "network"])
 def test_a_constant_disturbance_is_found_at_the_stated_bandwidth(fields, name):
     """Of a first-order filter: 1 − exp(−β t) of it by time t, whatever the field."""
-    found = watch(fields[name], Disturbed(fields[name], TRUE), 5.0)
+    found = watch(fields[name], disturbed(fields[name], TRUE), 5.0)
     share = -np.expm1(-5.0 * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
     np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2)
 
 
 def test_without_bandwidth_there_is_no_observer(fields):
-    np.testing.assert_array_equal(watch(BODY, Disturbed(BODY, TRUE), 0.0), 0.0)
+    np.testing.assert_array_equal(watch(BODY, disturbed(BODY, TRUE), 0.0), 0.0)
 
 
 def test_an_exact_model_has_no_disturbance():
@@ -55,12 +56,5 @@ def test_an_exact_model_has_no_disturbance():
 
 def test_the_sign_of_the_quaternion_is_nothing_to_it(fields):
     hybrid = fields["hybrid"]
-    disturbed = Disturbed(hybrid, TRUE)
-    np.testing.assert_array_equal(watch(hybrid, disturbed, 5.0), watch(hybrid, disturbed, 5.0, sign=-1.0))
-
-
-def test_a_disturbed_field_adds_to_the_accelerations():
-    u = jnp.full(4, 600.0)
-    np.testing.assert_allclose(
-        Disturbed(BODY, TRUE)(START, u) - BODY(START, u), np.concatenate([np.zeros(7), TRUE]), atol=1e-5
-    )
+    plant = disturbed(hybrid, TRUE)
+    np.testing.assert_array_equal(watch(hybrid, plant, 5.0), watch(hybrid, plant, 5.0, sign=-1.0))

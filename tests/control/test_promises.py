@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, Disturbed, advance, fly, hover, realised, sample
+from hybrid_jax.control import Controller, advance, fly, hover, realised, sample
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.control.promises import Promises, excess, least_promise, promises
+from hybrid_jax.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
@@ -18,7 +19,7 @@ def test_promises_are_those_of_the_calls_one_by_one():
     reference = sample(hover(), CONTROLLER, 0.3)
 
     def plant(x, u, t):
-        return advance(Disturbed(BODY, jnp.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0])), x, u, CONTROLLER.period)
+        return advance(disturbed(BODY, jnp.array([0.0, -1.0, 0.0, 0.0, 0.0, 0.0])), x, u, CONTROLLER.period)
 
     @jax.jit
     def both():
