@@ -16,6 +16,7 @@ from experiments.flight_protocol import LEARN
 from experiments.flight_recipes import Recipe, Step, stage_of
 from experiments.stages import Stages
 from hybrid_jax import rotation, training
+from hybrid_jax.archive import named_leaves
 from hybrid_jax.baselines import FrozenRates
 from hybrid_jax.channels import ChannelPrediction, channels_from
 from hybrid_jax.datasets import Dataset
@@ -30,7 +31,7 @@ from hybrid_jax.schedule import cut, judged, rates_by_group
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.training import FitState, Plan, make_plan
 from hybrid_jax.trajectories import Trajectories, concatenate
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch, trainable
 from hybrid_jax.vehicle import Vehicle
 
 HUBER = 1.0  # errors beyond a simple baseline's count linearly
@@ -224,10 +225,16 @@ def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:
     def plan(each: Lane) -> Plan:
         stage = stage_of(step, model, each.share)
         subset = np.resize(each.subset, longest)  # of one length; only the first len(subset) are used
-        rates = rates_by_group(one, stage.rates)
+        rates = rates_by_group(one, stage.rates | dict.fromkeys(_paths_of(step.kept, one), 0.0))
         return make_plan(rates, subset, len(each.subset), 0, stage.patience, stage.epochs, 0.0)
 
     return jax.device_get(stack([jax.device_get(plan(each)) for each in lanes]))
+
+
+def _paths_of(names: Sequence[str], field: AbstractVectorField) -> list[str]:
+    """Where in a field there are learned parameters of these names."""
+    learned = eqx.filter(field, trainable(field))
+    return [path for path in named_leaves(learned) if path.rpartition("/")[-1] in names]
 
 
 def _until(plans: Plan, epochs: np.ndarray) -> Plan:
