@@ -14,7 +14,7 @@ from experiments.closed_loop_ablation import Option, networks, unnormalised, var
 from experiments.closed_loop_lanes import Airspace, Block
 from experiments.closed_loop_report import Outcome, write
 from experiments.common_field import CommonField
-from experiments.flyers import Trained, fleet, solved, train
+from experiments.flyers import Trained, fleet, nine_numbers, train
 from experiments.protocol import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
 from hybrid_jax import checks, hosts
 from hybrid_jax.closed_loop_rows import Flyer
@@ -141,7 +141,7 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
     wanted = shared(config, sizes=sizes, pool=config.pooled(), rates=safe_rates(config), **seen)
     own = limited(wanted, config.safe_source, config.safe_epochs)
     trained["safe"] = _train("safe", "hybrid", own, console, outcome)
-    trained["nine"], stages = solved(trained["safe"].source, min(sizes), own, console, DOMAINS)
+    trained["nine"], stages = nine_numbers(trained["safe"].source, min(sizes), own, console, DOMAINS)
     outcome.seconds |= {f"nine numbers, {stage}": seconds for stage, seconds in stages.seconds.items()}
     return trained
 

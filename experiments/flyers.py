@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -10,19 +11,16 @@ import numpy as np
 from rich.console import Console
 
 from experiments.common_field import CommonField, common, true_field
-from experiments.conditions import input_scaling, settings
+from experiments.conditions import input_scaling
 from experiments.protocol import Config
-from experiments.rivals import by_lane, subsets
+from experiments.solved import constant_disturbance, solved
 from experiments.stages import Stages, stages_of
 from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
 from hybrid_jax.closed_loop_rows import Flyer
-from hybrid_jax.disturbance import with_disturbance
 from hybrid_jax.lanes import lane
-from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.residual import BatchNorm, InputScaling
 from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import Vehicle
 
@@ -57,19 +55,16 @@ def train(
     return Trained(start, found), stages
 
 
-def solved(
+def nine_numbers(
     source: AbstractVectorField, few: int, config: Config, console: Console, domains: Sequence[Domain]
 ) -> tuple[Trained, Stages]:
     """Hybrids of the source, of which θ_p and a constant disturbance are fitted to each domain by least squares."""
-    stages, solver = stages_of(config, console), settings(config).solver
-
-    def one(lane, pool: Trajectories) -> AbstractVectorField:
-        field, subset = lane
-        return fit_physics(with_disturbance(field), pool[subset], solver).field
+    stages, own = stages_of(config, console), replace(config, sizes=(few,))
 
     def of(domain: Domain) -> AbstractVectorField:
-        pool = flown(domain, target_splits(config), config, stages).splits["train"]
-        return stages.timed(f"least squares {domain.name}", lambda: by_lane(one, (source, subsets(few, config)), pool))
+        target = flown(domain, target_splits(config), config, stages)
+        work = partial(solved, constant_disturbance, source, own, target)
+        return stages.timed(f"least squares {domain.name}", work).fields
 
     return Trained(source, {(domain.name, few): of(domain) for domain in domains}), stages
 

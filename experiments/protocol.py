@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal, TypeVar
+from typing import Any, Literal, TypeVar, get_args
 
 import platformdirs
 
@@ -14,7 +14,7 @@ TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of 
 # Options that change no result: where files lie, how often state is saved, on what machines it runs.
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 Kind = TypeVar("Kind", bound="Config")
-Model = Literal["hybrid", "no_physics", "physics_only"]
+Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "body"]
 ResidualOutputs = Literal["all", "accelerations"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
@@ -196,8 +196,9 @@ class Config(Run):
 class AdaptationConfig(Config):
     """Pre-train on source flight, adapt to the target with N short trajectories, test; all lanes are one sweep."""
 
-    models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
-    """Which models to compare."""
+    models: tuple[Model, ...] = get_args(Model)
+    """Which models to compare. constant_disturbance: the source's hybrid, of which θ_p and a constant disturbance are
+    fitted by least squares."""
     source_flights: Path | None = None
     """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
     target_flights: Path | None = None
@@ -233,8 +234,8 @@ def column(size: int) -> int:
 
 PAPER = AdaptationConfig()
 QUICK = replace(
-    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=("hybrid", "no_physics"), source_train=3000,
-    validation=300, test=300, max_epochs=400,
+    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=("hybrid", "no_physics", "constant_disturbance"),
+    source_train=3000, validation=300, test=300, max_epochs=400,
 )  # fmt: skip
 SMOKE = replace(
     PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=10, batch_size=20, max_epochs=3,

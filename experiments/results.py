@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 import hybrid_jax
+from experiments.solved import Solved
 from hybrid_jax.lanes import lane
 from hybrid_jax.rows import Row
 from hybrid_jax.sim.flight import DT
@@ -54,10 +55,19 @@ def trained(
     return Lanes(model, mode, sizes, seeds, final.best, errors, *fit, theta=theta_of(final.best))
 
 
+def solution(model: str, sizes: Sequence[int], seeds: Sequence[int], found: Solved, errors: np.ndarray) -> Lanes:
+    """The lanes of a model that was solved instead of trained, tested."""
+    return Lanes(model, "fine_tuned", sizes, seeds, found.fields, errors, *found[1:], theta=theta_of(found.fields))
+
+
+def physics_in(field: Any) -> Any:
+    """The physics inside a field, hybrids of hybrids included."""
+    return physics_in(field.physics) if isinstance(field, Hybrid) else field
+
+
 def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray] | None:
     """θ_p of a model that has physics, or of stacked ones."""
-    physics = field.physics if isinstance(field, Hybrid) else field
-    theta = getattr(physics, "theta", None)
+    theta = getattr(physics_in(field), "theta", None)
     return None if theta is None else {name: np.asarray(value) for name, value in theta().items()}
 
 

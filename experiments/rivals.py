@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -10,21 +9,20 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.conditions import adaptation, drawn, settings
+from experiments.conditions import adaptation, settings
 from experiments.protocol import Config
-from experiments.results import Lanes, theta_of, trained
+from experiments.results import Lanes, physics_in, solution, theta_of, trained
+from experiments.solved import Solve, by_lane, constant_disturbance, least_squares, solved, subsets
 from experiments.stages import Stages
 from experiments.study import domain_name, places
 from hybrid_jax import linear_adaptation
 from hybrid_jax.datasets import Dataset
-from hybrid_jax.disturbance import with_disturbance
 from hybrid_jax.expert_augmentation import prediction_mse
-from hybrid_jax.lanes import lane, stack
-from hybrid_jax.least_squares import fit_physics, physics_of
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.lanes import lane
+from hybrid_jax.least_squares import physics_of
 from hybrid_jax.rigid_body import RigidBody
 from hybrid_jax.sweep import evaluate
-from hybrid_jax.training import CAPPED, DIVERGED, STOPPED, FitState
+from hybrid_jax.training import STOPPED, FitState
 from hybrid_jax.trajectories import Trajectories, split
 from hybrid_jax.uncertainty import intervals, physics_covariance
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, thaw
@@ -77,30 +75,16 @@ def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field:
     return method
 
 
-class Solved:
-    """Adaptation in closed form, or nearly: `solve(field, train, validation, settings) → (field, steps, status)`."""
+def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
+    """Adaptation of the hybrid by what solves it instead of training."""
 
-    def __init__(self, solve: Callable[..., tuple[AbstractVectorField, Any, Any]]):
-        self._solve = solve
+    def method(case: Case, name: str) -> Lanes:
+        config, start = case.config, case.pretrained["hybrid"].best
+        found = case.stages.timed(f"fine_tuned {name} {case.name}", lambda: solved(solve, start, config, case.target))
+        errors = case.tested(name, found.fields)
+        return with_intervals(case, solution(name, *places(config.sizes, config), found, errors))
 
-    def __call__(self, case: Case, name: str) -> Lanes:
-        config, shared = case.config, settings(case.config)
-
-        def one(lane, pool: Trajectories, validation: Trajectories):
-            field, subset = lane
-            field, steps, status = self._solve(field, pool[subset], validation, shared)
-            return field, deployed_mse(field, validation, solver=shared.solver), jnp.asarray(steps), jnp.asarray(status)
-
-        def solve(size: int):
-            lanes = (case.pretrained["hybrid"].best, subsets(size, config))
-            return by_lane(one, lanes, case.target.splits["train"], case.target.splits["validation"])
-
-        def work():
-            return jax.tree.map(lambda *parts: np.concatenate(parts), *map(solve, config.sizes))
-
-        fields, val_mse, steps, status = case.stages.timed(f"fine_tuned {name} {case.name}", work)
-        found = (case.tested(name, fields), val_mse, steps, status, theta_of(physics_in(fields)))
-        return with_intervals(case, Lanes(name, "fine_tuned", *places(config.sizes, config), fields, *found))
+    return method
 
 
 def source_only(model: str) -> Callable[[Case], Lanes]:
@@ -158,34 +142,11 @@ def with_intervals(case: Case, lanes: Lanes) -> Lanes:
     return replace(lanes, intervals=jax.tree.map(lambda *ends: np.concatenate(ends), *parts))
 
 
-def physics_in(field: Any) -> Any:
-    """The physics inside a field, hybrids of hybrids included."""
-    return physics_in(field.physics) if isinstance(field, Hybrid) else field
-
-
-def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
-    """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
-    # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
-    run = eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
-    return jax.device_get(run(lanes, shared))
-
-
-def subsets(size: int, config: Config) -> np.ndarray:
-    """The target trajectories that each seed draws, as indices (seeds, size)."""
-    return stack([drawn(seed, config)[:size] for seed in range(config.seeds)])
-
-
-def _ridge(method) -> Solved:
+def _ridge(method) -> Callable[[Case, str], Lanes]:
     def solve(field, train, validation, shared):
         return linear_adaptation.adapted(method, field, train, validation, solver=shared.solver).field, 0, STOPPED
 
-    return Solved(solve)
-
-
-def _least_squares(field, train, validation, shared, begun=lambda field: field):
-    found = fit_physics(begun(field), train, shared.solver)
-    status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
-    return found.field, found.steps, status
+    return found_by(solve)
 
 
 CLOSED_FORM = {
@@ -199,7 +160,7 @@ METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
     "expert_augmentation": augmented,
     "theta_p_only": tuned("hybrid", lambda field: Hybrid(field.physics, Frozen(field.residual))),
     "theta_d_only": tuned("hybrid", lambda field: Hybrid(Frozen(field.physics), field.residual)),
-    "least_squares": Solved(_least_squares),
-    "constant_disturbance": Solved(partial(_least_squares, begun=with_disturbance)),
+    "least_squares": found_by(least_squares),
+    "constant_disturbance": found_by(constant_disturbance),
     **CLOSED_FORM,
 }

@@ -1,24 +1,26 @@
 """The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 from experiments.ahead import Ahead, blank
 from experiments.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.make_flights import chosen_flights, flights
 from experiments.protocol import AdaptationConfig, Config
-from experiments.results import Lanes, rows_of, trained
+from experiments.results import Lanes, rows_of, solution, trained
 from experiments.sensors import measured
+from experiments.solved import Solve, constant_disturbance, solved
 from experiments.stages import Stages, stages_of
 from hybrid_jax import hosts
 from hybrid_jax.archive import Arrays
 from hybrid_jax.datasets import ARRAYS, Dataset
-from hybrid_jax.rows import Row, with_rho
+from hybrid_jax.rows import SOURCE_OF, Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import compile_evaluation, compile_sweep, evaluate
@@ -28,7 +30,7 @@ from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
-TESTED = ("source_only", "fine_tuned", "target_only")
+SOLVED: Mapping[str, Solve] = {"constant_disturbance": constant_disturbance}  # models that are not trained
 
 
 @dataclass(frozen=True)
@@ -57,13 +59,19 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
         return flown(of, splits, config, stages)
 
     lanes: list[Lanes] = []
-    unseen = [model for model in config.models if not stages.knows(f"pre-training {model}")]
+    learned: dict[str, FitState] = {}
+    sources = dict.fromkeys(source_of(model) for model in config.models)
+    unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
     with Ahead({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
         source = get(config.source_flights, SOURCE, source_splits(config))
         target = get(config.target_flights, domain, target_splits(config))
         for model in config.models:
-            programs.wait_for(model)
-            lanes += _model_lanes(model, vehicle, config, stages, source, target)
+            start = source_of(model)
+            if start not in learned:
+                programs.wait_for(start)
+                learned[start] = pretrained(start, vehicle, config, stages, source)
+                lanes.append(_tested(start, "source_only", learned[start], config, stages, target))
+            lanes += _adapted_lanes(model, learned[start].best, vehicle, config, stages, target)
     rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
 
@@ -122,19 +130,24 @@ def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
     return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
-def _model_lanes(
-    model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset, target: Dataset
+def source_of(model: str) -> str:
+    """The model whose pre-training an adaptation starts from."""
+    return SOURCE_OF.get(model, model)
+
+
+def _adapted_lanes(
+    model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
 ) -> list[Lanes]:
-    learned = pretrained(model, vehicle, config, stages, source)
-    starts = {"fine_tuned": learned.best, "target_only": fresh_fields(model, vehicle, config)}
-    finals = {"source_only": learned} | {
-        mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()
-    }
-    return [_tested(model, mode, finals[mode], config, stages, target) for mode in TESTED]
+    """The lanes of a model after learning from the target: trained on, and anew, or solved."""
+    if model in SOLVED:
+        return [_solved(model, source, config, stages, target)]
+    starts = {"fine_tuned": source, "target_only": fresh_fields(model, vehicle, config)}
+    finals = {mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()}
+    return [_tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
 
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
-    """Compile all that `_model_lanes` will run: of windows and models, a program knows the shapes alone."""
+    """Compile all that training and testing a model will run: of windows and models, a program knows shapes alone."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: blank(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
@@ -147,10 +160,20 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
 
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    errors = stages.timed(
-        f"test {mode} {model}", lambda: evaluate(final.best, target.splits["test"], EVERY, settings(config))
-    )
+    errors = _errors(f"test {mode} {model}", final.best, config, stages, target)
     return trained(model, mode, *places((0,) if mode == "source_only" else config.sizes, config), final, errors)
+
+
+def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
+    name = f"fine_tuned {model}"
+    found = stages.timed(f"{name} {domain_name(target)}", lambda: solved(SOLVED[model], source, config, target))
+    errors = _errors(f"test {name}", found.fields, config, stages, target)
+    return solution(model, *places(config.sizes, config), found, errors)
+
+
+def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> np.ndarray:
+    """L^T_MSE of stacked fields on the test flights."""
+    return stages.timed(stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config)))
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

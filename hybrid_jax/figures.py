@@ -28,7 +28,7 @@ STYLE: dict[Any, Any] = {
     "svg.hashsalt": "hybrid_jax",  # otherwise names inside an SVG are random
 }
 # Okabe and Ito's palette, which the colour-blind can tell apart.
-COLOURS = {"hybrid": "#0072B2", "no_physics": "#D55E00", "physics_only": "#009E73"}
+COLOURS = {"hybrid": "#0072B2", "no_physics": "#D55E00", "physics_only": "#009E73", "constant_disturbance": "#CC79A7"}
 OTHERS = "0.4"  # models that are in no figure of the paper
 DASHES = {"fine_tuned": "-", "target_only": "--", "source_only": ":"}
 MARKERS = {"fine_tuned": "o", "target_only": "s", "source_only": ""}

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from hybrid_jax.figures import COLOURS, STYLE
+from hybrid_jax.figures import COLOURS, STYLE, colour
 from hybrid_jax.rows import NAMES
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
@@ -103,9 +103,9 @@ def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None
         # A path ends where it first is not finite, or so far off that drawing it would overflow.
         near = np.all(np.abs(states[:, :2] - centre) < 1e3 * half, axis=1)
         drawn = states[: len(near) if near.all() else int(np.argmin(near)), :2]
-        label, colour = NAMES.get(name, name), COLOURS.get(name, "#CC79A7")
-        axes.plot(*drawn.T, color=colour, linewidth=1.8, marker=".", markersize=4, label=label)
-        _say_if_it_leaves(axes, states[:, :2], centre, half, label, colour)
+        label, tint = NAMES.get(name, name), colour(name)
+        axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=label)
+        _say_if_it_leaves(axes, states[:, :2], centre, half, label, tint)
     axes.plot(*path.T, color="black", linestyle="--", linewidth=1.5, label="truth", zorder=4)
     axes.plot(*start, marker="o", color="black", markerfacecolor="white", linestyle="", label="start", zorder=5)
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
@@ -134,8 +134,7 @@ def _draw_space(axes: Any, states: States) -> None:
 
 
 def _draw_rotors(axes: Axes, time: np.ndarray, inputs: np.ndarray) -> None:
-    colours = (*COLOURS.values(), "#CC79A7")
-    for index, (name, colour) in enumerate(zip(INPUT_NAMES, colours, strict=True)):
-        axes.stairs(inputs[:, index], time, baseline=None, color=colour, label=name, linewidth=1)
+    for index, (name, tint) in enumerate(zip(INPUT_NAMES, COLOURS.values(), strict=False)):
+        axes.stairs(inputs[:, index], time, baseline=None, color=tint, label=name, linewidth=1)
     axes.set(xlabel="time [s]", ylabel="rotors\n[rad/s]")
     axes.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=7, columnspacing=1, handlelength=1, frameon=True)

@@ -29,7 +29,7 @@ NAMES = {name: name.replace("_", "-") for name in MODELS + MODES} | {  # for peo
     "theta_d_only": "θ_d only",
     "last_layer": "last layer (ridge)",
     "least_squares": "least squares on θ_p",
-    "constant_disturbance": "least squares on θ_p and a constant disturbance",
+    "constant_disturbance": "least squares on θ_p + disturbance",
     "linear_residual": "source + linear residual",
 }
 _ENDS = {name: (f"{name}_low", f"{name}_high") for name in THETA}  # columns of an interval in CSV

@@ -1,0 +1,81 @@
+"""Adaptation that is solved instead of trained, by least squares or in closed form, for every size and seed."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.conditions import drawn, settings
+from experiments.protocol import Config
+from hybrid_jax.datasets import Dataset
+from hybrid_jax.disturbance import with_disturbance
+from hybrid_jax.lanes import stack
+from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.objective import Settings
+from hybrid_jax.training import CAPPED, DIVERGED, STOPPED
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vector_field import AbstractVectorField
+
+# From a field, the windows to adapt to and those to validate with: the field found, steps and status.
+Solve = Callable[[Any, Trajectories, Trajectories, Settings], tuple[AbstractVectorField, Any, Any]]
+
+
+class Solved(NamedTuple):
+    """What was found: a lane for each size and seed, in the order of `study.places`.
+
+    Attributes:
+        fields: the models, stacked.
+        val_mse: L_MSE of each on the validation windows.
+        steps: of each solution.
+        status: see `training`.
+    """
+
+    fields: Any
+    val_mse: np.ndarray
+    steps: np.ndarray
+    status: np.ndarray
+
+
+def solved(solve: Solve, fields: AbstractVectorField, config: Config, target: Dataset) -> Solved:
+    """Each seed's field, adapted to as many target windows of its own as each of the sizes says."""
+    shared = settings(config)
+
+    def one(lane, pool: Trajectories, validation: Trajectories) -> Solved:
+        field, subset = lane
+        field, steps, status = solve(field, pool[subset], validation, shared)
+        val_mse = deployed_mse(field, validation, solver=shared.solver)
+        return Solved(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
+
+    def of_size(size: int) -> Solved:
+        lanes = (fields, subsets(size, config))
+        return by_lane(one, lanes, target.splits["train"], target.splits["validation"])
+
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *map(of_size, config.sizes))
+
+
+def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):
+    """θ_p by least squares, everything else as it is."""
+    found = fit_physics(field, train, shared.solver)
+    status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
+    return found.field, found.steps, status
+
+
+def constant_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
+    """θ_p and a constant disturbance by least squares: nine numbers."""
+    return least_squares(with_disturbance(field), train, validation, shared)
+
+
+def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
+    """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
+    # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
+    run = eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
+    return jax.device_get(run(lanes, shared))
+
+
+def subsets(size: int, config: Config) -> np.ndarray:
+    """The target trajectories that each seed draws, as indices (seeds, size)."""
+    return stack([drawn(seed, config)[:size] for seed in range(config.seeds)])
