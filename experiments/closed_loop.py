@@ -13,7 +13,7 @@ from experiments.call_times import call_times
 from experiments.closed_loop_ablation import Option, networks, unnormalised, variants
 from experiments.closed_loop_lanes import Airspace, Block
 from experiments.closed_loop_report import Outcome, write
-from experiments.common_field import CommonField
+from experiments.common_field import Believed
 from experiments.flyers import Trained, fleet, nine_numbers, train
 from experiments.protocol import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
 from hybrid_jax import checks, hosts
@@ -28,7 +28,7 @@ NAME = "closed_loop"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
-Crew = dict[Flyer, CommonField]
+Crew = dict[Flyer, Believed]
 ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
 

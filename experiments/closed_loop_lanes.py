@@ -1,8 +1,8 @@
-"""Every closed-loop flight as a lane of one compiled program, flown block by block; finished blocks are kept."""
+"""Every closed-loop flight as a lane of a compiled program, flown block by block; finished blocks are kept."""
 
 import time
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from rich.console import Console
 
-from experiments.common_field import CommonField, described
+from experiments.common_field import Believed
 from experiments.progress import clock
 from hybrid_jax import hosts
 from hybrid_jax.archive import Arrays, digest, load_archive, named_leaves, save_archive
@@ -70,7 +70,7 @@ class Lane(eqx.Module):
         bandwidth: of the disturbance observer [rad/s]; 0 for none.
     """
 
-    model: CommonField
+    model: Believed
     vehicle: Parameters
     shares: Float[Array, " f"]
     path: Int[Array, ""]
@@ -90,7 +90,7 @@ class Block:
     domain: Domain
     reference: str
     distance: float
-    flyers: Mapping[Flyer, CommonField]
+    flyers: Mapping[Flyer, Believed]
 
     @property
     def name(self) -> str:
@@ -98,12 +98,19 @@ class Block:
         away = f" {self.distance:g} m away" if self.distance else ""
         return f"{self.domain.name} {self.reference}{away}"
 
+    def parts(self) -> list["Block"]:
+        """Blocks of fields of one kind: what one program flies."""
+        kinds = dict.fromkeys(type(field) for field in self.flyers.values())
+        chosen = [{who: field for who, field in self.flyers.items() if type(field) is kind} for kind in kinds]
+        return [replace(self, flyers=flyers) for flyers in chosen]
+
     def keys(self) -> list[tuple[Flyer, int]]:
-        """Who flies each lane, and its seed."""
-        return [(flyer, seed) for flyer, field in self.flyers.items() for seed in range(count(field))]
+        """Who flies each lane, and its seed: part after part."""
+        flyers = (pair for part in self.parts() for pair in part.flyers.items())
+        return [(flyer, seed) for flyer, field in flyers for seed in range(count(field))]
 
     def lanes(self, bandwidth: float) -> Lane:
-        """Its lanes, stacked; bandwidth of the observers [rad/s]."""
+        """Its lanes, stacked, of fields of one kind; bandwidth of the observers [rad/s]."""
         keys = self.keys()
 
         def repeated(value):
@@ -155,7 +162,7 @@ class Flights:
 
 
 class Airspace:
-    """Flies blocks with one controller, all by the same program.
+    """Flies blocks with one controller, all fields of a kind by the same program.
 
     Args:
         seconds: length of a flight.
@@ -182,7 +189,7 @@ class Airspace:
         thrown = list(PATHS).index("upset")
         starts[thrown] = upset(jnp.asarray(references[thrown, 0]))
         self._shared = (references, starts)
-        self._map: LaneMap | None = None
+        self._maps: dict[int, LaneMap] = {}  # by their width
 
     def fly(self, block: Block) -> Flights:
         """The flights of a block, found in the cache or flown now.
@@ -190,20 +197,27 @@ class Airspace:
         Raises:
             ValueError: what is kept of the block is damaged; names the file.
         """
+        abouts, arrays, found = zip(*map(self._part, block.parts()), strict=True)
+        together = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
+        spent = {name: sum(about[name] for about in abouts) for name in ("seconds", "processor_seconds")}
+        words = "as found in the cache" if all(found) else clock(spent["seconds"])
+        self._console.print(f"{block.name}: {len(block.keys())} flights, {words}", highlight=False, soft_wrap=True)
+        return Flights(block, together, **spent, devices=abouts[0]["devices"])
+
+    def _part(self, block: Block) -> tuple[dict[str, Any], Arrays, bool]:
+        """Flights of fields of one kind, what is known of them, and whether they were in the cache."""
         lanes = block.lanes(self._bandwidth)
         path = self._folder / f"{block.name.replace(' ', '-')}-{self._identity(lanes)[:16]}.npz"
         about, arrays = hosts.from_first(lambda: self._found(path))
-        found = "as found in the cache"
-        if about is None:
-            about, arrays = self._flown(lanes)
-            found = clock(about["seconds"])
-            if hosts.first():
-                save_archive(path, FORMAT, about, arrays)
-        self._console.print(f"{block.name}: {count(lanes)} flights, {found}", highlight=False, soft_wrap=True)
-        return Flights(block, arrays, about["seconds"], about["processor_seconds"], about["devices"])
+        if about is not None:
+            return about, arrays, True
+        about, arrays = self._flown(lanes)
+        if hosts.first():
+            save_archive(path, FORMAT, about, arrays)
+        return about, arrays, False
 
     def _identity(self, lanes: Lane) -> str:
-        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), described(lanes.model)]
+        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), lanes.model.described()]
         return digest(fixed, named_leaves({"lanes": lanes, "shared": self._shared}))
 
     def _found(self, path: Path):
@@ -217,14 +231,15 @@ class Airspace:
 
     def _flown(self, lanes: Lane):
         total = count(lanes)
-        padded = lane(lanes, np.resize(np.arange(total), max(total, self._capacity)))
-        if self._map is None:
-            width = WIDTH.get(jax.default_backend(), 0)
-            self._map = LaneMap(partial(simulate, self._controller), width)
+        # A lone lane, that of the truth, would wait for as many as are padded to.
+        alone = total == 1
+        padded = lane(lanes, np.resize(np.arange(total), 1 if alone else max(total, self._capacity)))
+        width = 1 if alone else WIDTH.get(jax.default_backend(), 0)
+        run = self._maps.setdefault(width, LaneMap(partial(simulate, self._controller), width))
         costs = np.ones(count(padded))
-        self._map(padded, self._shared, costs, [])  # compiles, flies nothing
+        run(padded, self._shared, costs, [])  # compiles, flies nothing
         began, worked = time.perf_counter(), time.process_time()
-        arrays = self._map(padded, self._shared, costs, range(total))
+        arrays = run(padded, self._shared, costs, range(total))
         spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
         return {**spent, "devices": jax.device_count(), "versions": versions(*MADE_BY)}, arrays
 

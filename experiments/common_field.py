@@ -1,4 +1,4 @@
-"""One vector field of which every model that flies is a special case, so that all of them are lanes of one program."""
+"""One vector field of which every model that learned is a special case, and that of the truth: two programs fly all."""
 
 from dataclasses import asdict
 from typing import Any
@@ -26,39 +26,57 @@ Scalar = Float[Array, ""]
 
 
 class CommonField(AbstractVectorField):
-    """ẋ = s f_p(x, u) + (drag, ground effect, a steady force) + f_d(x, Rᵀe_z, u).
+    """ẋ = s f_p(x, u) + f_d(x, Rᵀe_z, u).
 
     Attributes:
         share: s, 1, or 0 for a network alone.
         body: f_p.
-        drag: [kg/s].
-        ground: 1 with ground effect, 0 without.
-        push: steady force [N, world].
         network: f_d; reads the state and the direction of the world's up in the body. Its norm is a bias.
     """
 
     share: Scalar
     body: RigidBody
-    drag: Scalar
-    ground: Scalar
-    push: Float[Array, "3"]
     network: ResidualNetwork
 
     def __call__(self, x: State, u: Input) -> State:
         up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
-        learned = self.network(jnp.concatenate([x, up]), u)
-        return self.share * self.body(x, u) + self._forces(x, u) + learned
+        return self.share * self.body(x, u) + self.network(jnp.concatenate([x, up]), u)
 
-    def _forces(self, x: State, u: Input) -> State:
+    def described(self) -> dict[str, Any]:
+        """What is the same for all lanes, as JSON values."""
+        return {"vehicle": asdict(self.body.vehicle), "scaling": [*asdict(self.network.scaling).values()]}
+
+
+class TrueField(AbstractVectorField):
+    """ẋ = f_p(x, u) + (drag, ground effect, a steady force): the simulator's equations without a clock.
+
+    Attributes:
+        body: f_p.
+        drag: [kg/s].
+        push: steady force [N, world].
+    """
+
+    body: RigidBody
+    drag: Scalar
+    push: Float[Array, "3"]
+
+    def __call__(self, x: State, u: Input) -> State:
         vehicle, theta = self.body.vehicle, self.body.theta()
         known = eqx.tree_at(lambda p: p.drag_coefficient, parameters_of(vehicle), self.drag)
         now = jnp.asarray(NOW, x.dtype)
         air, ground = drag(x, u, now, known), ground_effect(x, u, now, known)
-        torque = rotation.rotate(rotation.conjugate(x[QUATERNION]), self.ground * ground.torque)
+        torque = rotation.rotate(rotation.conjugate(x[QUATERNION]), ground.torque)
         inertia = jnp.stack([theta["Ix"], theta["Iy"], jnp.asarray(vehicle.inertia[2], x.dtype)])
-        force = air.force + self.ground * ground.force + self.push
+        force = air.force + ground.force + self.push
         still = jnp.zeros_like(x, shape=VELOCITY.start)
-        return jnp.concatenate([still, force / vehicle.mass, torque / inertia])
+        return self.body(x, u) + jnp.concatenate([still, force / vehicle.mass, torque / inertia])
+
+    def described(self) -> dict[str, Any]:
+        """What is the same for all lanes, as JSON values."""
+        return {"vehicle": asdict(self.body.vehicle)}
+
+
+Believed = CommonField | TrueField  # by a controller
 
 
 def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
@@ -82,20 +100,19 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
             share, network = 1.0, silent(hidden, scaling)
         case _:
             share, network, body = 0.0, wide(field), rigid_body(vehicle)
-    return CommonField(jnp.asarray(share), body, jnp.zeros(()), jnp.zeros(()), jnp.zeros(3), network)
+    return CommonField(jnp.asarray(share), body, network)
 
 
-def true_field(domain: Domain, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
+def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
     """The true vehicle of a domain under its own forces, of the wind the mean: the best model without a clock.
 
     Args:
-        vehicle: that of the other lanes, from which the true one may differ in Ix, Iy and k.
+        vehicle: that of the models, from which the true one may differ in Ix, Iy and k.
     """
     truth = nominal(domain.vehicle)
     body = RigidBody({name: jnp.log(truth[name] / value) for name, value in nominal(vehicle).items()}, vehicle)
     push = jnp.array([0.0, WIND_MEAN if wind in domain.forces else 0.0, 0.0])
-    air = jnp.asarray(domain.drag_coefficient)
-    return CommonField(jnp.ones(()), body, air, jnp.ones(()), push, silent(hidden, scaling))
+    return TrueField(body, jnp.asarray(domain.drag_coefficient), push)
 
 
 def silent(hidden: int, scaling: InputScaling) -> ResidualNetwork:
@@ -150,8 +167,3 @@ def _affine(network: ResidualNetwork) -> tuple[Float[Array, "h m"], Float[Array,
         case Bias():
             return network.weight_in, network.norm.shift
     raise ValueError(f"--norm: a network with {type(network.norm).__name__} cannot be flown here, only batch or none")
-
-
-def described(field: CommonField) -> dict[str, Any]:
-    """What is the same for all lanes, as JSON values."""
-    return {"vehicle": asdict(field.body.vehicle), "scaling": [*asdict(field.network.scaling).values()]}

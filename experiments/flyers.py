@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments.common_field import CommonField, common, true_field
+from experiments.common_field import Believed, CommonField, common, true_field
 from experiments.conditions import input_scaling
 from experiments.protocol import Config
 from experiments.solved import constant_disturbance, solved
@@ -71,8 +71,8 @@ def nine_numbers(
 
 def fleet(
     domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], few: int, many: int, config: Config
-) -> dict[Flyer, CommonField]:
-    """All that flies in a domain, in the common form: a lane for each seed, or one of a model that was not trained.
+) -> dict[Flyer, Believed]:
+    """All that flies in a domain: a lane for each seed, or one of a model that was not trained.
 
     Args:
         trained: "physics", "hybrid", "no_physics", "safe", "nine".
@@ -86,10 +86,8 @@ def fleet(
     observed = Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few), Flyer("nine", few)
     for flyer in observed:
         fields[replace(flyer, observer=True)] = fields[flyer]
-    truth = true_field(domain, vehicle, config.hidden, input_scaling(vehicle, config))
-    return {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()} | {
-        Flyer("oracle"): single(truth)
-    }
+    models = {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()}
+    return models | {Flyer("oracle"): single(true_field(domain, vehicle))}
 
 
 def in_common(fields: AbstractVectorField, vehicle: Vehicle, config: Config) -> CommonField:
