@@ -28,7 +28,7 @@ class Options:
     preset: Literal["full", "smoke"] = "full"
     """full: what is reported. smoke: does it work; its numbers say nothing."""
     out: Path | None = None
-    """Also write the numbers of all benchmarks to this file as JSON."""
+    """Also write the numbers of all benchmarks to this file as JSON, and figures beside it."""
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
@@ -36,8 +36,8 @@ class Options:
     in `torch.compile`. A rival that is not installed is named and skipped: pip install -e '.[peers]'."""
 
 
-def measured(name: str, preset: str) -> dict[str, Any]:
-    """The report of one benchmark; its tables are shown on stderr when it is done.
+def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
+    """The report of one benchmark; its tables are shown on stderr when it is done, its figures are put beside `out`.
 
     Raises:
         RuntimeError: it failed, for instance because two programs do not compute the same.
@@ -47,6 +47,9 @@ def measured(name: str, preset: str) -> dict[str, Any]:
         command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]
         if subprocess.run(command, stdout=sys.stderr, check=False).returncode:
             raise RuntimeError(f"benchmark {name} failed; what it says stands above")
+        for figure in report.parent.glob(f"{name}.[!j]*"):
+            if out is not None:
+                write_whole(out.with_name(f"{out.stem}-{figure.name}"), figure.read_bytes())
         return read_json(report)
 
 
@@ -72,7 +75,7 @@ def main() -> None:
         if options.out is not None:
             check_folder("--out", options.out.parent)
         names = options.only + (PEERS if options.peers else ())
-        reports = [measured(name, options.preset) for name in names]
+        reports = [measured(name, options.preset, options.out) for name in names]
     except (ValueError, RuntimeError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, ValueError) else 1)

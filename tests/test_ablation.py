@@ -8,7 +8,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from test_experiments import command
+from smoke import experiments
 
 from experiments.ablation import PRESETS, Choice, variations
 from experiments.sensors import Noise, measured
@@ -88,13 +88,13 @@ def test_noise_has_its_size_and_spares_the_tests():
 
 
 def test_a_run_leaves_a_report_a_page_and_a_figure_for_each_choice(tmp_path):
-    run = command("ablation", "--over", "noise", folder=tmp_path)
+    (run,) = experiments("ablation", "ablation", folder=tmp_path, options=("--over", "noise"))
     assert run.returncode == 0, run.stderr
     out = tmp_path / "out" / "ablation"
-    report = json.loads((out / "report.json").read_text())
-    assert {row["value"] for row in report["rows"]} == {f"{level} × typical" for level in ("0", "0.5", "1", "2")}
-    assert [row["default"] for row in report["rows"]].count(True) == 4  # one seed, two modes, two domains
+    rows = [row for row in json.loads((out / "report.json").read_text())["rows"] if row["choice"] == "noise"]
+    assert {row["value"] for row in rows} == {f"{level} × typical" for level in ("0", "0.5", "1", "2")}
+    assert [row["default"] for row in rows].count(True) == 4  # one seed, two modes, two domains
     assert (out / "noise.png").read_bytes().startswith(b"\x89PNG")
     assert "Noise" in (out / "report.md").read_text()
-    by_level = {row["value"]: row["val_mse"] for row in report["rows"] if row["mode"] == "fine_tuned"}
+    by_level = {row["value"]: row["val_mse"] for row in rows if row["mode"] == "fine_tuned"}
     assert by_level["2 × typical"] > by_level["0 × typical"]  # validation is measured with the same noise

@@ -1,16 +1,15 @@
 """Every benchmark runs, compares what it times, and says what it found; how fast that was is nobody's business here."""
 
-import json
 import math
-import subprocess
 import sys
 from collections import Counter
-from pathlib import Path
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from smoke import benchmarks
 
 from benchmarks import (
     compilation,
@@ -23,47 +22,59 @@ from benchmarks import (
     training_peers,
     training_step,
 )
+from benchmarks.__main__ import Benchmark
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
 
 
-def smoke(name, folder):
-    """The report of the smallest preset, and what was printed."""
-    command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", "smoke", "--out", str(folder / "report.json")]
-    finished = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-    assert finished.returncode == 0, finished.stderr
-    report = json.loads((folder / "report.json").read_text())
-    assert (report["benchmark"], report["preset"]) == (name, "smoke")
-    assert report["environment"]["versions"]["jax"] == jax.__version__
-    assert report["environment"]["hardware"]["cores"] >= report["cores_used"] >= 1
-    assert all(math.isfinite(ratio["value"]) for ratio in report["ratios"])
-    return report, finished.stdout
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("benchmarks")
 
 
-def test_one_command_gathers_the_ratios_of_all(tmp_path):
-    out = tmp_path / "all.json"
-    command = [sys.executable, "-m", "benchmarks", "--preset", "smoke", "--only", "training_step", "--out", str(out)]
-    finished = subprocess.run(command, capture_output=True, text=True, cwd=Path(__file__).parents[1])
-    assert finished.returncode == 0, finished.stderr
-    (report,) = json.loads(out.read_text())["benchmarks"]
-    assert report["benchmark"] == "training_step"
-    for ratio in report["ratios"]:
-        assert f"training_step: {ratio['what']}" in finished.stdout
-    assert "GFLOP/s" in finished.stderr  # the benchmark's own tables are beside the result, not in it
+@pytest.fixture(scope="module")
+def everything(folder):
+    """What all benchmarks in their smallest preset said, and the report of each."""
+    return benchmarks(folder)
 
 
-def test_the_environment_agrees_with_c_mujoco(tmp_path):
-    report, printed = smoke("environment", tmp_path)
-    assert "C MuJoCo" in printed
-    assert "Failed to import" not in printed
+@pytest.fixture
+def report_of(everything):
+    """The report of a benchmark by its name, once it is known to be sound."""
+
+    def sound(name):
+        report = everything[1][name]
+        assert report["preset"] == "smoke"
+        assert report["environment"]["versions"]["jax"] == jax.__version__
+        assert report["environment"]["hardware"]["cores"] >= report["cores_used"] >= 1
+        assert all(math.isfinite(ratio["value"]) for ratio in report["ratios"])
+        return report
+
+    return sound
+
+
+def test_one_command_gathers_the_ratios_of_all(everything):
+    run, reports = everything
+    assert set(reports) >= {*get_args(Benchmark)}
+    printed = " ".join(run.stdout.split())
+    for name, report in reports.items():
+        for ratio in report["ratios"]:
+            assert f"{name}: {ratio['what'].split()[0]}" in printed
+    # The benchmarks' own tables are beside the result, not in it.
+    for words in ("GFLOP/s", "C MuJoCo", "diffeqsolve", "best width", "weak scaling", "hidden units"):
+        assert words in run.stderr
+    assert "Failed to import" not in run.stderr
+
+
+def test_the_environment_agrees_with_c_mujoco(report_of):
+    report = report_of("environment")
     (row,) = report["rows"]
     assert row["difference"] < 1e-5
     assert set(row["steps_per_second"]) == {"ours", "ours_with_forces", "mujoco"}
 
 
-def test_three_integrators_predict_alike_and_have_the_same_gradient(tmp_path):
-    report, printed = smoke("rollout", tmp_path)
-    assert "diffeqsolve" in printed
+def test_three_integrators_predict_alike_and_have_the_same_gradient(report_of):
+    report = report_of("rollout")
     *cases, forward = report["rows"]
     assert {row["work"] for row in cases} == {"prediction", "gradient"}
     for row in cases:
@@ -74,9 +85,8 @@ def test_three_integrators_predict_alike_and_have_the_same_gradient(tmp_path):
     assert {ratio["at_most"] for ratio in report["ratios"]} == {1.05, None}
 
 
-def test_our_gradient_step_is_the_plain_one(tmp_path):
-    report, printed = smoke("training_step", tmp_path)
-    assert "GFLOP/s" in printed
+def test_our_gradient_step_is_the_plain_one(report_of):
+    report = report_of("training_step")
     (row,) = report["rows"]
     assert row["model"] == "hybrid"
     assert row["difference"] < 1e-5
@@ -84,9 +94,8 @@ def test_our_gradient_step_is_the_plain_one(tmp_path):
     assert set(row["seconds"]) == set(row["compile_seconds"]) == {"ours", "plain"}
 
 
-def test_widths_of_chunks_train_alike(tmp_path):
-    report, printed = smoke("sweep", tmp_path)
-    assert "best width" in printed
+def test_widths_of_chunks_train_alike(report_of):
+    report = report_of("sweep")
     *cells, stopped, choice = report["rows"]
     assert {(row["width"], row["lanes"]) for row in cells} == {(width, lanes) for width in (1, 2) for lanes in (1, 2)}
     assert all(row["seconds_per_lane_epoch"] > 0 for row in cells)
@@ -94,9 +103,8 @@ def test_widths_of_chunks_train_alike(tmp_path):
     assert choice["best_width"] in (1, 2)
 
 
-def test_weak_scaling_is_measured_in_processes_of_their_own(tmp_path):
-    report, printed = smoke("scaling", tmp_path)
-    assert "weak scaling" in printed
+def test_weak_scaling_is_measured_in_processes_of_their_own(report_of):
+    report = report_of("scaling")
     for row in report["rows"]:
         assert row["lanes"] == row["processes"] * row["devices"]
         assert min(row["seconds"].values()) >= 0
@@ -105,15 +113,14 @@ def test_weak_scaling_is_measured_in_processes_of_their_own(tmp_path):
     assert len(report["ratios"]) == sum(row["lanes"] > 1 for row in report["rows"])
 
 
-def test_growth_is_measured_along_every_axis_and_drawn(tmp_path):
-    report, printed = smoke("growth", tmp_path)
+def test_growth_is_measured_along_every_axis_and_drawn(report_of, folder):
+    report = report_of("growth")
     rows = {axis: [row for row in report["rows"] if row["axis"] == axis] for axis in growth.AXES}
     assert [len(points) for points in rows.values()] == [2, 2, 2, 2]
     for first, second in rows.values():
         assert second["bytes"] >= first["bytes"] > 0
         assert second["slope"] == pytest.approx(growth.slope(first, second))
-    assert "hidden units" in printed
-    assert (tmp_path / "report.png").stat().st_size > 10_000
+    assert (folder / "all-growth.png").stat().st_size > 10_000
 
 
 def test_a_slope_is_the_exponent():

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from test_experiments import command, refused
+from smoke import command, experiments, refused
 
 import hybrid_jax as hj
 from experiments.closed_loop_lanes import PATHS, Airspace, Block
@@ -84,7 +84,7 @@ def test_the_oracle_is_the_simulator_in_the_mean_wind(domain):
     truth = domain.quadrotor()
     # At time 0 the wind's sine is 0.
     expected = jax.jit(jax.vmap(lambda x, u: truth.derivative(x, u, jnp.zeros(()))))(x, u)
-    found = jax.vmap(true_field(domain, hj.IRIS, 8, SCALING))(x, u)
+    found = jax.vmap(true_field(domain, hj.IRIS))(x, u)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
@@ -103,7 +103,7 @@ def crew():
     flyers = {
         Flyer("nominal"): in_common(single(hj.rigid_body(hj.IRIS)), hj.IRIS, SMOKE),
         Flyer("hybrid"): in_common(stacked, hj.IRIS, SMOKE),
-        Flyer("oracle"): single(true_field(PARAMETER_SHIFT, hj.IRIS, 8, SCALING)),
+        Flyer("oracle"): single(true_field(PARAMETER_SHIFT, hj.IRIS)),
     }
     return flyers, hybrid
 
@@ -152,7 +152,7 @@ def test_the_true_vehicle_flies_better_than_the_nominal_one_and_keeps_its_promis
 def folder(tmp_path_factory):
     """Left by one run of the command."""
     folder = tmp_path_factory.mktemp("closed_loop_command")
-    run = command("closed_loop", folder=folder)
+    (run,) = experiments("closed_loop", "closed_loop", folder=folder)
     assert run.returncode == 0, run.stderr
     assert "What was to be reached" in run.stdout
     return folder

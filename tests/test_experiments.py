@@ -2,34 +2,26 @@
 
 import csv
 import json
-import os
 import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from smoke import ROOT, command, experiments, refused
 
 import hybrid_jax
 from experiments.external_force import sine_floor
+from experiments.results import physics_in
 from hybrid_jax.report import load_report
+from hybrid_jax.rows import SOURCE_OF
 
-ROOT = Path(__file__).parents[1]
 EXPERIMENTS = ("param_shift", "external_force")
 ROW = {
     "domain": str, "model": str, "mode": str, "n_train": int, "seed": int, "test_mse": float, "rho": float,
     "val_mse": float, "epochs": int, "status": str, "theta": dict | None, "theta_interval": dict | None,
 }  # fmt: skip
-
-
-def command(name, *options, folder, out=None):
-    out = folder / "out" if out is None else out
-    preset = [] if "--preset" in options else ["--preset", "smoke"]
-    arguments = [*preset, "--out", str(out), "--cache", str(folder / "cache"), *options]
-    run = [sys.executable, "-m", f"experiments.{name}", *arguments]
-    return subprocess.run(run, capture_output=True, text=True, cwd=ROOT, env=os.environ | {"MPLBACKEND": "agg"})
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +32,7 @@ def folder(tmp_path_factory):
 @pytest.fixture(scope="module")
 def finished(folder):
     """Each experiment run once; the second finds the first one's pre-training in the cache."""
-    runs = {name: command(name, folder=folder) for name in EXPERIMENTS}
+    runs = dict(zip(EXPERIMENTS, experiments("shifts", *EXPERIMENTS, folder=folder), strict=True))
     assert {name: run.returncode for name, run in runs.items()} == dict.fromkeys(EXPERIMENTS, 0), runs
     return runs
 
@@ -55,12 +47,12 @@ def test_the_report_keeps_its_contract(name, folder, finished):
     assert report["experiment"] == name
     assert report["config"]["preset"] == "smoke"
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
-    # Three models: source-only once a seed, two modes for each size and seed.
-    assert len(report["rows"]) == 3 * (1 + 2)
+    # Three models: source-only once a seed, two modes for each size and seed; and the one that is solved.
+    assert len(report["rows"]) == 3 * (1 + 2) + 1
     for row in report["rows"]:
         assert set(row) == set(ROW)
         assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
-        assert row["model"] in ("hybrid", "no_physics", "physics_only")
+        assert row["model"] in ("hybrid", "no_physics", "physics_only", "constant_disturbance")
         assert row["mode"] in ("fine_tuned", "target_only", "source_only")
         assert row["status"] in ("ok", "capped", "diverged")
         assert (row["theta"] is None) == (row["model"] == "no_physics")
@@ -77,7 +69,8 @@ def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
     rows = record(folder, name)["rows"]
     source = {row["model"]: row["test_mse"] for row in rows if row["mode"] == "source_only"}
     for row in rows:
-        expected = (source[row["model"]] - row["test_mse"]) / source[row["model"]]
+        error = source[SOURCE_OF.get(row["model"], row["model"])]
+        expected = (error - row["test_mse"]) / error
         np.testing.assert_allclose(row["rho"], expected, rtol=1e-12)
 
 
@@ -85,7 +78,7 @@ def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
 def test_tables_and_figures_are_there(name, folder, finished):
     out = folder / "out" / name
     with (out / "rows.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 9
+        assert len(list(csv.DictReader(file))) == 10
     assert "hybrid" in (out / "report.md").read_text()
     for figure in ("scores", "example_flight", "theta", "predictions"):
         assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
@@ -107,8 +100,7 @@ def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
         model = hybrid_jax.load(folder / "out" / "param_shift" / "models" / name)
         assert model.about["test_mse"] == row["test_mse"]
         if row["theta"] is not None:
-            physics = model.field if row["model"] == "physics_only" else model.field.physics
-            assert {key: float(value) for key, value in physics.theta().items()} == row["theta"]
+            assert {key: float(value) for key, value in physics_in(model.field).theta().items()} == row["theta"]
     predicted = model.predict(x0, u, model.about["dt"])
     assert predicted.shape == (2, 5, 13)
     assert np.isfinite(predicted).all()
@@ -160,15 +152,6 @@ def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent
     assert "the same command goes on from here" in rest
     (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun")
     shutil.rmtree(begun)
-
-
-def refused(run, name):
-    """Exit code 2 and one line on stderr."""
-    assert run.returncode == 2, run.stderr
-    lines = run.stderr.strip().splitlines()
-    assert len(lines) == 1, run.stderr
-    assert lines[0].startswith(f"{name}: ")
-    return lines[0]
 
 
 @pytest.mark.parametrize(

@@ -1,17 +1,16 @@
 """Rivals are timed where they are installed and named where they are not; how fast they are, nobody asks here."""
 
-import json
-import subprocess
 import sys
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from pendulum import pendulum
+from smoke import benchmarks
 
+from benchmarks.__main__ import PEERS
 from benchmarks.peers import installed
 from benchmarks.rigid_body_by_hand import derivative
 from benchmarks.subjects import make_flights, untrained
@@ -22,17 +21,12 @@ from hybrid_jax.vector_field import Hybrid as OurHybrid
 from hybrid_jax.vector_field import evaluate_batch
 from hybrid_jax.vehicle import IRIS
 
-ROOT = Path(__file__).parents[1]
-
 
 @pytest.fixture(scope="module")
 def peers(tmp_path_factory):
     """The reports of the smallest preset, by benchmark, and what was printed, from one command."""
-    out = tmp_path_factory.mktemp("peers") / "all.json"
-    command = [sys.executable, "-m", "benchmarks", "--preset", "smoke", "--peers", "--out", str(out), "--only"]
-    finished = subprocess.run(command, capture_output=True, text=True, cwd=ROOT)
-    assert finished.returncode == 0, finished.stderr
-    return {report["benchmark"]: report for report in json.loads(out.read_text())["benchmarks"]}, finished.stdout
+    run, reports = benchmarks(tmp_path_factory.mktemp("peers"), "--peers", "--only")
+    return {name: reports[name] for name in PEERS}, run.stdout
 
 
 def test_every_rival_is_timed_or_named_with_what_would_install_it(peers):

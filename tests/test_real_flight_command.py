@@ -1,15 +1,13 @@
 """From folders of logs, sound but for one thing, to a report: what is read, what is refused, what is left behind."""
 
 import json
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
+from smoke import command, experiments, refused
 
 import hybrid_jax
 from experiments import real_flight
@@ -18,8 +16,6 @@ from experiments.flight_logs import cut, fly_in, require_one_rate
 from experiments.simulated_logs import vehicle_toml
 from hybrid_jax.flight_rows import QUANTITIES
 from hybrid_jax.vehicle import IRIS
-
-ROOT = Path(__file__).parents[1]
 
 
 def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
@@ -78,12 +74,6 @@ def test_numbers_may_be_joined_by_commas():
     assert real_flight.spaced(given) == expected
 
 
-def command(*options, folder):
-    arguments = ["--out", str(folder / "out"), "--cache", str(folder / "cache"), *options]
-    run = [sys.executable, "-m", "experiments.real_flight", "--preset", "smoke", *arguments]
-    return subprocess.run(run, capture_output=True, text=True, cwd=ROOT, env=os.environ | {"MPLBACKEND": "agg"})
-
-
 def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
     (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
     source = write(tmp_path / "source", LOGS[:3])
@@ -93,9 +83,8 @@ def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
         + "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600\n"
     )
     (source / "bad.csv").write_text(text)
-    run = command("--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source), folder=tmp_path)
-    assert run.returncode == 2
-    (line,) = run.stderr.strip().splitlines()
+    options = ("--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source))
+    line = refused(command("real_flight", *options, folder=tmp_path), "real_flight")
     assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
     left = (tmp_path / "out" / "real_flight").iterdir()
     assert [path.name for path in left] == [".lock"]  # nothing is written half
@@ -104,7 +93,7 @@ def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
 @pytest.fixture(scope="module")
 def simulated(tmp_path_factory):
     folder = tmp_path_factory.mktemp("simulated")
-    run = command("--simulated", folder=folder)
+    (run,) = experiments("real_flight", "real_flight", folder=folder, options=("--simulated",))
     assert run.returncode == 0, run.stderr
     return folder / "out" / "real_flight", run
 
@@ -129,6 +118,16 @@ def test_simulated_logs_go_all_the_way(simulated):
         assert f"({figure})" in page
     assert "Consistency of each log" in page
     assert "Traceback" not in run.stderr
+
+
+def test_adaptation_leaves_what_is_the_estimator_s(simulated):
+    rows = json.loads((simulated[0] / "report.json").read_text())["rows"]
+    theta = {(row["fold"], row["model"], row["mode"]): row["theta"] for row in rows}
+    for (fold, model, mode), adapted in theta.items():
+        if mode == "fine_tuned":
+            source = theta[fold, model, "zero_shot"]
+            same = {name for name, value in adapted.items() if value == source[name]}
+            assert same == {f"velocity_gain[{axis}]" for axis in range(3)}
 
 
 def test_models_of_a_run_load_and_predict(simulated):
