@@ -225,7 +225,7 @@ def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:
     def plan(each: Lane) -> Plan:
         stage = stage_of(step, model, each.share)
         subset = np.resize(each.subset, longest)  # of one length; only the first len(subset) are used
-        rates = rates_by_group(one, stage.rates | dict.fromkeys(_paths_of(step.kept, one), 0.0))
+        rates = rates_by_group(one, {**stage.rates, **dict.fromkeys(_paths_of(step.kept, one), 0.0)})
         return make_plan(rates, subset, len(each.subset), 0, stage.patience, stage.epochs, 0.0)
 
     return jax.device_get(stack([jax.device_get(plan(each)) for each in lanes]))

@@ -29,15 +29,15 @@ class Solved(NamedTuple):
 
     Attributes:
         fields: the models, stacked.
-        val_mse: L_MSE of each on the validation windows.
-        steps: of each solution.
-        status: see `training`.
+        val_mse: L_MSE of each on the validation windows (lanes,).
+        steps: of each solution (lanes,).
+        status: see `training` (lanes,).
     """
 
     fields: Any
-    val_mse: np.ndarray
-    steps: np.ndarray
-    status: np.ndarray
+    val_mse: Any
+    steps: Any
+    status: Any
 
 
 def solved(solve: Solve, fields: AbstractVectorField, config: Config, target: Dataset) -> Solved:
