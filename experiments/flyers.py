@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -63,8 +62,7 @@ def nine_numbers(
 
     def of(domain: Domain) -> AbstractVectorField:
         target = flown(domain, target_splits(config), config, stages)
-        work = partial(solved, constant_disturbance, source, own, target)
-        return stages.timed(f"least squares {domain.name}", work).fields
+        return solved(f"least squares {domain.name}", constant_disturbance, source, own, stages, target).fields
 
     return Trained(source, {(domain.name, few): of(domain) for domain in domains}), stages
 

@@ -2,6 +2,7 @@
 
 import time
 from contextlib import AbstractContextManager
+from typing import Self
 
 from rich.console import Console
 from rich.live import Live
@@ -12,15 +13,15 @@ from hybrid_jax.sweep import Progress
 FIRST, QUIET = 5.0, 30.0  # s before the first line in a file, and between two
 
 
-class SweepLine(AbstractContextManager):
-    """One line about a sweep; `show` is what `sweep` calls after each block."""
+class Line(AbstractContextManager):
+    """One line about a stage, drawn anew whenever there is news."""
 
     def __init__(self, name: str, console: Console):
         self._name, self._console = name, console
         self._live = Live(Text(f"{name}: compiling"), console=console, transient=True) if console.is_terminal else None
         self._due = time.perf_counter() + FIRST
 
-    def __enter__(self) -> "SweepLine":
+    def __enter__(self) -> Self:
         if self._live is not None:
             self._live.start()
         return self
@@ -29,14 +30,36 @@ class SweepLine(AbstractContextManager):
         if self._live is not None:
             self._live.stop()
 
-    def show(self, progress: Progress) -> None:
-        """Draw where the sweep is."""
-        line = f"{self._name}: {describe(progress)}"
+    def say(self, news: str) -> None:
+        """Draw the news, in a file only now and then."""
+        line = f"{self._name}: {news}"
         if self._live is not None:
             self._live.update(Text(line))
         elif time.perf_counter() > self._due:
             self._due = time.perf_counter() + QUIET
             self._console.print(line, highlight=False, soft_wrap=True)
+
+
+class SweepLine(Line):
+    """About a sweep; `show` is what `sweep` calls after each block."""
+
+    def show(self, progress: Progress) -> None:
+        """Draw where the sweep is."""
+        self.say(describe(progress))
+
+
+class PartLine(Line):
+    """About work in so many parts, of which `show` is told how many are done."""
+
+    def __init__(self, name: str, console: Console, parts: int):
+        super().__init__(name, console)
+        self._parts, self._began = parts, time.perf_counter()
+
+    def show(self, done: int) -> None:
+        """Draw how many parts are done, and what is left if the others take as long."""
+        gone = time.perf_counter() - self._began
+        left = gone / done * (self._parts - done)
+        self.say(f"{done} of {self._parts} parts, {clock(gone)} gone, {clock(left)} left")
 
 
 def describe(progress: Progress) -> str:

@@ -80,7 +80,7 @@ def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
 
     def method(case: Case, name: str) -> Lanes:
         config, start = case.config, case.pretrained["hybrid"].best
-        found = case.stages.timed(f"fine_tuned {name} {case.name}", lambda: solved(solve, start, config, case.target))
+        found = solved(f"fine_tuned {name} {case.name}", solve, start, config, case.stages, case.target)
         errors = case.tested(name, found.fields)
         return with_intervals(case, solution(name, *places(config.sizes, config), found, errors))
 

@@ -1,6 +1,7 @@
 """Adaptation that is solved instead of trained, by least squares or in closed form, for every size and seed."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 
 from experiments.conditions import drawn, settings
 from experiments.protocol import Config
+from experiments.stages import Stages
 from hybrid_jax.datasets import Dataset
 from hybrid_jax.disturbance import with_disturbance
 from hybrid_jax.lanes import stack
@@ -40,8 +42,14 @@ class Solved(NamedTuple):
     status: Any
 
 
-def solved(solve: Solve, fields: AbstractVectorField, config: Config, target: Dataset) -> Solved:
-    """Each seed's field, adapted to as many target windows of its own as each of the sizes says."""
+def solved(
+    name: str, solve: Solve, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
+) -> Solved:
+    """Each seed's field, adapted to as many target windows of its own as each of the sizes says.
+
+    Args:
+        name: of the stage.
+    """
     shared = settings(config)
 
     def one(lane, pool: Trajectories, validation: Trajectories) -> Solved:
@@ -54,7 +62,8 @@ def solved(solve: Solve, fields: AbstractVectorField, config: Config, target: Da
         lanes = (fields, subsets(size, config))
         return by_lane(one, lanes, target.splits["train"], target.splits["validation"])
 
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *map(of_size, config.sizes))
+    parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
 
 
 def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):

@@ -1,7 +1,7 @@
 """Sweeps that are worth keeping: each is found in the cache by the hash of all that fixes it, or run."""
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -10,7 +10,7 @@ from rich.console import Console
 
 from experiments.checkpoints import Checkpoints
 from experiments.interrupts import Held
-from experiments.progress import SweepLine, clock
+from experiments.progress import PartLine, SweepLine, clock
 from experiments.protocol import Run
 from experiments.run_record import require_same
 from hybrid_jax import hosts
@@ -84,6 +84,17 @@ class Stages:
         result = work()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
         return result
+
+    def parts(self, name: str, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
+        """The results of jobs, one after the other, timed as one."""
+        with PartLine(name, self._console, len(jobs)) as line:
+
+            def one(number: int, job: Callable[[], Result]) -> Result:
+                result = job()
+                line.show(number)
+                return result
+
+            return self.timed(name, lambda: [one(number, job) for number, job in enumerate(jobs, 1)])
 
     def knows(self, name: str) -> bool:
         """Whether a sweep of this name, in whatever configuration, was begun or finished before."""

@@ -166,7 +166,7 @@ def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stag
 
 def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
     name = f"fine_tuned {model}"
-    found = stages.timed(f"{name} {domain_name(target)}", lambda: solved(SOLVED[model], source, config, target))
+    found = solved(f"{name} {domain_name(target)}", SOLVED[model], source, config, stages, target)
     errors = _errors(f"test {name}", found.fields, config, stages, target)
     return solution(model, *places(config.sizes, config), found, errors)
 

@@ -26,7 +26,8 @@ _MODELS = {
     "regression in closed form, as in Neural-Fly",
     "least_squares": "the hybrid of before the change, of which only θ_p is fitted anew, by nonlinear least squares "
     "(Levenberg–Marquardt)",
-    "constant_disturbance": "the same, of θ_p and six numbers beside it: a force and a torque that do not change",
+    "constant_disturbance": "the hybrid of before the change, of which only θ_p and, beside it, six accelerations that "
+    "do not change are fitted, by nonlinear least squares",
     "linear_residual": "the hybrid of before the change as it is, plus a linear map fitted to what it leaves over",
 }
 _MODES = {
