@@ -97,7 +97,7 @@ def theta(rows: Sequence[Row], truth: Mapping[str, float], title: str = "Physica
         axes.set(title=f"{name}, truly {truth[name]:.4g} {_unit(name)}", xlabel="N, target trajectories")
         _tick_sizes(axes, known)
     panels[0].set_ylabel("recovered / true − 1  [%]")
-    _finish(figure, panels[0], title, columns=5)
+    _finish(figure, panels[0], title, columns=4)
     return figure
 
 
@@ -162,7 +162,7 @@ def _draw_gains(axes: Axes, curves: _Curves) -> None:
     axes.axhline(0.0, color="0.4", linestyle=":")
     style = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.4"}
     axes.text(0.99, -0.01, "0: no gain over source-only", transform=axes.get_yaxis_transform(), **style)
-    axes.set(ylabel="ρ = (source error − error) / source error", title="Improvement over source-only (1 is perfect)")
+    axes.set(ylabel="ρ = 1 − error / source error", title="Improvement over source-only (1 is perfect)")
     _draw_curves(axes, curves, min(lowest, 0.0) - 0.1, 1.08, lost_at_top=False)
 
 
