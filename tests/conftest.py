@@ -5,8 +5,11 @@
 
 import os
 import shutil
+import signal
 import tempfile
 from importlib.metadata import version
+
+import pytest
 
 # All are read when JAX is imported, which must not happen here; the others are as `runtime.configure` sets them.
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
@@ -27,3 +30,11 @@ def pytest_configure(config):
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     for name, value in (KEEP_ALL | {"XLA_FLAGS": QUICK}).items():
         os.environ.setdefault(name, value)
+
+
+@pytest.fixture
+def heard():
+    """Ctrl-C is heard, here and by what is started, also where pytest is a background job, which ignores it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)

@@ -6,7 +6,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from functools import partial
 
 import numpy as np
 import pytest
@@ -135,14 +134,13 @@ def test_physics_alone_is_an_experiment_too(folder, finished):
     assert len(record(folder, "param_shift", "physics")["rows"]) == 3
 
 
+@pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
 def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent, code, folder, finished):
     forever = ["--patience.hybrid-pretraining.minimum", "10000000", "--max-epochs", "10000000"]
     options = ["--preset", "smoke", "--models", "physics_only", *forever, "--cache", str(folder / "cache")]
     run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
-    # A shell's background job ignores Ctrl-C, and so would what it starts.
-    heard = partial(signal.signal, sent, signal.SIG_DFL)
-    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT, preexec_fn=heard) as process:
+    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert any("lanes active" in line for line in process.stderr)  # said after a few seconds of training
             second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)

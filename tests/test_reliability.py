@@ -135,6 +135,23 @@ def test_a_killed_run_goes_on_by_itself_to_the_same_bits(number, place, whole):
     assert not list(place.cache.glob("sweeps/*.begun"))
 
 
+@pytest.fixture(scope="module")
+def begun_once(place, whole, tmp_path_factory):
+    """A copy of what a run has left that was killed with two checkpoints of a sweep saved."""
+    interrupted(place)
+    kept = tmp_path_factory.mktemp("begun")
+    for name in ("cache", "out"):
+        shutil.copytree(getattr(place, name), kept / name, ignore=shutil.ignore_patterns("programs"))
+    return kept
+
+
+@pytest.fixture
+def begun(place, begun_once, _empty):
+    """The place as that run left it."""
+    for name in ("cache", "out"):
+        shutil.copytree(begun_once / name, getattr(place, name), dirs_exist_ok=True)
+
+
 def interrupted(place, checkpoints=2):
     """Kill a run as soon as it has saved so many checkpoints of a sweep; another, if a busy machine let it run on."""
     for _ in range(TRIES):
@@ -150,8 +167,8 @@ def interrupted(place, checkpoints=2):
     pytest.fail(f"none of {TRIES} runs could be killed in time")
 
 
+@pytest.mark.usefixtures("begun")
 def test_a_truncated_checkpoint_is_set_aside_and_the_one_before_it_used(place, whole):
-    interrupted(place)
     last = place.checkpoints()[-1]
     for path in last.rglob("*"):
         if path.is_file():
@@ -164,9 +181,9 @@ def test_a_truncated_checkpoint_is_set_aside_and_the_one_before_it_used(place, w
     assert [path.name.split("-")[0] for path in last.parent.iterdir()] == [f"{last.name}.damaged"]
 
 
+@pytest.mark.usefixtures("begun")
 def test_a_full_disk_ends_in_one_line_and_what_was_saved_is_used(place, whole):
     """No file may grow beyond 3 kB: the write of the next checkpoint fails as on a full disk."""
-    interrupted(place)
     kept = {path: path.read_bytes() for path in place.checkpoints()[-1].rglob("*") if path.is_file()}
     limited = ["sh", "-c", 'ulimit -f 6; exec "$@"', "sh", *place.command()]  # blocks of 512 bytes
     full = subprocess.run(limited, capture_output=True, text=True, cwd=ROOT)
@@ -181,8 +198,8 @@ def test_a_full_disk_ends_in_one_line_and_what_was_saved_is_used(place, whole):
     assert place.rows() == whole[0]
 
 
+@pytest.mark.usefixtures("begun")
 def test_another_run_is_refused_until_told_to_start_anew(place, whole):
-    interrupted(place, 1)
     begun = place.record()
     other = place.run("--regulariser-weight", "0.01")
     assert other.returncode == 2
@@ -197,9 +214,9 @@ def test_another_run_is_refused_until_told_to_start_anew(place, whole):
     assert json.loads((aside / "run.json").read_text()) == begun
 
 
+@pytest.mark.usefixtures("begun")
 def test_a_sweep_begun_by_another_version_is_refused(place, whole, tmp_path):
     """A package of another version number stands before the installed one, as after an upgrade."""
-    interrupted(place, 1)
     shutil.rmtree(place.out)  # of the run nothing but the sweep is left
     about = tmp_path / "jax-99.0.dist-info" / "METADATA"
     about.parent.mkdir()

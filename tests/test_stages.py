@@ -55,14 +55,6 @@ def test_a_finished_sweep_is_found_not_run(folder, whole):
     assert same(again, whole)
 
 
-@pytest.fixture
-def heard():
-    """Ctrl-C is heard, also where pytest is a background job, which ignores it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    yield
-    signal.signal(signal.SIGINT, before)
-
-
 @pytest.mark.usefixtures("heard")
 def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
     seen = []
