@@ -4,7 +4,7 @@ import os
 import subprocess
 import sys
 
-from hybrid_jax.runtime import PROGRAMS
+from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
 PROGRAM = """
 import sys
@@ -19,13 +19,32 @@ assert len(jax.devices()) == cores()
 print(events.count("/jax/compilation_cache/cache_hits"), events.count("/jax/compilation_cache/cache_misses"))
 """
 
+LOOP = """
+import sys
+from pathlib import Path
+import jax
+from hybrid_jax.runtime import configure
+configure(Path(sys.argv[1]))
+loop = jax.jit(lambda x: jax.lax.scan(lambda x, _: (x - x[::-1] ** 3, None), x, length=10)[0])
+print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call"))
+"""
+
+
+def printed(program, cache, **more):
+    own = {name: value for name, value in os.environ.items() if name != PROGRAMS}  # not the cache of all tests
+    command = [sys.executable, "-c", program, str(cache)]
+    run = subprocess.run(command, env=own | more, capture_output=True, text=True, check=False)
+    assert run.returncode == 0, run.stderr
+    return [int(number) for number in run.stdout.split()]
+
 
 def hits_and_misses(cache):
-    own = {name: value for name, value in os.environ.items() if name != PROGRAMS}  # not the cache of all tests
-    command = [sys.executable, "-c", PROGRAM, str(cache)]
-    run = subprocess.run(command, env=own, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    return [int(number) for number in run.stdout.split()[-2:]]
+    return printed(PROGRAM, cache)
+
+
+def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own(tmp_path):
+    assert printed(LOOP, tmp_path) == [1]
+    assert printed(LOOP, tmp_path, **{FLAGS: f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=1"}) == [0]
 
 
 def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):

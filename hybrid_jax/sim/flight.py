@@ -1,6 +1,7 @@
 """Random flights of a domain: the pilot and the true vehicle in closed loop."""
 
 from functools import partial
+from importlib.metadata import version
 from typing import NamedTuple
 
 import jax
@@ -21,6 +22,9 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), so that windows
 
 # A flight that leaves these bounds, or whose centre is below ground, has gone wrong.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
+
+# XLA's fusion emitters make the simulator compile longer and fly slower; later versions may have no other way.
+COMPILER = {"xla_cpu_use_fusion_emitters": False} if version("jaxlib").split(".")[:2] == ["0", "10"] else None
 
 
 class Flights(NamedTuple):
@@ -61,7 +65,7 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(jax.jit, static_argnames="steps")
+@partial(jax.jit, static_argnames="steps", compiler_options=COMPILER)
 def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int) -> Flights:
     return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps))(keys)
 
