@@ -100,7 +100,7 @@ class Checkpoints:
         return self._folder / f"{number:06d}"
 
     def _sweep_up(self) -> None:
-        """Delete what a kill left half written."""
+        """Delete what a kill, or a save that failed, left half written."""
         for path in self._folder.glob(f"*{PARTIAL}*"):
             shutil.rmtree(path, ignore_errors=True)
 

@@ -192,10 +192,11 @@ def test_a_full_disk_ends_in_one_line_and_what_was_saved_is_used(place, whole):
     assert "what was saved before is intact" in line
     assert "Traceback" not in full.stderr
     assert all(path.read_bytes() == content for path, content in kept.items())
-    assert not place.writes()
     again = place.run()
     assert "goes on where it was interrupted, at epoch" in again.stderr
     assert place.rows() == whole[0]
+    # Not before: a thread of orbax that hears late of the failure may leave a folder behind, until the next save.
+    assert not place.writes()
 
 
 @pytest.mark.usefixtures("begun")
