@@ -68,15 +68,13 @@ _ADAPTATION = (
     Step(1e-2, 0, 10, 40, 15, _SAME),
     Step(3e-3, 3e-3, 10, 40, 15, _SAME),
     Step(1e-3, 1e-3, 25, 30, 10, _SAME),
-    Step(3e-4, 3e-4, 10, 30, 10, _SAME),
 )
-_SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25, 30, 10), Step(3e-4, 3e-4, 10, 30, 10))
+_SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25, 30, 10))
 _BRIEF = (Step(2e-2, 0, 25, 10, 5), Step(2e-3, 2e-3, 25, 5, 5), Step(1e-3, 1e-3, 50, 5, 5))
 
 RECIPES: Mapping[str, Recipe] = {
     "staged": Recipe(
-        "physics, then all on 10 steps, on 25 and, after a change, on 10 again; "
-        "the network adds to accelerations alone",
+        "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
         *(25, _SOURCE, _ADAPTATION, _SCRATCH),
         outputs="accelerations",
         position=10.0,
