@@ -8,7 +8,7 @@ from hybrid_jax.schedule import Stage
 
 Model = Literal["hybrid", "no_physics", "physics_only"]
 Physics = Literal["multirotor", "torque_off", "frozen_rates"]
-RecipeName = Literal["staged", "short", "torque_off", "frozen_rates"]
+RecipeName = Literal["staged", "turning", "short", "torque_off", "frozen_rates"]
 
 REFERENCE = 1000  # N for which the epochs of an adaptation are given
 NETWORK_ALONE = 5e-3  # rate of a network without physics in the steps that are the physics' own
@@ -57,7 +57,7 @@ class Recipe:
     scratch: tuple[Step, ...]
     physics: Physics = "multirotor"
     learn: tuple[str, ...] = ()
-    outputs: Literal["accelerations", "motion"] = "motion"
+    outputs: Literal["accelerations", "angular_acceleration", "motion"] = "motion"
     position: float = 1.0
 
 
@@ -77,6 +77,12 @@ RECIPES: Mapping[str, Recipe] = {
         "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
         *(25, _SOURCE, _ADAPTATION, _SCRATCH),
         outputs="accelerations",
+        position=10.0,
+    ),
+    "turning": Recipe(
+        "physics, then all on 10 steps, then all on 25; the network adds to the angular acceleration alone",
+        *(25, _SOURCE, _ADAPTATION, _SCRATCH),
+        outputs="angular_acceleration",
         position=10.0,
     ),
     "short": Recipe(

@@ -128,6 +128,18 @@ class Accelerations(View):
         return jnp.concatenate([jnp.zeros((VELOCITY.start, *inside.shape[1:]), inside.dtype), inside])
 
 
+class AngularAcceleration(View):
+    """The field inside returns ω̇ (3); ṗ, q̇ and v̇ are exactly zero."""
+
+    field: AbstractVectorField
+
+    def read(self, x):
+        return x
+
+    def write(self, x, inside):
+        return jnp.concatenate([jnp.zeros((BODY_RATES.start, *inside.shape[1:]), inside.dtype), inside])
+
+
 class Motion(View):
     """The field inside returns corrections of ṗ, of the body rates that turn q, and v̇ and ω̇ (12), seen from the body.
 
@@ -176,6 +188,7 @@ INPUTS: dict[str, tuple[int, Wrapper]] = {
 OUTPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "accelerations": (6, Accelerations),
+    "angular_acceleration": (3, AngularAcceleration),
     "motion": (12, Motion),
 }
 FROM_THE_BODY = ("body", "body_motion")  # the inputs that "motion" goes with
@@ -195,7 +208,8 @@ def restricted(
     Args:
         inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`); "body",
             seen from the body (see `BodyFrame`); "body_motion", that without the height.
-        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "motion", with ṗ and body rates as well (`Motion`).
+        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; the "angular_acceleration" ω̇ alone; "motion", v̇ and
+            ω̇ with ṗ and body rates as well (`Motion`).
         norm: as in `residual_network`.
 
     Raises:
