@@ -1,7 +1,7 @@
 """How a model of a real vehicle is trained: stages as data, of source flights and of N windows of the target's."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal
 
 from hybrid_jax.schedule import Stage
@@ -72,25 +72,19 @@ _ADAPTATION = (
 _SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25, 30, 10))
 _BRIEF = (Step(2e-2, 0, 25, 10, 5), Step(2e-3, 2e-3, 25, 5, 5), Step(1e-3, 1e-3, 50, 5, 5))
 
+_STAGED = Recipe(
+    "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
+    *(25, _SOURCE, _ADAPTATION, _SCRATCH),
+    outputs="accelerations",
+    position=10.0,
+)
+_TURNING = "physics, then all on 10 steps, then all on 25; the network adds to the angular acceleration alone"
+_SHORT = "physics, then all on 10 steps; the network adds to accelerations alone"
+
 RECIPES: Mapping[str, Recipe] = {
-    "staged": Recipe(
-        "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
-        *(25, _SOURCE, _ADAPTATION, _SCRATCH),
-        outputs="accelerations",
-        position=10.0,
-    ),
-    "turning": Recipe(
-        "physics, then all on 10 steps, then all on 25; the network adds to the angular acceleration alone",
-        *(25, _SOURCE, _ADAPTATION, _SCRATCH),
-        outputs="angular_acceleration",
-        position=10.0,
-    ),
-    "short": Recipe(
-        "physics, then all on 10 steps; the network adds to accelerations alone",
-        *(25, _SOURCE[:2], _ADAPTATION[:2], _SCRATCH[:2]),
-        outputs="accelerations",
-        position=10.0,
-    ),
+    "staged": _STAGED,
+    "turning": replace(_STAGED, about=_TURNING, outputs="angular_acceleration"),
+    "short": replace(_STAGED, about=_SHORT, source=_SOURCE[:2], adaptation=_ADAPTATION[:2], scratch=_SCRATCH[:2]),
     "torque_off": Recipe(
         "the rotors' torque is not used; a few epochs on 25 and 50 steps",
         *(50, _BRIEF, _BRIEF, _BRIEF),
