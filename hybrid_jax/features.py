@@ -117,7 +117,7 @@ def _to_world(q: Float[Array, " 4 *b"], inside: Features) -> Float[Array, " 13 *
 
 
 class Accelerations(View):
-    """The field inside returns v̇ and ω̇ (6); ṗ and q̇ are exactly zero."""
+    """The field inside returns v̇ and ω̇ (6), or ω̇ alone (3); the derivatives before them are exactly zero."""
 
     field: AbstractVectorField
 
@@ -125,19 +125,7 @@ class Accelerations(View):
         return x
 
     def write(self, x, inside):
-        return jnp.concatenate([jnp.zeros((VELOCITY.start, *inside.shape[1:]), inside.dtype), inside])
-
-
-class AngularAcceleration(View):
-    """The field inside returns ω̇ (3); ṗ, q̇ and v̇ are exactly zero."""
-
-    field: AbstractVectorField
-
-    def read(self, x):
-        return x
-
-    def write(self, x, inside):
-        return jnp.concatenate([jnp.zeros((BODY_RATES.start, *inside.shape[1:]), inside.dtype), inside])
+        return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
 
 
 class Motion(View):
@@ -188,7 +176,7 @@ INPUTS: dict[str, tuple[int, Wrapper]] = {
 OUTPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "accelerations": (6, Accelerations),
-    "angular_acceleration": (3, AngularAcceleration),
+    "angular_acceleration": (3, Accelerations),
     "motion": (12, Motion),
 }
 FROM_THE_BODY = ("body", "body_motion")  # the inputs that "motion" goes with

@@ -16,15 +16,7 @@ from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import (
-    Accelerations,
-    AngularAcceleration,
-    BodyFrame,
-    BodyMotion,
-    Motion,
-    Placeless,
-    TiltOnly,
-)
+from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
@@ -50,7 +42,7 @@ _FIELDS = (
     *(ConstantDisturbance, Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor),
     *(ResidualNetwork, RigidBody),
 )
-_VIEWS = (Accelerations, AngularAcceleration, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)
