@@ -15,14 +15,14 @@ from benchmarks.timing import Ratio, ratio_table
 from experiments.command import BAD_INPUT, check_folder
 from hybrid_jax.files import json_text, read_json, write_whole
 
-Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth"]
+Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
 PEERS = "training_peers", "environment_peers"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Run every benchmark, each in a process of its own, and print one table of ratios: about ten minutes on two quiet
-    cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
+    """Run every benchmark, each in a process of its own, and print one table of ratios: about twelve minutes on two
+    quiet cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
     """
 
     preset: Literal["full", "smoke"] = "full"

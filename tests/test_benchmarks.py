@@ -15,6 +15,7 @@ from benchmarks import (
     compilation,
     environment,
     growth,
+    ingest,
     rollout,
     scaling,
     sweep,
@@ -25,6 +26,7 @@ from benchmarks import (
 from benchmarks.__main__ import Benchmark
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
+from hybrid_jax.flights.log import COLUMNS
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +63,7 @@ def test_one_command_gathers_the_ratios_of_all(everything):
         for ratio in report["ratios"]:
             assert f"{name}: {ratio['what'].split()[0]}" in printed
     # The benchmarks' own tables are beside the result, not in it.
-    for words in ("GFLOP/s", "C MuJoCo", "diffeqsolve", "best width", "weak scaling", "hidden units"):
+    for words in ("GFLOP/s", "C MuJoCo", "diffeqsolve", "best width", "weak scaling", "hidden units", "a CSV log"):
         assert words in run.stderr
     assert "Failed to import" not in run.stderr
 
@@ -121,6 +123,13 @@ def test_growth_is_measured_along_every_axis_and_drawn(report_of, folder):
         assert second["bytes"] >= first["bytes"] > 0
         assert second["slope"] == pytest.approx(growth.slope(first, second))
     assert (folder / "all-growth.png").stat().st_size > 10_000
+
+
+def test_a_log_is_read_as_numpy_reads_it(report_of):
+    both, once = report_of("ingest")["rows"]
+    assert both["difference"] < 1e-9
+    assert set(both["rows_per_second"]) == {"read_csv", "loadtxt"}
+    assert once["peak_bytes"] > once["bytes"] == once["rows"] * len(COLUMNS) * 8
 
 
 def test_a_slope_is_the_exponent():
@@ -185,5 +194,5 @@ def test_operations_are_counted_in_loops_and_calls():
 
 
 def test_the_preset_that_is_reported_times_each_call_ten_times():
-    measured = environment, growth, rollout, scaling, sweep, training_peers, training_step
+    measured = environment, growth, ingest, rollout, scaling, sweep, training_peers, training_step
     assert all(module.PRESETS["full"].turns >= 10 for module in measured)
