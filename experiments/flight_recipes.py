@@ -1,6 +1,6 @@
 """How a model of a real vehicle is trained: stages as data, of source flights and of N windows of the target's."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
@@ -116,6 +116,18 @@ def stage_of(step: Step, model: str, share: float = 1.0) -> Stage:
         case _:
             rates = {"": step.physics}
     return Stage(rates, step.steps, epochs, patience)
+
+
+def alike(model: str, recipe: str, among: Sequence[str]) -> str:
+    """The first of some recipes that trains a model as the given one does: what a hybrid's network adds to is no
+    concern of the others.
+    """
+
+    def training(name: str) -> Recipe:
+        how = replace(RECIPES[name], about="")
+        return how if model == "hybrid" else replace(how, outputs="motion")
+
+    return next((name for name in among if training(name) == training(recipe)), recipe)
 
 
 def share_of_epochs(size: int) -> float:

@@ -11,7 +11,7 @@ from experiments.flight_folds import Fold, folds_of, hold_out_validation
 from experiments.flight_logs import Flown, cut
 from experiments.flight_models import Craft
 from experiments.flight_protocol import RealFlightConfig
-from experiments.flight_recipes import RECIPES
+from experiments.flight_recipes import RECIPES, alike
 from experiments.flight_tests import (
     INTERVAL_STEPS,
     Scored,
@@ -81,10 +81,11 @@ def _train(course: Course, found: Study) -> None:
     config = course.config
     for number, fold in enumerate(found.folds):
         where, trial = f"fold {number}", trial_of(fold, config)
-        recipe = _chosen(course, found, fold, lambda name, fold=fold, where=where: _tried(course, where, fold, name))
-        lesson = course.lesson(fold, recipe)
+        chosen = _chosen(course, found, fold, lambda name, fold=fold, where=where: _tried(course, where, fold, name))
+        lesson = course.lesson(fold, chosen)
         found.scored.extend(_baselines(trial, course.before))
         for model in config.models:
+            recipe = alike(model, chosen, config.recipes)
             taught = course.taught(where, model, recipe, lesson, config.seeds)
             if config.refit:
                 taught = course.retaught(where, model, recipe, fold, lesson, taught)
@@ -106,11 +107,12 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
         def tried(recipe: str, where=where, fold=fold) -> list[AbstractVectorField]:
             return _tried_after(course, where, first[recipe], fold, recipe, pool)
 
-        recipe = _chosen(course, found, fold, tried)
-        lesson = first[recipe]
-        here = course.lesson_after(fold, recipe, lesson)
+        chosen = _chosen(course, found, fold, tried)
+        lesson = first[chosen]
+        here = course.lesson_after(fold, chosen, lesson)
         found.scored.extend(_baselines(trial, course.after))
         for model in config.models:
+            recipe = alike(model, chosen, config.recipes)
             if (model, recipe) not in taught:
                 taught[model, recipe] = course.taught("source", model, recipe, lesson, config.seeds)
             source = taught[model, recipe]

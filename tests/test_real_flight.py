@@ -16,7 +16,7 @@ import hybrid_jax
 from experiments.flight_folds import apart, drawn, folds_of, lessons
 from experiments.flight_logs import Windows, cut, fly_in, require_one_rate
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
-from experiments.flight_recipes import RECIPES, stage_of
+from experiments.flight_recipes import RECIPES, alike, stage_of
 from experiments.flight_tests import body_of, parameters, scores
 from hybrid_jax.channels import ChannelPrediction, channels_from
 from hybrid_jax.flight_claims import flight_claims
@@ -110,6 +110,18 @@ def test_kinematics_move_and_turn_at_constant_rates():
     np.testing.assert_array_equal(x[-1, 7:], x0[7:])
     angle = angle_between(x[-1, QUATERNION], jnp.asarray(x0[QUATERNION]))
     np.testing.assert_allclose(angle, 0.5 * np.linalg.norm(x0[10:]), rtol=1e-4)
+
+
+@pytest.mark.parametrize("model", ["hybrid", "no_physics", "physics_only"])
+def test_what_recipes_train_alike_is_trained_by_the_first(model):
+    names = tuple(RECIPES)
+    for recipe in names:
+        first = alike(model, recipe, names)
+        assert eqx.tree_equal(*(fresh(model, CRAFT, RECIPES[name], 4, 1) for name in (first, recipe)))
+        assert (RECIPES[first].source, RECIPES[first].window) == (RECIPES[recipe].source, RECIPES[recipe].window)
+    assert alike(model, "turning", names) == ("turning" if model == "hybrid" else "staged")
+    assert alike(model, "turning", ("turning", "staged")) == "turning"
+    assert alike(model, "short", names) == "short"
 
 
 @pytest.mark.parametrize("recipe", RECIPES)
