@@ -119,7 +119,7 @@ def residual_by_speed(
     Args:
         residuals: what is added to ẋ at each sample, by the name of the model.
     """
-    every = {"ṗ  [m/s]": POSITION, "v̇  [m/s²]": VELOCITY, "ω̇  [rad/s²]": BODY_RATES}
+    every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
     figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
     panels = figure.subplots(1, max(len(parts), 1), squeeze=False)[0][: len(parts)]
