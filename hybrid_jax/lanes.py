@@ -9,6 +9,7 @@ cache; on a GPU a chunk holds all lanes. Which lanes run is data, not shape: one
 
 import heapq
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -195,14 +196,16 @@ def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], share
     """The results of the first `chunks` chunks of this device's lanes; the others' places hold zeros."""
     arrays, rest = eqx.partition(lanes, eqx.is_array)
 
-    def one(arrays):
+    # Traced once, though it is asked for its shapes before it runs in the loop.
+    @partial(jax.jit, inline=True)
+    def one(arrays, shared):
         return eqx.filter(function(eqx.combine(arrays, rest), *shared), eqx.is_array)
 
     def chunk(arrays):
         if width > 1:
-            return jax.vmap(one)(arrays)
+            return jax.vmap(one, in_axes=(0, None))(arrays, shared)
         # Without vmap a loop inside keeps a scalar condition and copies nothing that it does not change.
-        return jax.tree.map(lambda leaf: leaf[None], one(jax.tree.map(lambda leaf: leaf[0], arrays)))
+        return jax.tree.map(lambda leaf: leaf[None], one(jax.tree.map(lambda leaf: leaf[0], arrays), shared))
 
     def body(i, results):
         part = jax.tree.map(lambda leaf: jax.lax.dynamic_slice_in_dim(leaf, i * width, width), arrays)
@@ -210,6 +213,6 @@ def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], share
             lambda whole, new: jax.lax.dynamic_update_slice_in_dim(whole, new, i * width, 0), results, chunk(part)
         )
 
-    shapes = jax.eval_shape(one, jax.tree.map(lambda leaf: leaf[0], arrays))
+    shapes = jax.eval_shape(one, jax.tree.map(lambda leaf: leaf[0], arrays), shared)
     results = jax.tree.map(lambda s: jnp.zeros((count(lanes), *s.shape), s.dtype), shapes)
     return jax.lax.fori_loop(0, chunks, body, results)
