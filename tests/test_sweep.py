@@ -261,6 +261,21 @@ def test_a_chunk_is_halved_until_its_program_fits_into_memory():
     np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
+@pytest.mark.parametrize("width", [1, 3])
+def test_a_lane_is_traced_once(width):
+    traced = []
+
+    def function(lane, shared):
+        traced.append(lane)
+        return lane * shared
+
+    mapped = LaneMap(function, width)
+    lanes = np.arange(4, dtype=np.float32)
+    for active in ([0, 1, 2, 3], [2]):
+        np.testing.assert_array_equal(mapped(lanes, (np.float32(2),), np.ones(4), active), 2 * lanes[active])
+    assert len(traced) == 1
+
+
 DEVICES = """
 import sys
 sys.path.insert(0, "tests")
