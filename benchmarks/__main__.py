@@ -21,7 +21,7 @@ PEERS = "training_peers", "environment_peers"
 
 @dataclass(frozen=True)
 class Options:
-    """Run every benchmark, each in a process of its own, and print one table of ratios: about twelve minutes on two
+    """Run every benchmark, each in a process of its own, and print one table of ratios: about eleven minutes on two
     quiet cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
     """
 

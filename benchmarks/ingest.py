@@ -5,7 +5,7 @@ the same numbers, which is checked before they are timed in turns. `read_csv` al
 fields of every row, and refuses what cannot be a flight. A million rows are then read once, and the memory that this
 takes is traced in a pass of its own.
 
-smoke: a thousand rows. full: a hundred thousand in turns and a million once, about two minutes.
+smoke: a thousand rows. full: a hundred thousand in turns and a million once, about forty seconds.
 """
 
 import tracemalloc
@@ -51,7 +51,7 @@ def write_flight(path: Path, rows: int) -> None:
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=",".join(COLUMNS), comments="")
 
 
-def table_of(log: FlightLog) -> np.ndarray:
+def numbers_of(log: FlightLog) -> np.ndarray:
     """What a log holds, in the order of its file."""
     return np.column_stack([log.t, log.x, log.u])
 
@@ -59,7 +59,7 @@ def table_of(log: FlightLog) -> np.ndarray:
 def measure_both(path: Path, preset: Preset) -> dict[str, Any]:
     """Agreement and rows per second of both."""
     calls = {"read_csv": lambda: read_csv(path), "loadtxt": lambda: np.loadtxt(path, delimiter=",", skiprows=1)}
-    difference = agree("numbers", table_of(calls["read_csv"]()), calls["loadtxt"](), AGREEMENT)
+    difference = agree("numbers", numbers_of(calls["read_csv"]()), calls["loadtxt"](), AGREEMENT)
     times = in_turns(calls, preset.turns)
     return {
         "rows": preset.rows,
@@ -70,9 +70,9 @@ def measure_both(path: Path, preset: Preset) -> dict[str, Any]:
 
 
 def measure_once(path: Path, rows: int) -> dict[str, Any]:
-    """Seconds of one pass, and by how much memory another exceeds the numbers read."""
+    """Seconds of one pass; bytes of the numbers read, and the most that another pass held at once."""
     log, seconds = stopwatch(lambda: read_csv(path))
-    kept = table_of(log).nbytes
+    kept = numbers_of(log).nbytes
     del log
     tracemalloc.start()
     read_csv(path)
@@ -81,7 +81,7 @@ def measure_once(path: Path, rows: int) -> dict[str, Any]:
     return {"rows": rows, "seconds": seconds, "bytes": kept, "peak_bytes": peak}
 
 
-def table_for(both: dict[str, Any], once: dict[str, Any]) -> Table:
+def table_of(both: dict[str, Any], once: dict[str, Any]) -> Table:
     """The measurements for reading."""
     table = Table("rows", "rows/s", "× loadtxt", "peak [MiB]", "numbers [MiB]", title="a CSV log is read and checked")
     speed = both["rows_per_second"]["read_csv"]
@@ -104,7 +104,7 @@ def measure(preset: Preset) -> Findings:
         Ratio("read_csv / loadtxt", both["times_loadtxt"]),
         Ratio(f"seconds a million rows, from {once['rows']:,}", million, at_most=REACH),
     ]
-    return Findings([both, once], [table_for(both, once)], ratios)
+    return Findings([both, once], [table_of(both, once)], ratios)
 
 
 if __name__ == "__main__":
