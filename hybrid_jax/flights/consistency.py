@@ -3,38 +3,48 @@
 Where they disagree, the usual mistakes are undone one at a time, and the one that makes them agree is suggested.
 """
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import moving_mean, respond
-from hybrid_jax.flights.segments import gaps, repeats, sound_intervals
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.flights.attitude import rotation_of
+from hybrid_jax.flights.log import COLUMNS, FlightLog
+from hybrid_jax.flights.motor_response import respond
+from hybrid_jax.flights.readings import (
+    NOTHING,
+    UP,
+    Readings,
+    Vectors,
+    accelerations,
+    middle,
+    rates,
+    smoother,
+    velocities,
+)
+from hybrid_jax.flights.segments import at_rest, gaps, repeats, sound_intervals
+from hybrid_jax.state import INPUT_NAMES, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
-NOTHING = "nothing to correct"
 MORE_FLIGHT = "check on a flight with more motion"
-SPAN = 0.05  # s of moving average on both sides of an equation
+UNUSUAL = "no usual mistake explains it: look at sensors, time stamps and columns"
 MOST_SAMPLES = 100_000  # of a longer log, its middle
 
+LONGEST_INTERVAL = 0.5  # s; no vehicle is flown by fewer samples
 # Relative errors: 0 where two records agree, 1 where they have nothing in common, √2 where they are opposed.
 KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
+AXIS_LIMIT = 0.8  # of one axis alone, where less motion is more noise
+GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
+YAW_LIMIT = 0.3  # correlation: rotors turn the body about z by little, and two of four wrong signs leave half of it
+OPPOSED = -0.1  # correlation
+NOISE = 0.2  # of the least motion: readings that differ by less are the same
+CLEAR = 1.0  # times the least motion that an axis must move to be judged alone
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
-
-UP = np.array([0.0, 0.0, 1.0])
-GRAVITY = 9.81 * UP
-
-Vectors = Float[np.ndarray, "n 3"]
-Fits = dict[str, tuple[Vectors, Vectors]]
 
 
 @dataclass(frozen=True)
@@ -66,18 +76,24 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     log = log[skip : skip + MOST_SAMPLES]
     return [
         *_samples(log),
-        _velocity(log),
-        _rates(log),
-        _thrust_direction(log),
-        _thrust_ratio(log, vehicle),
+        _judge(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"]),
+        _judge(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"]),
+        _judge(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
+        *_thrust(log, vehicle),
+        _columns(log),
         *_motors(log, vehicle),
     ]
 
 
 def _samples(log: FlightLog) -> list[Check]:
-    lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
+    lost, stale, clock = (
+        float(gaps(log).mean()),
+        float(repeats(log).mean()),
+        "the time is in ms or µs: declare its unit",
+    )
     split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones if you ask"
     return [
+        Check("interval between samples", log.dt, "s", LONGEST_INTERVAL, *_at_most(log.dt, LONGEST_INTERVAL, clock)),
         Check("gaps", lost, "share of intervals", 0.01, *_at_most(lost, 0.01, split)),
         Check("repeated samples", stale, "share of samples", 0.01, *_at_most(stale, 0.01, split)),
     ]
@@ -87,101 +103,23 @@ def _at_most(value: float, limit: float, suggestion: str) -> tuple[str, str]:
     return (OK, NOTHING) if value <= limit else (FAILS, suggestion)
 
 
-def _velocity(log: FlightLog) -> Check:
-    p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
-    slope = np.diff(p, axis=0) / np.diff(log.t)[:, None]
-    readings = {
-        NOTHING: v,
-        'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
-        'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(
-            v @ BODIES["FRD"]
-        ),
-        'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
-        "velocity is north-west-down against position: flip the sign of vz": v * [1, 1, -1],
-        "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
-        "velocity is in mm/s or position in km: set the units": v * 1e-3,
-        "velocity is in cm/s: set its unit": v * 1e-2,
-        "position is in mm: set its unit": v * 1e3,
-        "position is in cm: set its unit": v * 1e2,
-    }
-    fits = {name: (slope, _middle(reading)) for name, reading in readings.items()}
-    return _judge(log, "dp/dt against v", fits, KINEMATICS_LIMIT, LEAST_MOTION["velocity"])
-
-
-def _rates(log: FlightLog) -> Check:
-    q, omega = log.x[:, QUATERNION], log.x[:, BODY_RATES]
-    turned, stated = rates_between(log.t, q), _middle(omega)
-    last_first, inverse = np.roll(q, 1, axis=1), q * [1, -1, -1, -1]
-    back = rotation_of(q[:-1]).inv()
-    fits = {
-        NOTHING: (turned, stated),
-        "the quaternion is (x, y, z, w), read as (w, x, y, z): declare xyzw": (
-            rates_between(log.t, last_first),
-            stated,
-        ),
-        "the quaternion is world → body: conjugate it": (rates_between(log.t, inverse), stated),
-        "the quaternion is (x, y, z, w) and world → body: declare xyzw and conjugate it": (
-            rates_between(log.t, last_first * [1, -1, -1, -1]),
-            stated,
-        ),
-        "body rates are in degrees per second: declare deg/s": (turned, stated * np.pi / 180),
-        "body rates are in the world frame: rotate them into the body": (turned, back.apply(stated)),
-        "body rates and attitude differ in body frame: convert the one that is FRD": (turned, stated @ BODIES["FRD"]),
-        "body rates have the opposite sign": (turned, -stated),
-    }
-    return _judge(log, "q̇ against ω", fits, KINEMATICS_LIMIT, LEAST_MOTION["rates"])
-
-
-def _thrust_direction(log: FlightLog) -> Check:
-    """v̇ + g against Σu² along body z, whatever the thrust coefficient."""
-    q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
-    attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
-    ned = quaternion_of(_turned(attitude, WORLDS["NED"], BODIES["FRD"]))
-    readings = {
-        NOTHING: (q, v),
-        'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
-        "attitude alone is NED and FRD: convert it": (ned, v),
-        'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
-        'the body is FRD in a world with z up: set body = "FRD"': (
-            quaternion_of(_turned(attitude, np.eye(3), BODIES["FRD"])),
-            v,
-        ),
-        "the quaternion is (x, y, z, w), read as (w, x, y, z): declare xyzw": (np.roll(q, 1, axis=1), v),
-        "the quaternion is world → body: conjugate it": (q * [1, -1, -1, -1], v),
-        'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
-    }
-    fits = {name: _accelerations(log, q, v, thrust) for name, (q, v) in readings.items()}
-    return _judge(log, "v̇ against thrust along body z", fits, THRUST_LIMIT, LEAST_MOTION["acceleration"])
-
-
-def _turned(attitude: Rotation, world, body) -> Rotation:
-    return Rotation.from_matrix(world @ attitude.as_matrix() @ body.T)
-
-
-def _accelerations(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
-    """v̇ as the velocity has it, and as Σu² along body z less gravity has it, at the best thrust coefficient."""
-    up, slope = _middle(rotation_of(q).apply(UP)), np.diff(v, axis=0) / np.diff(log.t)[:, None]
-    specific, sound = slope + GRAVITY, sound_intervals(log)[:, None]
-    predicted = up * thrust
-    power = (predicted**2 * sound).sum()
-    scale = max(0.0, (predicted * specific * sound).sum() / power) if power > 0 else 0.0
-    return slope, scale * predicted - GRAVITY
-
-
-def _thrust_ratio(log: FlightLog, vehicle: Vehicle) -> Check:
-    """Mean specific force along body z over k Σu² / m."""
-    name, sound = "specific force over thrust per mass", sound_intervals(log)
-    thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[sound]
+def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
+    """How long the vehicle stood, and while it flew the mean specific force along body z over k Σu² / m."""
+    name, resting = "specific force over thrust per mass", at_rest(log)
+    flying = sound_intervals(log) & ~resting[:-1]
+    stood = float(resting.mean())
+    advice = "cut out what is not flight: in_flight(log), or --cleaning.in-flight"
+    ground = Check("time on the ground", stood, "share of samples", 0.01, *_at_most(stood, 0.01, advice))
+    thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
-    along = (specific * _middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[sound]
+    along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
-        return Check(
-            name, float("nan"), "ratio", THRUST_RATIO_LIMIT, UNKNOWN, "the motors stand still: check in flight"
-        )
+        still = "the motors stand still: check in flight"
+        return [ground, Check(name, float("nan"), "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)]
     ratio = float(along.mean() / thrust.mean())
-    if 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT:
-        return Check(name, ratio, "ratio", THRUST_RATIO_LIMIT, OK, NOTHING)
-    return Check(name, ratio, "ratio", THRUST_RATIO_LIMIT, FAILS, _thrust_suggestion(ratio, log, vehicle))
+    fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
+    verdict = (OK, NOTHING) if fits else (FAILS, _thrust_suggestion(ratio, log, vehicle))
+    return [ground, Check(name, ratio, "ratio", THRUST_RATIO_LIMIT, *verdict)]
 
 
 def _thrust_suggestion(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
@@ -193,6 +131,20 @@ def _thrust_suggestion(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
     if log.u.max() < 0.02 * vehicle.hover_speed:
         return "rotor speeds are normalised commands: give the polynomial that maps them to rad/s"
     return f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+
+
+def _columns(log: FlightLog) -> Check:
+    """Motors that are always equal, or a rate that never changes, are a column read twice or not at all."""
+    values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
+    columns: dict[str, np.ndarray] = dict(zip(COLUMNS[-len(values) :], values, strict=True))
+    moving = [name for name, values in columns.items() if (values != values[0]).any()]
+    motors = [name for name in INPUT_NAMES if name in moving]
+    alike = [(a, b) for a, b in combinations(motors, 2) if (columns[a] == columns[b]).all()]
+    kinds = [[name for name in columns if name[0] == kind] for kind in "vwu"]
+    still = [name for kind in kinds if {*kind} & {*moving} for name in kind if name not in moving]
+    said = [f"{a} and {b} are equal in every sample" for a, b in alike] + [f"{name} never changes" for name in still]
+    verdict = (FAILS, f"{'; '.join(said)}: name the columns that were measured") if said else (OK, NOTHING)
+    return Check("columns", float(len(said)), "suspect", 0.0, *verdict)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
@@ -209,17 +161,19 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     order = (OK, NOTHING) if right else (FAILS, f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}")
     return [
         Check("motor order against roll and pitch", min(found.as_is[:2]), "correlation", ORDER_LIMIT, *order),
-        _spin(found.yaw_sign * found.correlations[2]),
+        _spin(found.yaw_sign * found.correlations[2], vehicle),
         _lag(1000 * found.lag, limit),
     ]
 
 
-def _spin(yaw: float) -> Check:
-    if abs(yaw) < 0.1:
-        verdict = UNKNOWN, MORE_FLIGHT
+def _spin(yaw: float, vehicle: Vehicle) -> Check:
+    if sum(vehicle.spin):
+        verdict = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
+    elif yaw < OPPOSED:
+        verdict = FAILS, "flip the sign of every spin of the vehicle"
     else:
-        verdict = (OK, NOTHING) if yaw > 0 else (FAILS, "flip the sign of every spin of the vehicle")
-    return Check("spin against yaw", yaw, "correlation", 0.1, *verdict)
+        verdict = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
+    return Check("spin against yaw", yaw, "correlation", YAW_LIMIT, *verdict)
 
 
 def _lag(lag: float, limit: float) -> Check:
@@ -230,37 +184,52 @@ def _lag(lag: float, limit: float) -> Check:
     return Check("lag of the gyro behind the motors", lag, "ms", limit, *_at_most(abs(lag), limit, advice))
 
 
-def _middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
-    return 0.5 * (values[1:] + values[:-1])
+def _judge(log: FlightLog, name: str, readings: Readings, limit: float, least: float) -> Check:
+    """Compare two records under every reading."""
+    smooth = smoother(log)
+    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in readings.items()}
+    a, b = pairs[NOTHING]
+    if not len(a) or max(_size(a), _size(b)) < least:
+        return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)
+    value = _relative_error(a, b)
+    verdict = (OK, NOTHING) if (advice := _advice(pairs, limit, least)) is None else (FAILS, advice)
+    return Check(name, value, "relative error", limit, *verdict)
 
 
-def _judge(log: FlightLog, name: str, fits: Fits, limit: float, least: float) -> Check:
-    """Compare two records under every reading; the first is the log as it is."""
-    smooth = _smoother(log)
-    errors = {reading: _relative_error(smooth(a), smooth(b), least) for reading, (a, b) in fits.items()}
-    as_is, best = errors[NOTHING], min(errors, key=lambda reading: errors[reading])
-    if not np.isfinite(as_is):
-        return Check(name, as_is, "relative error", limit, UNKNOWN, MORE_FLIGHT)
-    if as_is <= limit and as_is <= max(0.1, 2 * errors[best]):
-        return Check(name, as_is, "relative error", limit, OK, NOTHING)
-    known = errors[best] <= min(limit, 0.7 * as_is)
-    advice = best if known else "no usual mistake explains it: look at sensors, time stamps and columns"
-    return Check(name, as_is, "relative error", limit, FAILS, advice)
+def _advice(pairs: Readings, limit: float, least: float) -> str | None:
+    """What to correct, if anything."""
+    a, b = pairs[NOTHING]
+    left = {reading: a - b for reading, (a, b) in pairs.items()}
+    # Nearer by any margin counts, if the two readings differ by more than noise: a slow axis is a small part of all.
+    nearer = [
+        r for r in left if _size(left[NOTHING] - left[r]) > NOISE * least and _size(left[r]) < _size(left[NOTHING])
+    ]
+    if nearer:
+        best = min(nearer, key=lambda reading: _size(left[reading]))
+        if _relative_error(*pairs[best]) <= limit:
+            return best
+    apart = [axis for axis, ratio in enumerate(_by_axis(a, b, least)) if ratio > AXIS_LIMIT]
+    if _relative_error(a, b) > limit:
+        return UNUSUAL
+    if apart:
+        return f"{' and '.join('xyz'[axis] for axis in apart)} alone: {UNUSUAL}"
+    gain = float((a * b).sum() / (b * b).sum())
+    if not 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
+        return f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
+    return None
 
 
-def _smoother(log: FlightLog) -> Callable[[Vectors], Vectors]:
-    """Means over `SPAN` of sound intervals only."""
-    sound = sound_intervals(log)[:, None].astype(float)
-    width = min(max(1, round(SPAN / log.dt)), len(sound))
-    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
-    return lambda values: moving_mean(values, width)[whole]
+def _by_axis(a: Vectors, b: Vectors, least: float) -> list[float]:
+    """The relative error of each axis; 0 where there is little motion along it."""
+    columns = [(a[:, [axis]], b[:, [axis]]) for axis in range(3)]
+    return [_relative_error(*pair) if max(map(_size, pair)) > CLEAR * least else 0.0 for pair in columns]
 
 
-def _relative_error(a: Vectors, b: Vectors, least: float) -> float:
-    """RMS of a − b over the root of the summed mean squares; NaN where both are below the least motion."""
-    if not len(a):
-        return float("nan")
-    size = (a**2).sum(axis=1).mean(), (b**2).sum(axis=1).mean()
-    if max(size) < least**2:
-        return float("nan")
-    return float(np.sqrt(((a - b) ** 2).sum(axis=1).mean() / sum(size)))
+def _size(values: Float[np.ndarray, "n d"]) -> float:
+    """Root mean square of the vectors' lengths."""
+    return float(np.sqrt((values**2).sum(axis=1).mean()))
+
+
+def _relative_error(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> float:
+    """RMS of a − b over the root of the summed mean squares."""
+    return _size(a - b) / float(np.hypot(_size(a), _size(b)))

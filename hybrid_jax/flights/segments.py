@@ -6,6 +6,8 @@ from jaxtyping import Bool
 from hybrid_jax.flights.log import FlightLog
 
 GAP = 1.5  # intervals longer than this many times the median are gaps
+IDLE = 0.3  # of the thrust in flight: below it a vehicle stands, falls or rolls
+RESTING = 0.5  # s that it does so at least before it is said to stand
 
 
 def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
@@ -28,3 +30,14 @@ def segments(log: FlightLog) -> list[slice]:
     """The longest runs of samples joined by sound intervals, two samples or more each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], sound_intervals(log), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
+    """Whether a sample is of half a second or more with hardly any thrust: on the ground, not in flight."""
+    power = (log.u**2).sum(axis=1)
+    idle = power < IDLE * np.quantile(power, 0.9)
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], idle, [0]])))
+    found = np.zeros(len(log), bool)
+    for start, stop in zip(edges[::2], edges[1::2], strict=True):
+        found[start:stop] = log.t[stop - 1] - log.t[start] >= RESTING
+    return found

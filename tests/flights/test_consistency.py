@@ -1,5 +1,7 @@
 """A sound flight passes every check; each usual mistake is caught by the check for it, which names the correction."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -12,6 +14,7 @@ from hybrid_jax.vehicle import IRIS
 
 VELOCITY, RATES, THRUST = "dp/dt against v", "q̇ against ω", "v̇ against thrust along body z"
 RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
+COLUMNS, UPWARDS = "columns", [1, 1, -1]
 YAW, LAG = "spin against yaw", "lag of the gyro behind the motors"
 
 
@@ -53,7 +56,36 @@ def gyro_in_world(log):
     return with_parts(log, omega=rotation_of(log.x[:, 3:7]).apply(log.x[:, 10:]))
 
 
+def slower(log):
+    """By a clock that counts 20 ms as 10."""
+    return FlightLog(2 * log.t, log.x, log.u)
+
+
+def with_late_velocity(log):
+    return with_parts(log[10:], v=log.x[:-10, 7:10])
+
+
+def downwards(log):
+    return with_parts(log, log.x[:, :3] * UPWARDS, v=log.x[:, 7:10] * UPWARDS)
+
+
 MISTAKES = {
+    "height down": (
+        lambda log: with_parts(log, log.x[:, :3] * UPWARDS, v=log.x[:, 7:10] * UPWARDS),
+        THRUST,
+        "pz and vz",
+    ),
+    "climb down": (lambda log: with_parts(log, v=log.x[:, 7:10] * UPWARDS), VELOCITY, "vz and pz have opposite signs"),
+    "no climb": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), VELOCITY, "z alone"),
+    "wz": (lambda log: with_parts(log, omega=log.x[:, 10:] * UPWARDS), RATES, "wz has the wrong sign"),
+    "qy": (lambda log: with_parts(log, q=log.x[:, 3:7] * [1, 1, -1, 1]), RATES, "qy has the wrong sign"),
+    "wxyz as xyzw": (lambda log: with_parts(log, q=np.roll(log.x[:, 3:7], 1, axis=1)), RATES, "declare wxyz"),
+    "slow clock": (slower, VELOCITY, "0.50 times"),
+    "late velocity": (with_late_velocity, VELOCITY, "0.1 s late"),
+    "ms": (lambda log: FlightLog(1e3 * log.t, log.x, log.u), "interval between samples", "in ms"),
+    "one motor twice": (lambda log: with_parts(log, u=log.u[:, [0, 0, 2, 3]]), COLUMNS, "u0 and u1 are equal"),
+    "dead velocity": (lambda log: with_parts(log, v=log.x[:, 7:10] * [1, 1, 0]), COLUMNS, "vz never changes"),
+    "dead motor": (lambda log: with_parts(log, u=log.u * [1, 0, 1, 1]), COLUMNS, "u1 never changes"),
     "body velocity": (body_velocity, VELOCITY, "body frame (FLU)"),
     "NED velocity": (lambda log: with_parts(log, v=log.x[:, 7:10] @ WORLDS["NED"]), VELOCITY, "velocity is NED"),
     "mm": (lambda log: with_parts(log, p=log.x[:, :3] * 1000), VELOCITY, "position is in mm"),
@@ -95,6 +127,21 @@ def test_reversed_spin_is_told(flight):
     assert (check[YAW].verdict, "flip" in check[YAW].suggestion) == (FAILS, True)
 
 
+@pytest.mark.parametrize("spin", [(1, 1, -1, 1), (1, 1, 1, 1)], ids=str)
+def test_spins_that_do_not_balance_are_told(flight, spin):
+    checks = {check.name: check for check in check_log(flight, replace(IRIS, spin=spin))}
+    assert (checks[YAW].verdict, "two of its rotors" in checks[YAW].suggestion) == (FAILS, True)
+
+
+def test_time_on_the_ground_is_told_and_hides_no_thrust(flight):
+    x = np.tile(flight.x[:1], (600, 1))
+    x[:, 7:] = 0
+    t, u = np.arange(600 + len(flight)) * 0.01, np.concatenate([np.full((600, 4), 5.0), flight.u])
+    check = table(FlightLog(t, np.concatenate([x, flight.x]), u))
+    assert check["time on the ground"].value == pytest.approx(600 / len(t))
+    assert (check["time on the ground"].verdict, check[RATIO].verdict) == (FAILS, OK)
+
+
 def test_the_suggested_shift_repairs_the_lag(flight):
     late = with_parts(flight[:-5], u=flight.u[5:])
     assert table(late)[LAG].value == pytest.approx(50, abs=2)
@@ -127,4 +174,4 @@ def test_a_vehicle_at_rest_tells_nothing(flight):
 
 @pytest.mark.parametrize("samples", [2, 3, 10, 30])
 def test_short_logs_are_checked_without_error(flight, samples):
-    assert len(table(flight[:samples])) == 9
+    assert len(table(flight[:samples])) == 12

@@ -1,0 +1,137 @@
+"""How the numbers of a log may have to be read: each usual mistake undone, one at a time.
+
+A reading is a pair of records that should be equal, such as dp/dt and v, as they are if that mistake was made. The
+first, `NOTHING`, is the log as it stands.
+"""
+
+from collections.abc import Callable
+
+import numpy as np
+from jaxtyping import Float
+from scipy.spatial.transform import Rotation
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.motor_response import moving_mean
+from hybrid_jax.flights.segments import sound_intervals
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+
+NOTHING = "nothing to correct"
+SPAN = 0.05  # s of moving average on both sides of an equation
+LATE = 0.1  # s by which a velocity is tried to be late or early
+UP = np.array([0.0, 0.0, 1.0])
+GRAVITY = 9.81 * UP
+
+Vectors = Float[np.ndarray, "n 3"]
+Readings = dict[str, tuple[Vectors, Vectors]]
+
+
+def velocities(log: FlightLog) -> Readings:
+    """dp/dt and v [m/s]."""
+    p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
+    slope, late = np.diff(p, axis=0) / np.diff(log.t)[:, None], round(LATE / log.dt)
+    stated = {
+        NOTHING: v,
+        'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
+        'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(
+            v @ BODIES["FRD"]
+        ),
+        'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
+        "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
+        "velocity is in mm/s or position in km: set the units": v * 1e-3,
+        "velocity is in cm/s: set its unit": v * 1e-2,
+        "position is in mm: set its unit": v * 1e3,
+        "position is in cm: set its unit": v * 1e2,
+        f"velocity is about {LATE:g} s late: shift it": _shifted(v, late),
+        f"velocity is about {LATE:g} s early: shift it": _shifted(v, -late),
+    }
+    for axis, signs in zip("xyz", _one_axis_flipped(), strict=True):
+        stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
+    return {reading: (slope, middle(values)) for reading, values in stated.items()}
+
+
+def rates(log: FlightLog) -> Readings:
+    """Body rates that turn each attitude into the next, and ω [rad/s]."""
+    q, omega = log.x[:, QUATERNION], middle(log.x[:, BODY_RATES])
+    turned, back = rates_between(log.t, q), rotation_of(q[:-1]).inv()
+    found = {
+        NOTHING: (turned, omega),
+        "body rates are in degrees per second: declare deg/s": (turned, omega * np.pi / 180),
+        "body rates are in the world frame: rotate them into the body": (turned, back.apply(omega)),
+        "body rates and attitude differ in body frame: convert the one that is FRD": (turned, omega @ BODIES["FRD"]),
+        "body rates have the opposite sign": (turned, -omega),
+    }
+    for reading, attitude in _attitudes(q).items():
+        found[reading] = rates_between(log.t, attitude), omega
+    for axis, signs in zip("xyz", _one_axis_flipped(), strict=True):
+        found[f"w{axis} has the wrong sign: flip it"] = turned, omega * signs
+        mirrored = q * [1, *signs]
+        found[f"q{axis} has the wrong sign: flip it"] = rates_between(log.t, mirrored), omega
+    return found
+
+
+def accelerations(log: FlightLog) -> Readings:
+    """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
+    q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
+    attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
+    ned = quaternion_of(_turned(attitude, WORLDS["NED"], BODIES["FRD"]))
+    stated = {
+        NOTHING: (q, v),
+        'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
+        "attitude alone is NED and FRD: convert it": (ned, v),
+        'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
+        "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
+        'the body is FRD in a world with z up: set body = "FRD"': (
+            quaternion_of(_turned(attitude, np.eye(3), BODIES["FRD"])),
+            v,
+        ),
+        'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
+    }
+    # The other readings of attitudes turn thrust about z alone, which wind or a load may do as well.
+    stated |= {reading: (other, v) for reading, other in list(_attitudes(q).items())[:2]}
+    return {reading: _by_thrust(log, q, v, thrust) for reading, (q, v) in stated.items()}
+
+
+def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"]]:
+    last_first, inverse = np.roll(q, 1, axis=1), np.array([1, -1, -1, -1])
+    return {
+        "the quaternion is (x, y, z, w), read as (w, x, y, z): declare xyzw": last_first,
+        "the quaternion is world → body: conjugate it": q * inverse,
+        "the quaternion is (w, x, y, z), declared xyzw: declare wxyz": np.roll(q, -1, axis=1),
+        "the quaternion is (x, y, z, w) and world → body: declare xyzw and conjugate it": last_first * inverse,
+    }
+
+
+def _one_axis_flipped() -> Float[np.ndarray, "3 3"]:
+    return 1 - 2 * np.eye(3)
+
+
+def _shifted(values: Vectors, samples: int) -> Vectors:
+    """What is stated so many samples later; the ends are held."""
+    return values[np.clip(np.arange(len(values)) + samples, 0, len(values) - 1)]
+
+
+def _turned(attitude: Rotation, world, body) -> Rotation:
+    return Rotation.from_matrix(world @ attitude.as_matrix() @ body.T)
+
+
+def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
+    up, slope = middle(rotation_of(q).apply(UP)), np.diff(v, axis=0) / np.diff(log.t)[:, None]
+    specific, sound = slope + GRAVITY, sound_intervals(log)[:, None]
+    predicted = up * thrust
+    power = (predicted**2 * sound).sum()
+    scale = max(0.0, (predicted * specific * sound).sum() / power) if power > 0 else 0.0
+    return slope, scale * predicted - GRAVITY
+
+
+def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
+    """Means of neighbouring samples."""
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def smoother(log: FlightLog) -> Callable[[Vectors], Vectors]:
+    """Means over `SPAN` of sound intervals only."""
+    sound = sound_intervals(log)[:, None].astype(float)
+    width = min(max(1, round(SPAN / log.dt)), len(sound))
+    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
+    return lambda values: moving_mean(values, width)[whole]
