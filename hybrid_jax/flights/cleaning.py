@@ -6,7 +6,7 @@ from scipy import signal
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.motor_response import estimate_time_constant, lagged, respond
-from hybrid_jax.flights.segments import repeats, segments
+from hybrid_jax.flights.segments import GAP, at_rest, repeats, segments
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
@@ -34,10 +34,17 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
             parts.append(_sampled(piece, np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])))
     if not parts:
         raise ValueError(f"{log.name}: no segment without gaps is as long as dt = {dt} s")
+    parts = _kept_apart(parts, dt)
     t, x, u = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "x", "u"))
-    kept = np.concatenate([[True], np.diff(t) > 0.5 * dt])  # two segments may end and start at one time
-    done = f"resampled {len(log)} samples to {kept.sum()} at {dt} s in {len(parts)} segments"
-    return FlightLog(t[kept], x[kept], u[kept], log.name), f"{done}, bridging gaps up to {longest_gap} s"
+    done = f"resampled {len(log)} samples to {len(t)} at {dt} s in {len(parts)} segments"
+    return FlightLog(t, x, u, log.name), f"{done}, bridging gaps up to {longest_gap} s"
+
+
+def _kept_apart(parts: list[FlightLog], dt: float) -> list[FlightLog]:
+    """The segments without the last samples of those that would seem to go on in the next: a gap stays a gap."""
+    ends = [following.t[0] - GAP * dt for following in parts[1:]] + [np.inf]
+    short = [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
+    return short
 
 
 def _joined(log: FlightLog, fresh: FlightLog, longest_gap: float) -> list[slice]:
@@ -51,6 +58,18 @@ def _sampled(piece: FlightLog, t) -> FlightLog:
     x = interpolate(t, piece.t, piece.x)
     x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
     return FlightLog(t, x, mean_of_held(t, piece.t, piece.u), piece.name)
+
+
+def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
+    """The log without samples of half a second and more in which the rotors hardly push: it stands on the ground.
+
+    Raises:
+        ValueError: nothing is left.
+    """
+    flying = ~at_rest(log)
+    if not flying.any():
+        raise ValueError(f"{log.name}: the motors stand still; leave the file out")
+    return log[flying], f"{len(log) - flying.sum()} samples on the ground cut out"
 
 
 def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[FlightLog, str]:
@@ -67,6 +86,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"cutoff must lie between 0 and half the sampling frequency {rate / 2:.6g} Hz, got {cutoff!r}")
     sections = signal.butter(2, cutoff, fs=rate, output="sos")
+    log, all_samples = log[~repeats(log)], len(log)  # a copy of what came before would no longer be known as one
     x, u = log.x.copy(), log.u.copy()
     for part in _even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
@@ -74,7 +94,10 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
         x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
-    return FlightLog(log.t, x, u, log.name), f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
+    done = f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
+    if len(log) < all_samples:
+        done += f"; {all_samples - len(log)} repeated samples left out"
+    return FlightLog(log.t, x, u, log.name), done
 
 
 def _forward(sections, values):

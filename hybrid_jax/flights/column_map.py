@@ -28,7 +28,6 @@ delimiter = ";"               # may be left out: a comma
 """
 
 import math
-import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -39,6 +38,7 @@ from jaxtyping import Float
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
 from hybrid_jax.flights.flight_csv import MOST_ROWS, flight_log, read_table
 from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
+from hybrid_jax.vehicle import read_tables
 
 SCALES = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -83,6 +83,10 @@ class ColumnMap:
             if name not in self.quantities:
                 raise ValueError(f"[{name}]: is missing; give its columns and unit")
             _check(name, self.quantities[name], scales)
+        for name, stated in self.quantities.items():
+            for column in stated.columns:
+                if self.names.count(column) > 1:
+                    raise ValueError(f"[{name}]: column {column!r} is named twice; each has one meaning")
         if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
             raise ValueError(f"[format]: delimiter must be one character, got {self.delimiter!r}")
 
@@ -98,10 +102,7 @@ def load_column_map(path: str | Path) -> ColumnMap:
     Raises:
         ValueError: file, table, key and what was expected, in one line.
     """
-    try:
-        tables = tomllib.loads(Path(path).read_text())
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
-        raise ValueError(f"{path}: not a readable TOML file: {error}") from error
+    tables = read_tables(path)
     try:
         return _column_map(tables)
     except ValueError as error:

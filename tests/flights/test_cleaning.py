@@ -7,6 +7,7 @@ from hybrid_jax.flights.cleaning import (
     align_motors,
     delay_motors,
     follow_motors,
+    in_flight,
     lag_motors,
     low_pass,
     resample,
@@ -82,6 +83,14 @@ def test_resampling_keeps_gaps_unless_asked_to_bridge_them(flight):
     np.testing.assert_allclose(repeated.x[700], 0.5 * (flight.x[699] + flight.x[701]), atol=1e-4)
 
 
+@pytest.mark.parametrize("lost", [slice(401, 402), slice(401, 410)])
+def test_coarser_resampling_hides_no_gap(flight, lost):
+    log, _ = resample(with_gap(flight, lost.start, lost.stop), 0.02)
+    assert gaps(log).sum() == 1
+    before = log.t[: np.flatnonzero(gaps(log))[0] + 1]
+    assert before[-1] <= flight.t[lost.start - 1]
+
+
 def test_coarser_resampling_loses_no_thrust(flight):
     log, _ = resample(flight, 0.04)
     first = int(np.argmin(np.abs(flight.t - log.t[0])))
@@ -123,6 +132,20 @@ def test_filters_do_not_reach_across_gaps(flight):
     a, _ = low_pass(with_gap(flight), 5.0)
     b, _ = low_pass(with_gap(FlightLog(flight.t, other, flight.u)), 5.0)
     np.testing.assert_array_equal(a.x[:400], b.x[:400])
+
+
+def test_a_filter_makes_no_sample_of_a_repeated_one(flight):
+    log, done = low_pass(with_repeat(flight), 20.0)
+    assert [part.stop - part.start for part in segments(log)] == [700, len(flight) - 701]
+    assert "1 repeated samples left out" in done
+
+
+def test_time_on_the_ground_is_cut_and_a_short_fall_is_not(flight, refusal):
+    u = flight.u.copy()
+    u[:80], u[500:530] = 3.0, 3.0  # 0.8 s, and 0.3 s without thrust
+    log, done = in_flight(FlightLog(flight.t, flight.x, u))
+    np.testing.assert_array_equal(log.t, flight.t[80:])
+    assert done == "80 samples on the ground cut out"
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 50.1, -1.0, np.nan])

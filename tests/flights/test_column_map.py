@@ -95,12 +95,14 @@ def test_a_foreign_log_is_the_same_flight(flight, mapped, changes, motors):
         ([('unit = "mm"', "")], ("[position]", "unit is missing")),
         ([('["u", "v", "w"]', '["u", "v"]')], ("[velocity]", "3 names")),
         ([('["u", "v", "w"]', '"uvw"')], ("[velocity]", "lists")),
+        ([('["u", "v", "w"]', '["u", "v", "u"]')], ("[velocity]", "'u' is named twice")),
         ([("[position]", "[place]")], ("[place]", "no such table")),
         ([('unit = "deg/s"', 'unit = "deg/s"\nsign = 1')], ("[body_rates]", "sign", "no such key")),
         ([('"rpm"', '"command"')], ("[motors]", "polynomial")),
         ([('"rpm"', '"rpm"\npolynomial = [1.0]')], ("[motors]", "polynomial")),
         ([('delimiter = ";"', 'delimiter = ";;"')], ("[format]", "delimiter")),
         ([("[format]", "[format")], ("not a readable TOML",)),
+        ([("[format]", "x = " + "[" * 2000 + "\n[format]")], ("not a readable TOML",)),
     ],
 )
 def test_a_wrong_map_is_refused(flight, mapped, refusal, tmp_path, changes, words):
