@@ -86,11 +86,8 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
 
 
 def _samples(log: FlightLog) -> list[Check]:
-    lost, stale, clock = (
-        float(gaps(log).mean()),
-        float(repeats(log).mean()),
-        "the time is in ms or µs: declare its unit",
-    )
+    lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
+    clock = "the time is in ms or µs: declare its unit"
     split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones if you ask"
     return [
         Check("interval between samples", log.dt, "s", LONGEST_INTERVAL, *_at_most(log.dt, LONGEST_INTERVAL, clock)),
