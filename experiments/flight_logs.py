@@ -17,7 +17,7 @@ from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.segments import gaps, repeats, segments
 from hybrid_jax.flights.splits import flight_of
 from hybrid_jax.flights.ulog import read_ulog
-from hybrid_jax.trajectories import Trajectories, concatenate
+from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
 
 SUFFIXES = (".csv", ".csv.gz", ".ulg")
@@ -114,13 +114,54 @@ def cut(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> Windows:
     Raises:
         ValueError: no flight is as long as a window, or samples that are not evenly spaced.
     """
-    long = [log for log in logs if any(part.stop - part.start > steps for part in segments(log))]
+    long = long_enough(logs, steps)
+    parts = [windows(log, steps, stride) for log in long]
+    return Windows(_single(concatenate(parts)), [len(part) for part in parts], stride)
+
+
+def long_enough(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
+    """The flights that have a window of `steps` intervals.
+
+    Raises:
+        ValueError: none has.
+    """
+    long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
         names = ", ".join(flight_of(log) for log in logs)
         raise ValueError(f"no window of {steps} intervals without gaps in {names}; bridge gaps or shorten --horizon")
-    parts = [windows(log, steps, stride) for log in long]
-    both = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
-    return Windows(both, [len(part) for part in parts], stride)
+    return long
+
+
+@dataclass(frozen=True)
+class Stretch:
+    """The longest segment of a flight as windows that touch; `begin` is when it starts [s], from the flight's first
+    sample on.
+    """
+
+    flight: FlightLog
+    begin: float
+    windows: Trajectories
+
+
+def stretch(logs: Sequence[FlightLog], steps: int) -> Stretch:
+    """Of the first flight that has a window of `steps` intervals.
+
+    Raises:
+        ValueError: none has.
+    """
+    flight = long_enough(logs, steps)[0]
+    part = max(segments(flight), key=lambda part: part.stop - part.start)
+    touching = windows_of(flight.x[part], flight.u[part][:-1], flight.dt, steps=steps)
+    return Stretch(flight, float(flight.t[part.start] - flight.t[0]), _single(touching))
+
+
+def _single(windows: Trajectories) -> Trajectories:
+    return jax.tree.map(lambda leaf: leaf.astype(np.float32), windows)
+
+
+def _intervals(log: FlightLog) -> list[int]:
+    """How many there are in each segment."""
+    return [part.stop - part.start - 1 for part in segments(log)]
 
 
 def _files(option: str, folder: Path) -> list[Path]:

@@ -11,7 +11,7 @@ import numpy as np
 from rich.console import Console
 
 import hybrid_jax
-from experiments.flight_logs import Flown, cut
+from experiments.flight_logs import Flown, cut, stretch
 from experiments.flight_models import Craft
 from experiments.flight_protocol import NANODRONE_STEPS, RealFlightConfig
 from experiments.flight_recipes import RECIPES
@@ -235,8 +235,9 @@ def _last(taught: Taught) -> tuple[Cell, AbstractVectorField]:
 
 def _flight(outcome: Outcome):
     config, fold = outcome.config, outcome.found.folds[0]
-    windows = cut(fold.test[:1], config.longest, config.longest).windows[:PIECES]
-    starts = outcome.dt * config.longest * np.arange(len(windows))
+    shown = stretch(fold.test, config.longest)
+    windows = shown.windows[:PIECES]
+    starts = shown.begin + outcome.dt * config.longest * np.arange(len(windows))
     inside = outcome.dt * np.arange(config.longest + 1)
     truth = np.concatenate([windows.x0[:1], *windows.x])
     mode = next(iter(_hybrids(outcome.found)))
@@ -248,8 +249,8 @@ def _flight(outcome: Outcome):
         pieces = [(at + inside, np.vstack([x0, x])) for at, x0, x in zip(starts, windows.x0, states, strict=True)]
         return Restarted(cell_name((model, mode if model != "thrust" else "nominal", 0)), colour_of(model), pieces)
 
-    time = outcome.dt * np.arange(len(truth))
-    title = f"Test flight {flight_of(fold.test[0])}, predicted {outcome.dt * config.longest:.3g} s at a time"
+    time = shown.begin + outcome.dt * np.arange(len(truth))
+    title = f"Test flight {flight_of(shown.flight)}, predicted {outcome.dt * config.longest:.3g} s at a time"
     return predicted_flight(time, truth, [restarted(*each) for each in fields.items()], title)
 
 

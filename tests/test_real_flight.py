@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recorded import CONFIG, DT, LOGS, OTHERS, samples
+from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples
 
 import hybrid_jax
 from experiments.flight_folds import apart, drawn, folds_of, lessons
-from experiments.flight_logs import Windows, cut, fly_in, require_one_rate
+from experiments.flight_logs import Windows, cut, fly_in, require_one_rate, stretch
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
 from experiments.flight_recipes import RECIPES, alike, stage_of
 from experiments.flight_tests import body_of, parameters, scores
@@ -101,6 +101,19 @@ def test_random_draws_are_nested_and_contiguous_ones_are_runs():
 
 def test_windows_apart_share_no_sample():
     np.testing.assert_array_equal(apart(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
+
+
+def test_what_is_shown_of_a_flight_is_one_run_of_its_samples():
+    """The first flight that is long enough, and in it the longest run, whose times have no gap."""
+    short, gap = LOGS[0][:4], LOGS[1][[*range(20), *range(40, SAMPLES)]]
+    shown = stretch([short, gap, LOGS[2]], 10)
+    assert shown.flight.name == LOGS[1].name
+    assert shown.begin == LOGS[1].t[40]
+    states = np.concatenate([shown.windows.x0[:1], *shown.windows.x])
+    np.testing.assert_array_equal(states, LOGS[1].x[40:].astype(np.float32)[: len(states)])
+    assert len(states) == 41
+    with pytest.raises(ValueError, match="no window of 10 intervals without gaps in chirp_run1"):
+        stretch([short], 10)
 
 
 def test_kinematics_move_and_turn_at_constant_rates():
