@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from experiments.flight_protocol import Cleaning, RealFlightConfig
+from hybrid_jax.archive import digest
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, lag_motors, low_pass, resample, windows
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, check_log
@@ -30,7 +31,8 @@ class Flown:
     Attributes:
         label: what they are for: "source", "target" or "test".
         logs: cleaned.
-        records: of each flight, as JSON values: its samples, its gaps, the checks on it as it was read, what was done.
+        records: of each flight, as JSON values: its samples, their SHA-256, its gaps, the checks on it as it was read,
+            what was done.
     """
 
     label: str
@@ -75,6 +77,24 @@ def require_one_rate(flown: Sequence[Flown]) -> float:
                 f"give all the same with --cleaning.resample {max(log.dt, logs[0].dt):g}"
             )
     return logs[0].dt
+
+
+def require_distinct(flown: Sequence[Flown], config: RealFlightConfig) -> None:
+    """Refuse a flight that is there twice, whatever its files are called: it would teach, or stop, and judge.
+
+    Source and test may have flights in common where each is tested by models of other manoeuvres.
+
+    Raises:
+        ValueError: both files, and what to do.
+    """
+    shared = config.target is None and config.folds_by == "manoeuvre"
+    first: dict[tuple[str, str], str] = {}
+    for each in flown:
+        for log, record in zip(each.logs, each.records, strict=True):
+            key, file = (each.label if shared else "", record["sha256"]), f"--{each.label} {log.name}"
+            if key in first:
+                raise ValueError(f"{file}: the same flight as {first[key]}; leave one of the two out")
+            first[key] = file
 
 
 def cleaned(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightLog, list[str]]:
@@ -189,6 +209,7 @@ def _record(raw: FlightLog, log: FlightLog, vehicle: Vehicle, done: list[str]) -
     checks = [asdict(check) for check in check_log(raw, vehicle)]
     return {
         "flight": flight_of(raw),
+        "sha256": digest(None, {"t": raw.t, "x": raw.x, "u": raw.u}),
         "samples": len(raw),
         "seconds": round(float(raw.t[-1] - raw.t[0]), 3),
         "dt": raw.dt,

@@ -12,7 +12,7 @@ from rich.console import Console
 
 from experiments import command
 from experiments.flight_folds import Fold, hold_out_validation, thinned
-from experiments.flight_logs import Flown, cut, fly_in, require_one_rate
+from experiments.flight_logs import Flown, cut, fly_in, require_distinct, require_one_rate
 from experiments.flight_models import Craft
 from experiments.flight_outcome import Outcome, write_outcome
 from experiments.flight_protocol import LEARN, PRESETS, RealFlightConfig
@@ -62,6 +62,7 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
         for name, folder in folders.items()
         for craft in [before if name == "source" else after]
     }
+    require_distinct(list(flown.values()), config)
     dt = require_one_rate(list(flown.values()))
     if LAG in _description(vehicle).learn:
         flown = following_rotors(flown, before, config, console)

@@ -12,7 +12,7 @@ from smoke import command, experiments, refused
 import hybrid_jax
 from experiments import real_flight
 from experiments.flight_folds import folds_of
-from experiments.flight_logs import cut, fly_in, require_one_rate
+from experiments.flight_logs import cut, fly_in, require_distinct, require_one_rate
 from experiments.simulated_logs import vehicle_toml
 from hybrid_jax.flight_rows import QUANTITIES
 from hybrid_jax.vehicle import IRIS
@@ -35,6 +35,22 @@ def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
     found = fly_in("source", write(tmp_path, [LOGS[0], *slow]), IRIS, 0.0, CONFIG)
     with pytest.raises(ValueError, match=r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"):
         require_one_rate([found])
+
+
+def test_a_flight_is_there_once_whatever_it_is_called(tmp_path):
+    same = replace(LOGS[0], name="/logs/chirp_run9.csv")
+    source = fly_in("source", write(tmp_path / "source", LOGS[:2]), IRIS, 0.0, CONFIG)
+    twice = fly_in("source", write(tmp_path / "twice", [LOGS[0], same]), IRIS, 0.0, CONFIG)
+    test = fly_in("test", write(tmp_path / "test", [same]), IRIS, 0.0, CONFIG)
+    turns = replace(CONFIG, folds_by="manoeuvre")
+    require_distinct([source], CONFIG)
+    require_distinct([source, test], turns)
+    both = r"--test .*test/chirp_run9.csv.gz: the same flight as --source .*source/chirp_run1.csv.gz; leave one"
+    for config in (CONFIG, replace(turns, target=tmp_path)):
+        with pytest.raises(ValueError, match=both):
+            require_distinct([source, test], config)
+    with pytest.raises(ValueError, match=r"--source .*chirp_run9.*the same flight as --source .*chirp_run1"):
+        require_distinct([twice], turns)
 
 
 @pytest.mark.parametrize(
