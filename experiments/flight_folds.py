@@ -6,8 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Int
 
-from experiments.flight_logs import Windows, cut
+from experiments.flight_logs import Windows, count_windows, cut, long_enough
 from experiments.flight_protocol import RealFlightConfig
+from experiments.flight_recipes import RECIPES
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.splits import contiguous, flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.trajectories import Trajectories
@@ -91,6 +92,32 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
     return hold_out(logs, list(dealt[:count]), of)
 
 
+def require_windows(folds: Sequence[Fold], school: Fold | None, config: RealFlightConfig) -> None:
+    """Refuse flights that are too short for what is asked of them; to be asked before anything is trained.
+
+    Args:
+        school: the source's flights, where the folds' own are those to adapt to.
+
+    Raises:
+        ValueError: which flights have no window, or that a fold's have fewer than --n.
+    """
+    longest = max(RECIPES[name].window for name in config.recipes)
+    for fold in (*([school] if school else []), *folds):
+        long_enough(fold.train, longest)
+        long_enough(fold.validation, longest)
+    for fold in folds:
+        long_enough(fold.test, config.longest)
+        if len(config.recipes) > 1:
+            long_enough(fold.validation, config.longest)
+        if school:
+            _require_size(max(config.n), count_windows(fold.train, longest))
+
+
+def _require_size(size: int, count: int) -> None:
+    if size > count:
+        raise ValueError(f"--n {size}: the training flights have only {count} windows; give a smaller --n")
+
+
 def lessons(fold: Fold, steps: int, stride: int, count: int) -> Lessons:
     """Windows of `steps` intervals: of the training flights every `stride` samples, `count` of the validation ones."""
     return Lessons(cut(fold.train, steps, stride), thinned(cut(fold.validation, steps).windows, count))
@@ -115,8 +142,7 @@ def drawn(sizes: Sequence[int], size: int, draw: str, seed: int) -> Int[np.ndarr
     Raises:
         ValueError: there are not as many.
     """
-    if size > sum(sizes):
-        raise ValueError(f"--n {size}: the training flights have only {sum(sizes)} windows; give a smaller --n")
+    _require_size(size, sum(sizes))
     if draw == "random":
         return np.random.default_rng(seed).permutation(sum(sizes))[:size]
     starts, left = np.cumsum([0, *sizes]), list(sizes)

@@ -152,6 +152,11 @@ def long_enough(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
     return long
 
 
+def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
+    """How many windows `cut` finds, one at every sample."""
+    return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
+
+
 @dataclass(frozen=True)
 class Stretch:
     """The longest segment of a flight as windows that touch; `begin` is when it starts [s], from the flight's first

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 
-from experiments.flight_folds import Fold, folds_of, hold_out_validation
+from experiments.flight_folds import Fold, folds_of, hold_out_validation, require_windows
 from experiments.flight_logs import Flown, cut
 from experiments.flight_models import Craft
 from experiments.flight_protocol import RealFlightConfig
@@ -68,9 +68,11 @@ def study(before: Craft, after: Craft, flown: Mapping[str, Flown], config: RealF
     course = Course(before, after, config, stages_of(config, console))
     tested = flown["test"].logs if "test" in flown else None
     folds = folds_of(flown.get("target", flown["source"]).logs, tested, config)
+    school = Fold("source", *hold_out_validation(flown["source"].logs, config), []) if "target" in flown else None
+    require_windows(folds, school, config)
     found = Study([], folds, {}, {}, course.stages)
-    if "target" in flown:
-        _adapt(course, Fold("source", *hold_out_validation(flown["source"].logs, config), []), found)
+    if school:
+        _adapt(course, school, found)
     else:
         _train(course, found)
     return found

@@ -11,13 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples
+from rich.console import Console
 
 import hybrid_jax
 from experiments.flight_folds import apart, drawn, folds_of, lessons
-from experiments.flight_logs import Windows, cut, fly_in, require_one_rate, stretch
+from experiments.flight_logs import Flown, Windows, count_windows, cut, fly_in, require_one_rate, stretch
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
 from experiments.flight_recipes import RECIPES, alike, stage_of
+from experiments.flight_study import study
 from experiments.flight_tests import body_of, parameters, scores
+from experiments.flight_training import Course
 from hybrid_jax.channels import ChannelPrediction, channels_from
 from hybrid_jax.flight_claims import flight_claims
 from hybrid_jax.flight_rows import QUANTITIES, FlightRow, pooled
@@ -65,6 +68,33 @@ def test_a_manoeuvre_that_judges_is_in_no_flight_that_teaches():
     for fold in folds_of(LOGS, OTHERS[:3], replace(CONFIG, folds_by="manoeuvre")):
         taught = {log.name.split("_run")[0].split("/")[-1] for log in (*fold.train, *fold.validation)}
         assert not taught & set(fold.name.split(", "))
+
+
+def test_windows_are_counted_as_they_are_cut():
+    gap = LOGS[1][[*range(20), *range(40, SAMPLES)]]
+    assert count_windows([LOGS[0], gap], 25) == len(cut([LOGS[0], gap], 25)) == 65 + 25
+
+
+SHORT = [log[:30] for log in LOGS]
+
+
+@pytest.mark.parametrize(
+    ("options", "flights", "said"),
+    [
+        ({"n": (100, 400)}, {"source": LOGS, "target": LOGS}, "--n 400: the training flights have only 325 windows"),
+        ({"horizon": (40,)}, {"source": LOGS, "target": [*LOGS[:3], *SHORT[3:]]}, "no window of 40 intervals"),
+        ({}, {"source": LOGS, "test": [log[:5] for log in OTHERS]}, "no window of 5 intervals"),
+        ({"recipes": ("frozen_rates",)}, {"source": SHORT, "target": LOGS}, "no window of 50 intervals"),
+        ({"recipes": ("frozen_rates",)}, {"source": LOGS, "target": SHORT}, "no window of 50 intervals"),
+        ({"horizon": (40,)}, {"source": SHORT, "test": LOGS}, "no window of 40 intervals"),
+    ],
+)
+def test_flights_too_short_are_refused_before_anything_is_trained(options, flights, said, monkeypatch, tmp_path):
+    monkeypatch.setattr(Course, "lesson", lambda *_: pytest.fail("training has begun"))
+    config = replace(CONFIG, cache=tmp_path, target=tmp_path if "target" in flights else None, **options)
+    flown = {name: Flown(name, logs, []) for name, logs in flights.items()}
+    with pytest.raises(ValueError, match=said):
+        study(CRAFT, CRAFT, flown, config, Console(quiet=True))
 
 
 def test_weights_of_channels_come_from_training_windows_alone():
