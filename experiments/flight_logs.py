@@ -16,12 +16,10 @@ from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.segments import gaps, repeats, segments
-from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
-
-SUFFIXES = (".csv", ".csv.gz", ".ulg")
 
 
 @dataclass(frozen=True)

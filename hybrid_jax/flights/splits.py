@@ -14,16 +14,22 @@ from jaxtyping import Int
 from hybrid_jax.flights.log import FlightLog
 
 Split = tuple[list[FlightLog], list[FlightLog]]  # to learn from, and held out
-_RUN = re.compile(r"[_\- ]*(run|flight|take|log)?[_\- ]*\d+$", re.IGNORECASE)
+SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of files that are flights
+_RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
 
 def flight_of(log: FlightLog) -> str:
-    """The name of a flight's file, without folder and ending."""
-    return Path(log.name).name.split(".")[0]
+    """The name of a flight's file, without folder and `SUFFIXES`."""
+    name = Path(log.name).name
+    suffix = next((each for each in SUFFIXES if name.lower().endswith(each)), "")
+    return name[: len(name) - len(suffix)]
 
 
 def manoeuvre_of(log: FlightLog) -> str:
-    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are a "chirp"."""
+    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are a "chirp".
+
+    A number is that of a run only behind a separator, or behind "run", "flight", "take" or "log": a "figure8" is none.
+    """
     return _RUN.sub("", flight_of(log)) or flight_of(log)
 
 
