@@ -57,6 +57,9 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
         vehicle, folders = config.vehicle, {name: path for name, path in named.items() if path is not None}
     assert vehicle is not None
     before, after = crafts(vehicle, config)
+    lag_is_learned = LAG in _description(vehicle).learn
+    if lag_is_learned:
+        require_untested_source(folders, config)
     flown = {
         name: fly_in(name, folder, craft.vehicle, craft.terms.motor_time_constant, config)
         for name, folder in folders.items()
@@ -64,7 +67,7 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
     }
     require_distinct(list(flown.values()), config)
     dt = require_one_rate(list(flown.values()))
-    if LAG in _description(vehicle).learn:
+    if lag_is_learned:
         flown = following_rotors(flown, before, config, console)
     say_checks(flown, console)
     found = study(before, after, flown, config, console)
@@ -88,6 +91,19 @@ def _description(path: Path) -> VehicleDescription:
     """What the file says, and what is learned where it does not say."""
     found = load_description(path)
     return found if "learn" in read_tables(path) else replace(found, learn=LEARN)
+
+
+def require_untested_source(folders: Mapping[str, Path], config: RealFlightConfig) -> None:
+    """Refuse to choose the rotors' time constant on flights, or manoeuvres, that models are tested on.
+
+    Raises:
+        ValueError: what to do instead.
+    """
+    if "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
+        raise ValueError(
+            f"learn: {LAG} is chosen on flights of --source, and without --target these take turns in being tested; "
+            f"give --target, or state {LAG} under [terms]"
+        )
 
 
 def say_checks(flown: Mapping[str, Flown], console: Console) -> None:

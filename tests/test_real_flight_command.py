@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
+from rich.console import Console
 from smoke import command, experiments, refused
 
 import hybrid_jax
@@ -16,6 +17,7 @@ from experiments.flight_logs import cut, fly_in, require_distinct, require_one_r
 from experiments.simulated_logs import vehicle_toml
 from hybrid_jax.flight_rows import QUANTITIES
 from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle_description import LAG
 
 
 def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
@@ -75,6 +77,22 @@ def test_too_few_flights_are_refused():
         folds_of(LOGS[:1], OTHERS, CONFIG)
     with pytest.raises(ValueError, match="no window of 200 intervals"):
         cut(LOGS, 200)
+
+
+def with_lag(folder):
+    """A vehicle file with rotors whose lag is stated, and is to be learned."""
+    path = folder / "vehicle.toml"
+    path.write_text(f'learn = ["Ix", "{LAG}"]\n{vehicle_toml(IRIS)}[terms]\n{LAG} = 0.03\n')
+    return path
+
+
+@pytest.mark.parametrize(
+    "options", [{}, {"test": Path("test"), "folds_by": "manoeuvre"}, {"folds_by": "manoeuvre"}], ids=str
+)
+def test_the_lag_is_not_chosen_on_what_is_tested(options, tmp_path):
+    config = replace(CONFIG, vehicle=with_lag(tmp_path), source=tmp_path, **options)
+    with pytest.raises(ValueError, match=f"learn: {LAG} is chosen on flights of --source.*give --target"):
+        real_flight.experiment(config, Console(quiet=True))
 
 
 def test_without_flights_it_says_how_to_get_some(capsys):
