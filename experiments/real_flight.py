@@ -61,7 +61,7 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
     if lag_is_learned:
         require_untested_source(folders, config)
     flown = {
-        name: fly_in(name, folder, craft.vehicle, craft.terms.motor_time_constant, config)
+        name: fly_in(name, folder, craft.vehicle, 0.0 if lag_is_learned else craft.terms.motor_time_constant, config)
         for name, folder in folders.items()
         for craft in [before if name == "source" else after]
     }

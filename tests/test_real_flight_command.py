@@ -95,6 +95,22 @@ def test_the_lag_is_not_chosen_on_what_is_tested(options, tmp_path):
         real_flight.experiment(config, Console(quiet=True))
 
 
+@pytest.mark.parametrize("learned", [True, False])
+def test_rotors_lag_once(learned, tmp_path, monkeypatch):
+    """A lag that is stated is a guess where it is to be learned."""
+    found = []
+    monkeypatch.setattr(real_flight, "following_rotors", lambda flown, *_: flown)
+    monkeypatch.setattr(real_flight, "study", lambda before, after, flown, *_: found.append(flown))
+    monkeypatch.setattr(real_flight, "write_outcome", lambda *_: None)
+    vehicle = with_lag(tmp_path)
+    if not learned:
+        vehicle.write_text(vehicle.read_text().replace(f', "{LAG}"', ""))
+    folders = {"source": write(tmp_path / "source", LOGS[:1]), "target": write(tmp_path / "target", OTHERS[:1])}
+    real_flight.experiment(replace(CONFIG, vehicle=vehicle, **folders), Console(quiet=True))
+    done = [record["done"] for flown in found[0].values() for record in flown.records]
+    assert done == 2 * [[] if learned else ["rotors follow the log's motors with a time constant of 30.0 ms"]]
+
+
 def test_without_flights_it_says_how_to_get_some(capsys):
     with pytest.raises(SystemExit) as stop:
         real_flight.main([])
