@@ -37,7 +37,9 @@ def test_all_that_is_written_is_the_model(model, tmp_path, capsys):
     ("options", "said"),
     [
         (["--state-size", "12"], "field: Hybrid does not take"),
-        (["--dt", "-1"], "dt must be a positive"),
+        (["--dt", "-0.01"], "--dt must be a positive number of seconds, got -0.01"),
+        (["--dt", "0"], "--dt must be a positive number of seconds, got 0"),
+        (["--dt", "nan"], "--dt must be a positive number of seconds, got nan"),
     ],
     ids=str,
 )
@@ -48,6 +50,7 @@ def test_bad_input_ends_in_one_line(options, said, model, tmp_path, capsys):
     assert told.startswith("export: ")
     assert said in told
     assert told.count("\n") == 1
+    assert not list(tmp_path.glob("out/*"))  # nothing is written half
 
 
 def test_a_model_that_does_not_say_its_step_needs_one(tmp_path, capsys):
