@@ -1,6 +1,6 @@
 """Folders of logs: read, checked against the vehicle, cleaned as asked for, and what of this a report must say."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -96,21 +96,30 @@ def require_distinct(flown: Sequence[Flown], config: RealFlightConfig) -> None:
 
 
 def cleaned(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightLog, list[str]]:
-    """The log after each change that was asked for, and a line for each."""
+    """The log after each change that was asked for, and a line for each.
+
+    Raises:
+        ValueError: the flight, the option and why it cannot be done, in one line.
+    """
     done: list[str] = []
 
-    def apply(changed: tuple[FlightLog, str]) -> FlightLog:
-        done.append(changed[1])
-        return changed[0]
+    def apply(option: str, change: Callable[..., tuple[FlightLog, str]], *values: Any) -> FlightLog:
+        try:
+            changed, said = change(log, *values)
+        except ValueError as error:
+            why = str(error).removeprefix(f"{log.name}: ")
+            raise ValueError(f"{log.name}: --cleaning.{option}: {why}") from error
+        done.append(said)
+        return changed
 
     if cleaning.resample is not None:
-        log = apply(resample(log, cleaning.resample, cleaning.longest_gap))
+        log = apply("resample", resample, cleaning.resample, cleaning.longest_gap)
     if cleaning.low_pass is not None:
-        log = apply(low_pass(log, cleaning.low_pass))
+        log = apply("low-pass", low_pass, cleaning.low_pass)
     if cleaning.align:
-        log = apply(align_motors(log, vehicle))
+        log = apply("align", align_motors, vehicle)
     if cleaning.delay:
-        log = apply(delay_motors(log, cleaning.delay))
+        log = apply("delay", delay_motors, cleaning.delay)
     return log, done
 
 

@@ -7,6 +7,7 @@ from typing import Any, Literal
 
 from experiments.flight_recipes import RECIPES, Model, RecipeName
 from experiments.protocol import Run, distinct
+from hybrid_jax import checks
 from hybrid_jax.multirotor_terms import check_names
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
@@ -36,10 +37,11 @@ class Cleaning:
             raise ValueError("--cleaning.align finds the delay itself: leave --cleaning.delay out")
         if self.longest_gap and self.resample is None:
             raise ValueError("--cleaning.longest-gap needs --cleaning.resample")
-        for name in ("resample", "longest_gap", "low_pass", "delay"):
-            value = getattr(self, name)
-            if value is not None and not math.isfinite(value):
-                raise ValueError(f"--cleaning.{name.replace('_', '-')} must be a finite number, got {value}")
+        checks.not_negative("--cleaning.longest-gap", self.longest_gap)
+        checks.number("--cleaning.delay", self.delay)
+        for name in ("resample", "low_pass"):
+            if getattr(self, name) is not None:
+                checks.positive(f"--cleaning.{name.replace('_', '-')}", getattr(self, name))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,8 @@ from smoke import command, experiments, refused
 import hybrid_jax
 from experiments import real_flight
 from experiments.flight_folds import folds_of
-from experiments.flight_logs import cut, fly_in, require_distinct, require_one_rate
+from experiments.flight_logs import cleaned, cut, fly_in, require_distinct, require_one_rate
+from experiments.flight_protocol import Cleaning
 from experiments.simulated_logs import vehicle_toml
 from hybrid_jax.flight_rows import QUANTITIES
 from hybrid_jax.vehicle import IRIS
@@ -30,6 +31,33 @@ def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
         assert record["samples"] == SAMPLES
         assert len(record["checks"]) == 9
     assert require_one_rate([found]) == 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"low_pass": 60.0}, r"low-pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
+        ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
+        ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
+    ],
+)
+def test_what_cannot_be_done_to_a_log_is_refused_with_its_name_and_the_option(options, said):
+    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: --cleaning.{said}"):
+        cleaned(LOGS[0], Cleaning(**options), IRIS)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("resample", 0.0, "positive"),
+        ("low_pass", -1.0, "positive"),
+        ("longest_gap", -0.1, "finite number of at least 0"),
+        ("delay", np.nan, "finite"),
+    ],
+)
+def test_changes_that_cannot_be_are_refused_before_any_log_is_read(option, value, expected):
+    with pytest.raises(ValueError, match=f"^--cleaning.{option.replace('_', '-')} must be a {expected}.*{value}$"):
+        Cleaning(**{"resample": 0.01, option: value})
 
 
 def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
