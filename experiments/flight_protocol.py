@@ -8,7 +8,7 @@ from typing import Any, Literal
 from experiments.flight_recipes import RECIPES, Model, RecipeName
 from experiments.protocol import Run, distinct
 from hybrid_jax import checks
-from hybrid_jax.multirotor_terms import check_names
+from hybrid_jax.vehicle_description import check_learned
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_gain")
@@ -98,7 +98,8 @@ class RealFlightConfig(Run):
     models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
     """hybrid: physics and network. no_physics: network with p' = v and the attitude's kinematics. physics_only."""
     learn: tuple[str, ...] | None = None
-    """Names of what physics may learn; by default the vehicle file's `learn`, or else what real multirotors need."""
+    """Names of what physics may learn, and motor_time_constant for the rotors' lag; by default the vehicle file's
+    `learn`, or else what real multirotors need."""
     hidden: int = 32
     """Hidden units of the network."""
     stride: int = 5
@@ -128,7 +129,7 @@ class RealFlightConfig(Run):
         if not 0 < self.epochs < math.inf:
             raise ValueError(f"--epochs must be a positive number, got {self.epochs}")
         if self.learn is not None:
-            check_names(self.learn)
+            check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in (*FOLDERS, *FILES)):
             raise ValueError("--simulated makes its own logs: leave --vehicle, --source, --target and --test out")
 

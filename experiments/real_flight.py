@@ -5,7 +5,6 @@ python -m experiments.real_flight --help
 
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from pathlib import Path
 
 from rich.console import Console
@@ -27,7 +26,7 @@ from hybrid_jax.flights.rotor_lag import choose_time_constant
 from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.multirotor import multirotor
 from hybrid_jax.vehicle import read_tables
-from hybrid_jax.vehicle_description import LAG, VehicleDescription, load_description
+from hybrid_jax.vehicle_description import LAG, load_description, of_field
 
 NAME = "real_flight"
 ABOUT = "How well can a model of your own vehicle predict flights that it has not seen?"
@@ -44,6 +43,7 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
 
   Flights of others: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
   idsia-robotics/nanodrone-sysid-benchmark on GitHub; both need a column map, and their licences are theirs."""
+LISTS = ("--horizon", "--n", "--polynomial", "--learn", "--recipes", "--models")  # options that take several values
 FITTED = 300  # windows that physics is fitted to for each time constant that is tried
 
 
@@ -57,7 +57,7 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
         vehicle, folders = config.vehicle, {name: path for name, path in named.items() if path is not None}
     assert vehicle is not None
     before, after = crafts(vehicle, config)
-    lag_is_learned = LAG in _description(vehicle).learn
+    lag_is_learned = LAG in learned(vehicle, config)
     if lag_is_learned:
         require_untested_source(folders, config)
     flown = {
@@ -82,15 +82,20 @@ def crafts(path: Path, config: RealFlightConfig) -> tuple[Craft, Craft]:
         ValueError: the file, the key and what was expected, in one line.
     """
     found = [load_description(path), load_description(path, config.target_variant)]
-    learn = config.learn or tuple(name for name in _description(path).learn if name != LAG)
-    before, after = (Craft(each.vehicle, each.terms, learn) for each in found)
+    learn = learned(path, config)
+    before, after = (Craft(each.vehicle, each.terms, of_field(learn)) for each in found)
     return before, after
 
 
-def _description(path: Path) -> VehicleDescription:
-    """What the file says, and what is learned where it does not say."""
-    found = load_description(path)
-    return found if "learn" in read_tables(path) else replace(found, learn=LEARN)
+def learned(path: Path, config: RealFlightConfig) -> tuple[str, ...]:
+    """Names of what is to be learned: as asked for, or as the vehicle file says, or what real multirotors need.
+
+    Raises:
+        ValueError: as `load_description`.
+    """
+    if config.learn:
+        return config.learn
+    return load_description(path).learn if "learn" in read_tables(path) else LEARN
 
 
 def require_untested_source(folders: Mapping[str, Path], config: RealFlightConfig) -> None:
@@ -156,15 +161,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def spaced(arguments: Sequence[str]) -> list[str]:
-    """Numbers that are joined by commas, such as 10,50, as the separate words that options take."""
+    """What is joined by commas behind an option that takes several values, such as 10,50, as separate words."""
     words: list[str] = []
+    option = ""
     for word in arguments:
-        option, equals, value = word.partition("=") if word.startswith("--") else ("", "", word)
-        numbers = value.split(",")
-        if len(numbers) > 1 and all(number.isdecimal() for number in numbers):
-            words += [*([option] if equals else []), *numbers]
-        else:
+        named = word.startswith("--")
+        option, _, value = word.partition("=") if named else (option, "", word)
+        if option not in LISTS or word == option:
             words.append(word)
+        else:
+            words += [*([option] if named else []), *value.split(",")]
     return words
 
 

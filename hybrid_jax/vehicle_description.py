@@ -44,13 +44,7 @@ class VehicleDescription:
     learn: tuple[str, ...] = LEARNED
 
     def __post_init__(self):
-        if not isinstance(self.learn, tuple) or not all(isinstance(name, str) for name in self.learn):
-            raise ValueError(f"learn must be a list of names, got {checks.shown(self.learn)}")
-        if self.learn.count(LAG) > 1 or not set(self.learn) <= {*SHAPES, LAG}:
-            raise ValueError(
-                f"learn must be names of {', '.join([*SHAPES, LAG])}, each once, got {', '.join(self.learn)}"
-            )
-        check_names(self._of_field())
+        check_learned(self.learn)
 
     @property
     def learns_motor_lag(self) -> bool:
@@ -59,10 +53,25 @@ class VehicleDescription:
 
     def physics(self) -> Multirotor:
         """The field at its nominal values."""
-        return multirotor(self.vehicle, self._of_field(), self.terms)
+        return multirotor(self.vehicle, of_field(self.learn), self.terms)
 
-    def _of_field(self) -> tuple[str, ...]:
-        return tuple(name for name in self.learn if name != LAG)
+
+def check_learned(learn: tuple[str, ...]) -> None:
+    """Refuse names of nothing that a field or, of the rotors' lag, the logs can teach.
+
+    Raises:
+        ValueError: what is there to be named, or which names do not go together.
+    """
+    if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
+        raise ValueError(f"learn must be a list of names, got {checks.shown(learn)}")
+    if learn.count(LAG) > 1 or not set(learn) <= {*SHAPES, LAG}:
+        raise ValueError(f"learn must be names of {', '.join([*SHAPES, LAG])}, each once, got {', '.join(learn)}")
+    check_names(of_field(learn))
+
+
+def of_field(learn: tuple[str, ...]) -> tuple[str, ...]:
+    """Those names that a field learns: all but the rotors' lag."""
+    return tuple(name for name in learn if name != LAG)
 
 
 def load_description(path: str | Path, variant: str | None = None) -> VehicleDescription:

@@ -1,7 +1,7 @@
 """From folders of logs, sound but for one thing, to a report: what is read, what is refused, what is left behind."""
 
 import json
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -12,9 +12,10 @@ from smoke import command, experiments, refused
 
 import hybrid_jax
 from experiments import real_flight
+from experiments.command import read
 from experiments.flight_folds import folds_of
 from experiments.flight_logs import cleaned, cut, fly_in, require_distinct, require_one_rate
-from experiments.flight_protocol import Cleaning
+from experiments.flight_protocol import PRESETS, Cleaning, RealFlightConfig
 from experiments.simulated_logs import vehicle_toml
 from hybrid_jax.flight_rows import QUANTITIES
 from hybrid_jax.vehicle import IRIS
@@ -146,10 +147,29 @@ def test_without_flights_it_says_how_to_get_some(capsys):
     assert "--simulated" in capsys.readouterr().err
 
 
-def test_numbers_may_be_joined_by_commas():
-    given = ["--n", "100,300", "--horizon=10,50", "--source", "a,b", "--epochs", "0.5"]
-    expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "a,b", "--epochs", "0.5"]
+def test_values_may_be_joined_by_commas():
+    given = ["--n", "100,300", "--horizon=10,50", "--source", "1,2", "--test=3,4", "--learn", "Ix,Iy", "k", "--refit"]
+    given += ["--polynomial", "-150.5,9e2", "--models=hybrid", "--recipes", "staged,turning", "--epochs", "0.5"]
+    expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "1,2", "--test=3,4"]
+    expected += ["--learn", "Ix", "Iy", "k", "--refit", "--polynomial", "-150.5", "9e2", "--models", "hybrid"]
+    expected += ["--recipes", "staged", "turning", "--epochs", "0.5"]
     assert real_flight.spaced(given) == expected
+    config = read("real_flight", "", expected, PRESETS)
+    assert (config.polynomial, config.learn, config.test) == ((-150.5, 900.0), ("Ix", "Iy", "k"), Path("3,4"))
+    several = {f"--{each.name}" for each in fields(RealFlightConfig) if "tuple" in str(each.type)}
+    assert several == set(real_flight.LISTS)
+
+
+def test_the_lag_is_learned_where_an_option_says_so(tmp_path):
+    """As if it stood in the vehicle file, which the option stands in for."""
+    vehicle = tmp_path / "vehicle.toml"
+    vehicle.write_text(vehicle_toml(IRIS))
+    config = replace(CONFIG, vehicle=vehicle, source=tmp_path, learn=("Ix", LAG))
+    assert real_flight.learned(vehicle, config) == ("Ix", LAG)
+    assert [craft.learn for craft in real_flight.crafts(vehicle, config)] == [("Ix",)] * 2
+    assert LAG not in real_flight.learned(with_lag(tmp_path), replace(config, learn=("Ix",)))
+    with pytest.raises(ValueError, match="each once"):
+        replace(config, learn=(LAG, LAG))
 
 
 def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
