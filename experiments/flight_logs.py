@@ -199,7 +199,8 @@ def _intervals(log: FlightLog) -> list[int]:
 def _files(option: str, folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise ValueError(f"--{option} {folder}: no such folder")
-    files = sorted(path for path in folder.iterdir() if path.name.lower().endswith(SUFFIXES))
+    seen = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    files = sorted(path for path in seen if path.name.lower().endswith(SUFFIXES))
     if not files:
         raise ValueError(f"--{option} {folder}: holds no flights ({', '.join(SUFFIXES)})")
     return files

@@ -68,6 +68,13 @@ def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
         require_one_rate([found])
 
 
+def test_hidden_files_and_folders_are_no_flights(tmp_path):
+    source = write(tmp_path, LOGS[:1])
+    (source / "._chirp_run1.csv").write_bytes(b"\x00\x05\x16\x07")  # what macOS leaves beside a file on other disks
+    (source / "old.csv").mkdir()
+    assert len(fly_in("source", source, IRIS, 0.0, CONFIG).logs) == 1
+
+
 def test_a_flight_is_there_once_whatever_it_is_called(tmp_path):
     same = replace(LOGS[0], name="/logs/chirp_run9.csv")
     source = fly_in("source", write(tmp_path / "source", LOGS[:2]), IRIS, 0.0, CONFIG)
