@@ -19,6 +19,8 @@ BASELINE_COLOURS = {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.6
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
 BINS = 12
 LEAST = 10  # samples in a bin that is drawn
+APART = 1.02  # factor in N between the points of two models
+SPAN = 1.5  # factor in N that is shown on both sides of a single one
 
 
 class Curve(NamedTuple):
@@ -82,6 +84,8 @@ def errors_by_size(rows: Sequence[FlightRow], dt: float, title: str) -> Figure:
         axes.set(xscale="log", xlabel="N, target windows")
         axes.set_xticks(sizes, [str(size) for size in sizes])
         axes.xaxis.set_minor_formatter(NullFormatter())
+        if len(sizes) == 1:
+            axes.set_xlim(sizes[0] / SPAN, sizes[0] * SPAN)
     return _with_legend(figure, title, "mean over seeds; bars: ± one standard deviation")
 
 
@@ -145,7 +149,8 @@ def _draw_curve(axes: Axes, cell: Cell, time: np.ndarray, mean: np.ndarray, std:
 
 def _draw_sizes(axes: Axes, found: Mapping[Cell, Sequence[FlightRow]], sizes, label: str, quantity: str) -> None:
     drawn = dict.fromkeys((model, mode) for model, mode, _ in found)
-    for index, (model, mode) in enumerate(drawn):
+    adapted = [each for each in drawn if (*each, 0) not in found]
+    for model, mode in drawn:
         own = [(n, pooled(found[model, mode, n], label, quantity)) for n in (0, *sizes) if (model, mode, n) in found]
         name, colour = ", ".join(word for word in (NAMES[model], NAMES[mode]) if word), colour_of(model)
         if own[0][0] == 0:
@@ -154,7 +159,8 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Sequence[FlightRow]], sizes, la
         means = [values.mean() for _, values in own]
         spread = [values.std(ddof=1) if len(values) > 1 else 0.0 for _, values in own]
         # A little apart, or bars would hide each other.
-        at = [n * 1.02 ** (index - len(drawn) / 2) for n, _ in own]
+        aside = APART ** (adapted.index((model, mode)) - (len(adapted) - 1) / 2)
+        at = [n * aside for n, _ in own]
         style: dict[str, Any] = {"color": colour, "linestyle": DASHES[mode], "marker": "o", "markersize": 3.5}
         axes.errorbar(at, means, spread, capsize=2, label=name, **style)
     axes.set_yscale("log")

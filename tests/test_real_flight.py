@@ -26,6 +26,7 @@ from hybrid_jax.flight_claims import flight_claims
 from hybrid_jax.flight_rows import QUANTITIES, FlightRow, pooled
 from hybrid_jax.lanes import count, lane
 from hybrid_jax.multirotor_terms import Terms
+from hybrid_jax.recorded_flight_figures import errors_by_size
 from hybrid_jax.rollout import rollout
 from hybrid_jax.rotation import angle_between
 from hybrid_jax.schedule import rates_by_group
@@ -237,6 +238,19 @@ def test_claims_say_by_how_much():
     verdicts = {claim.id: claim.holds for claim in flight_claims(rows)}
     assert verdicts == {"F1": True, "F2": False, "F3": True, "F4": False}
     assert "step 10 velocity 0.25" in flight_claims(rows)[0].measured
+
+
+@pytest.mark.parametrize("sizes", [(20,), (100, 1000)])
+def test_points_of_a_figure_stand_around_their_number_of_windows(sizes):
+    """Models that are drawn as lines take no place among them."""
+    rows = [row("zero_shot", 1.0, n=0), row("nominal", 1.0, n=0, model="hold")]
+    rows += [row(mode, 1.0, n=n) for n in sizes for mode in ("fine_tuned", "scratch")]
+    rows = [replace(each, scores={"10": each.scores["10"]}) for each in rows]
+    for axes in errors_by_size(rows, DT, "").axes:
+        places = np.array([bars.lines[0].get_xdata() for bars in axes.containers], float)
+        assert places.shape == (2, len(sizes))
+        np.testing.assert_allclose(places.prod(axis=0), np.square(sizes))
+        np.testing.assert_array_less(1.04, [places.min() / axes.get_xlim()[0], axes.get_xlim()[1] / places.max()])
 
 
 @needs_flights
