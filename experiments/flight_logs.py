@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.flight_protocol import Cleaning, RealFlightConfig
 from hybrid_jax.archive import digest
-from hybrid_jax.flights.cleaning import align_motors, delay_motors, lag_motors, low_pass, resample, windows
+from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample, windows
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
@@ -112,6 +112,8 @@ def cleaned(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[Fligh
         done.append(said)
         return changed
 
+    if cleaning.in_flight:
+        log = apply("in-flight", in_flight)
     if cleaning.resample is not None:
         log = apply("resample", resample, cleaning.resample, cleaning.longest_gap)
     if cleaning.low_pass is not None:

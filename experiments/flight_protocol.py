@@ -21,6 +21,8 @@ FILES = ("vehicle", "columns")
 class Cleaning:
     """Changes to every log, in this order; by default none. What each did is in the report."""
 
+    in_flight: bool = False
+    """Cut out half a second and more in which the rotors hardly push: the vehicle stands on the ground."""
     resample: float | None = None
     """New interval between samples [s]."""
     longest_gap: float = 0.0

@@ -24,13 +24,13 @@ from hybrid_jax.vehicle_description import LAG
 
 def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
     source = write(tmp_path / "source", LOGS[:2])
-    cleaning = replace(CONFIG.cleaning, resample=0.02, low_pass=20.0, delay=0.02)
+    cleaning = replace(CONFIG.cleaning, in_flight=True, resample=0.02, low_pass=20.0, delay=0.02)
     found = fly_in("source", source, IRIS, 0.01, replace(CONFIG, cleaning=cleaning))
     assert [record["flight"] for record in found.records] == ["chirp_run1", "chirp_run2"]
     for record in found.records:
-        assert [line.split()[0] for line in record["done"]] == ["resampled", "low-pass", "motors", "rotors"]
+        assert [line.split()[0] for line in record["done"]] == ["0", "resampled", "low-pass", "motors", "rotors"]
         assert record["samples"] == SAMPLES
-        assert len(record["checks"]) == 9
+        assert len(record["checks"]) == 12
     assert require_one_rate([found]) == 0.02
 
 
