@@ -249,6 +249,7 @@ def _judge(state, plan, field, adam, key, train_loss, error) -> FitState:
     patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
     status = jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING)
     status = jnp.where(patient, status, STOPPED)
-    status = jnp.where(finite, status, DIVERGED)
+    # Python's integers make 64 bits in JAX's double precision, where the loop carries 32.
+    status = jnp.where(finite, status, DIVERGED).astype(jnp.int32)
     best_mse = jnp.where(better, error, state.best_mse)
     return FitState(field, adam, best, best_mse, best_epoch, finished, status, train_loss, key)

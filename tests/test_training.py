@@ -8,12 +8,14 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
+from hybrid_jax.lanes import stack
 from hybrid_jax.loss import trajectory_correlation
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.rigid_body import RigidBody, rigid_body
 from hybrid_jax.rollout import rollout_batch
 from hybrid_jax.state import VELOCITY
+from hybrid_jax.sweep import sweep
 from hybrid_jax.training import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, run, start
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
@@ -211,6 +213,20 @@ def test_a_huge_rate_ends_the_run_as_diverged_with_a_finite_field(hybrid):
     assert state.epoch < 30
     assert jnp.isfinite(state.best_mse) == (state.best_epoch > 0)
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(state.best, eqx.is_array)))
+
+
+def test_double_precision_trains_alone_and_in_a_sweep():
+    with jax.enable_x64(True):
+        field, train, validation = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, float), (pendulum(0.8), TRAIN, VALIDATION)
+        )
+        alone = trained(field, train=train, validation=validation, max_epochs=3)
+        plans = stack([make_plan(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
+        lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
+    assert (alone.status.dtype, int(alone.status)) == (np.int32, CAPPED)
+    assert alone.best.log_length.dtype == alone.best_mse.dtype == np.float64
+    # Another program for the same sums, in the round-off of double precision.
+    np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
 
 
 def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
