@@ -15,12 +15,23 @@ from experiments.conditions import augmentation, settings
 from experiments.coverage import Config as CoverageConfig
 from experiments.coverage import CoverageRow, coverage
 from experiments.external_force import sine_floor
-from experiments.protocol import QUICK, SMOKE, Config, Encoding, Stopping, distinct, preset_like
+from experiments.protocol import (
+    FROM_ZERO,
+    QUICK,
+    SMOKE,
+    Config,
+    Encoding,
+    Stopping,
+    check_numbers,
+    distinct,
+    factors,
+    preset_like,
+)
 from experiments.results import Lanes, rows_of, save_models
 from experiments.rivals import METHODS, PAST, Case, Method, source_only
 from experiments.stages import Stages, stages_of
 from experiments.study import adaptation_splits, flown, pretrained, source_splits
-from hybrid_jax import hosts
+from hybrid_jax import checks, hosts
 from hybrid_jax.claims import COMPARISON, claims
 from hybrid_jax.comparison_figures import standings
 from hybrid_jax.datasets import Dataset
@@ -28,7 +39,7 @@ from hybrid_jax.environment import environment
 from hybrid_jax.expert_augmentation import Augmentation
 from hybrid_jax.figures import save_figure
 from hybrid_jax.report import FLOOR, Report, print_report, write_report
-from hybrid_jax.rigid_body import nominal
+from hybrid_jax.rigid_body import LEARNED, nominal
 from hybrid_jax.rows import SOURCE_OF, Row, with_rho
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
@@ -42,6 +53,13 @@ GIVEN_NETWORK = (
     "An interval of θ_p takes the network as given: where both were trained, the spread over seeds shows how far they "
     "can trade with each other, which the interval does not."
 )
+ENCODING_RULES = {
+    "hidden": checks.count,
+    "rate": checks.not_negative,
+    "weight": checks.not_negative,
+    "stopping": FROM_ZERO,
+    "max_epochs": checks.count,
+}
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
 
@@ -62,6 +80,11 @@ class ComparisonConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
+        checks.count("--repeats", self.repeats)
+        if min(self.sizes) <= len(LEARNED):
+            raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
+        factors("--encoding.box", self.encoding.box)
+        check_numbers("--encoding.", self.encoding, ENCODING_RULES)
         if "no_physics" in self.methods and self.residual_outputs != "all":
             raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
         if "last_layer" in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):

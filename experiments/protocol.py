@@ -1,13 +1,15 @@
 """The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
 
 import math
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 import platformdirs
 
+from hybrid_jax import checks
 from hybrid_jax.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
@@ -19,6 +21,14 @@ ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "body"]
 ResidualOutputs = Literal["all", "accelerations"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
+Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
+FROM_ZERO: Rule = partial(checks.count, least=0)
+RULES: Mapping[str, Rule] = (
+    dict.fromkeys(("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"), checks.count)
+    | dict.fromkeys(("data_seed", "patience"), FROM_ZERO)
+    | dict.fromkeys(("noise", "regulariser_weight", "rates"), checks.not_negative)
+    | {"guess_off": checks.positive}
+)
 
 
 @dataclass(frozen=True)
@@ -165,9 +175,9 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for name in ("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        check_numbers("--", self, RULES)
+        check_numbers("--rates.", self.rates, {"offset": checks.positive})
+        factors("--guess", self.guess)
         if not self.sizes or min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
         if self.source_train < self.batch_size:
@@ -176,12 +186,6 @@ class Config(Run):
             raise ValueError(f"--sizes must be different, got {self.sizes}")
         if self.pool is not None and self.pool < max(self.sizes):
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
-        if self.noise < 0 or (self.guess_off is not None and self.guess_off <= 0):
-            raise ValueError(f"--noise must be >= 0, --guess-off > 0, got {self.noise} and {self.guess_off}")
-        if self.rates.offset is not None and not 0 < self.rates.offset < math.inf:
-            raise ValueError(f"--rates.offset must be a positive number, got {self.rates.offset}")
-        if not 0 < self.guess[0] < self.guess[1]:
-            raise ValueError(f"--guess must be two factors, low < high, above 0, got {self.guess}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
             group, entry = name.split(".")
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
@@ -219,6 +223,31 @@ def distinct(option: str, names: Sequence[str]) -> None:
     """
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
+
+def check_numbers(prefix: str, options: Any, rules: Mapping[str, Rule]) -> None:
+    """Check options, each by its rule: a number, a tuple of numbers, a group of either, or None for what is not given.
+
+    Raises:
+        ValueError: the first number that its rule refuses, by the name on the command line, which begins with prefix.
+    """
+    for name, rule in rules.items():
+        option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
+        if is_dataclass(value):
+            check_numbers(f"{option}.", value, dict.fromkeys((each.name for each in fields(value)), rule))
+        elif value is not None:
+            for number in value if isinstance(value, tuple) else (value,):
+                rule(option, number)
+
+
+def factors(option: str, value: tuple[float, float]) -> None:
+    """Check an option that is a range of factors.
+
+    Raises:
+        ValueError: not two finite numbers above 0, the lower one first.
+    """
+    if not 0 < value[0] < value[1] < math.inf:
+        raise ValueError(f"{option} must be two factors, low < high, above 0, got {value}")
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:

@@ -86,8 +86,12 @@ def test_intervals_stand_around_what_was_fitted(folder):
         (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
         (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
         (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
+        (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
+        (("--sizes", "20", "3", "--batch-size", "3"), "--sizes must each be more than the 3 of θ_p"),
+        (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
+        (("--encoding.stopping.patience", "-1"), "--encoding.stopping.patience must be an integer of at least 0"),
     ],
-    ids=["twice", "last layer of a view", "no physics without velocities"],
+    ids=["twice", "last layer of a view", "no physics without velocities", "repeats", "sizes", "box", "patience"],
 )
 def test_methods_that_do_not_fit_are_refused_before_anything_is_flown(options, named, tmp_path):
     assert named in refused(command("comparison", *options, folder=tmp_path), "comparison")

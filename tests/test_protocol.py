@@ -1,5 +1,6 @@
 """The presets hold the paper's tables, and the lanes made from them are what the tables say."""
 
+import math
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments.conditions import adaptation, fresh_fields, pretraining
-from experiments.protocol import PAPER, PRESETS, SMOKE, AdaptationConfig, column
+from experiments.protocol import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
 from hybrid_jax.lanes import lane
 from hybrid_jax.vector_field import Hybrid
 from hybrid_jax.vehicle import IRIS
@@ -127,8 +128,20 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"max_epochs": 0}, "--max-epochs"),
         ({"guess": (1.2, 0.8)}, "--guess"),
         ({"guess": (-1.0, 0.8)}, "--guess"),
+        ({"guess": (0.8, math.inf)}, "--guess must be two factors"),
+        ({"guess_off": math.nan}, "--guess-off must be a positive finite number, got nan"),
+        ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
+        ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
+        ({"data_seed": -1}, "--data-seed must be an integer of at least 0, got -1"),
         ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
+        ({"rates": replace(PAPER.rates, physics=-1.0)}, "--rates.physics must be a finite number of at least 0"),
+        ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
         ({"rates": replace(PAPER.rates, offset=0.0)}, "--rates.offset"),
+        (
+            {"patience": replace(PAPER.patience, hybrid_patience=(20,) * 4 + (-1,))},
+            "--patience.hybrid-patience must be",
+        ),
+        ({"patience": replace(PAPER.patience, no_physics=Stopping(-1, 5))}, "--patience.no-physics.minimum must be"),
         ({"patience": replace(PAPER.patience, hybrid_minimum=(1, 2))}, "--patience.hybrid-minimum"),
     ],
     ids=str,
