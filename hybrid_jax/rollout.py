@@ -67,9 +67,14 @@ def integrate(
 
     def interval(x, held):
         # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
-        state = solver.init(term, begin, end, x, held)
-        for _ in range(substeps):
-            x, _, _, state, _ = solver.step(term, begin, end, x, held, state, made_jump=False)
+        started = x, solver.init(term, begin, end, x, held)
+
+        def step(carry, _):
+            x, _, _, state, _ = solver.step(term, begin, end, carry[0], held, carry[1], made_jump=False)
+            return (x, state), None
+
+        # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
+        (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
         return x, x
 
     return jax.lax.scan(interval, x0, u)[1]

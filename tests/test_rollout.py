@@ -16,6 +16,9 @@ DT = 0.2
 START = np.array([0.5, -1.0])
 TORQUES = np.array([[3.0], [-40.0], [0.0], [25.0], [25.0]])  # jumps that a stage in the wrong interval would feel
 FIELD = {"length": 0.7, "damping": 0.3}
+# Without a state of its own, with a stage kept for the next step, and implicit.
+IMPLICIT = diffrax.Kvaerno3(root_finder=diffrax.VeryChord(rtol=1e-10, atol=1e-10))
+STEPPERS = (RK4(), diffrax.Tsit5(), IMPLICIT)
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -82,8 +85,7 @@ def test_every_named_solver_meets_the_adaptive_reference(name, reference):
 
 
 def test_an_implicit_solver_meets_the_adaptive_reference(reference):
-    solver = diffrax.Kvaerno3(root_finder=diffrax.VeryChord(rtol=1e-10, atol=1e-10))
-    np.testing.assert_allclose(path_of(solver, 4), reference, rtol=0, atol=1e-2)  # order 3 at a step of 0.05
+    np.testing.assert_allclose(path_of(IMPLICIT, 4), reference, rtol=0, atol=1e-2)  # order 3 at a step of 0.05
 
 
 def test_rk4_is_the_default():
@@ -107,6 +109,47 @@ def test_substeps_are_shorter_intervals():
     finer = rollout(pendulum(**FIELD), jnp.asarray(START), jnp.repeat(jnp.asarray(TORQUES), 3, axis=0), DT / 3)
     # The same steps; only t + h is rounded otherwise.
     np.testing.assert_allclose(path_of(substeps=3), finer[2::3], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
+def test_a_program_does_not_grow_with_its_substeps(solver):
+    def size(substeps):
+        program = jax.make_jaxpr(lambda x0: rollout(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps))
+        return len(str(program(jnp.asarray(START))).splitlines())
+
+    assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
+
+
+@pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
+def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
+    def by_hand(field):
+        term, begin, end = diffrax.ODETerm(lambda t, x, held: field(x, held)), jnp.zeros(()), jnp.asarray(DT / 3)
+        x = jnp.asarray(START)
+        for held in jnp.asarray(TORQUES[:2]):
+            state = solver.init(term, begin, end, x, held)
+            for _ in range(3):
+                x, _, _, state, _ = solver.step(term, begin, end, x, held, state, made_jump=False)
+        return x.sum()
+
+    def looped(field):
+        return rollout(field, jnp.asarray(START), jnp.asarray(TORQUES[:2]), DT, solver, 3)[-1].sum()
+
+    found, expected = (eqx.filter_jit(eqx.filter_value_and_grad(last))(pendulum(**FIELD)) for last in (looped, by_hand))
+    np.testing.assert_allclose(*map(jax.tree.leaves, (found, expected)), rtol=1e-12)  # order of sums
+
+
+@pytest.mark.parametrize("solver", STEPPERS[:2], ids=lambda value: type(value).__name__)
+def test_substeps_are_differentiated_inside_shard_map(solver):
+    """Where the lanes of a sweep run."""
+
+    def slope(x0):
+        field = pendulum(**FIELD)
+        return jax.grad(lambda field: rollout(field, x0, jnp.asarray(TORQUES), DT, solver, 3).sum())(field).log_length
+
+    mesh, part = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",)), jax.sharding.PartitionSpec("lanes")
+    share = jax.shard_map(lambda x0: slope(x0[0])[None], mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    x0 = jnp.asarray(START)
+    np.testing.assert_allclose(jax.jit(share)(x0[None])[0], jax.jit(slope)(x0), rtol=1e-12)  # order of sums
 
 
 def test_a_batch_is_a_loop_of_rollouts():
