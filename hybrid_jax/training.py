@@ -11,13 +11,14 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.objective import Learner, Settings
+from hybrid_jax.objective import Learner, Prediction, Settings
 from hybrid_jax.rigid_body import moves_a_rigid_body
 from hybrid_jax.rollout import checked
 from hybrid_jax.trajectories import Trajectories, check_attitudes
 from hybrid_jax.vector_field import AbstractVectorField, trainable
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
+WEIGHT = 1e-3  # λ, where none is given
 STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
 
 
@@ -146,15 +147,20 @@ def fit(
     min_epochs: int = 100,
     patience: int = 20,
     max_epochs: int = 2000,
-    regulariser_weight: float = 1e-3,
+    regulariser_weight: float | None = None,
     settings: Settings | None = None,
 ) -> FitState:
     """Train one field on all windows of `train`; `result.best` is the field of the best validation epoch.
 
+    Args:
+        regulariser_weight: λ, by default 1e-3.
+        settings: by default minibatches of 100 and no regulariser; the paper's is
+            `Settings(regulariser=hybrid_jax.loss.trajectory_correlation)`.
+
     Raises:
         ValueError: data that the objective refuses, that are not of the field's states and inputs, or are of a rigid
             body and have no unit quaternions; fewer training windows than a minibatch; rates that do not go with the
-            field; a rule that makes no sense; or no random key.
+            field; a rule that makes no sense; a weight without a regulariser; or no random key.
     """
     settings = Settings() if settings is None else settings
     data = settings.objective.prepare(train, "train")
@@ -171,8 +177,21 @@ def fit(
         raise ValueError(
             f"rates must be a number, or a tree of them that begins as the field does, got {checks.shown(rates)}"
         ) from error
-    plan = make_plan(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, regulariser_weight)
+    weight = _weight(regulariser_weight, settings)
+    plan = make_plan(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     return _fit(start(field, key), plan, data, judged_on, settings)
+
+
+def _weight(asked: float | None, settings: Settings) -> float:
+    """λ, or what another objective weighs by it."""
+    if asked is None:
+        return WEIGHT
+    if settings.regulariser is None and isinstance(settings.objective, Prediction):
+        raise ValueError(
+            f"regulariser_weight is {checks.shown(asked)} but settings.regulariser is None; leave it out, or take one "
+            "of hybrid_jax.loss.REGULARISERS"
+        )
+    return asked
 
 
 def _check_match(field: Learner, windows: Trajectories, name: str, settings: Settings) -> None:

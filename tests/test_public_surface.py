@@ -19,6 +19,7 @@ import hybrid_jax as hj
 from hybrid_jax import linear_adaptation, metrics, uncertainty
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
 from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.loss import residual_norm
 from hybrid_jax.multirotor import multirotor
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
@@ -115,7 +116,9 @@ def test_windows_that_pass_the_check_are_whole(found):
             "patience": odd(0, 2),
             "max_epochs": odd(1, 3),
             "regulariser_weight": odd(0.0, 1e-3),
-            "settings": st.sampled_from([hj.Settings(size) for size in (4, 13, 0, -1, 2.5, "4", None)]),
+            "settings": st.sampled_from(
+                [hj.Settings(4, residual_norm), *(hj.Settings(size) for size in (4, 13, 0, -1, 2.5, "4", None))]
+            ),
         },
     ),
     st.sampled_from([KEY, jax.random.PRNGKey(0), 0, None, jax.random.split(KEY, 2), "key"]),

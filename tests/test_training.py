@@ -9,7 +9,7 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.lanes import stack
-from hybrid_jax.loss import trajectory_correlation
+from hybrid_jax.loss import residual_norm, trajectory_correlation
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.rigid_body import RigidBody, rigid_body
@@ -249,3 +249,15 @@ def test_bad_data_are_refused_by_name(name):
 def test_fewer_windows_than_a_minibatch_are_refused():
     with pytest.raises(ValueError, match="19 windows, fewer than batch_size=20"):
         trained(pendulum(), train=TRAIN[:19])
+
+
+def test_a_weight_is_that_of_a_regulariser_or_is_refused():
+    with pytest.raises(ValueError, match=r"^regulariser_weight is 1.0 but settings.regulariser is None; leave it out"):
+        trained(pendulum(), regulariser_weight=1.0)
+    field, settings = Hybrid(pendulum(0.6), residual_network(2, 1, KEY, hidden=4)), Settings(BATCH, residual_norm)
+    usual, same, other = (
+        trained(field, settings=settings, max_epochs=1, **given)
+        for given in ({}, {"regulariser_weight": 1e-3}, {"regulariser_weight": 1.0})
+    )
+    assert eqx.tree_equal(usual, same)
+    assert usual.train_loss < other.train_loss
