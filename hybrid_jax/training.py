@@ -159,12 +159,13 @@ def fit(
 
     Raises:
         ValueError: data that the objective refuses, that are not of the field's states and inputs, or are of a rigid
-            body and have no unit quaternions; fewer training windows than a minibatch; rates that do not go with the
-            field; a rule that makes no sense; a weight without a regulariser; or no random key.
+            body and have no unit quaternions; fewer training windows than a minibatch; a field with nothing to learn;
+            rates that do not go with it; a rule that makes no sense; a weight without a regulariser; or no random key.
     """
     settings = Settings() if settings is None else settings
     data = settings.objective.prepare(train, "train")
     judged_on = settings.objective.prepare(validation, "validation")
+    _check_learns(field)
     for name, windows in (("train", train), ("validation", validation)):
         _check_match(field, windows, name, settings)
     checks.key("key", key)
@@ -192,6 +193,14 @@ def _weight(asked: float | None, settings: Settings) -> float:
             "of hybrid_jax.loss.REGULARISERS"
         )
     return asked
+
+
+def _check_learns(field: Learner) -> None:
+    if isinstance(field, AbstractVectorField) and not any(jax.tree.leaves(trainable(field))):
+        raise ValueError(
+            f"field: {type(field).__name__} has nothing to learn, no array of floating-point numbers; a Python float "
+            "is none, use jnp.asarray"
+        )
 
 
 def _check_match(field: Learner, windows: Trajectories, name: str, settings: Settings) -> None:

@@ -18,7 +18,7 @@ from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep import sweep
 from hybrid_jax.training import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, run, start
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField
+from hybrid_jax.vector_field import AbstractVectorField, Frozen
 from hybrid_jax.vehicle import IRIS
 
 BATCH = 20
@@ -261,3 +261,19 @@ def test_a_weight_is_that_of_a_regulariser_or_is_refused():
     )
     assert eqx.tree_equal(usual, same)
     assert usual.train_loss < other.train_loss
+
+
+class Stiff(AbstractVectorField):
+    """A pendulum whose length is a Python float."""
+
+    length: float
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - jnp.sin(x[0]) / self.length])
+
+
+@pytest.mark.parametrize("field", [Stiff(1.0), Frozen(pendulum())], ids=["float", "frozen"])
+def test_a_field_with_nothing_to_learn_is_refused(field):
+    said = rf"^field: {type(field).__name__} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
+    with pytest.raises(ValueError, match=said):
+        trained(field)
