@@ -180,6 +180,8 @@ class Config(Run):
         factors("--guess", self.guess)
         if not self.sizes or min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
+        if self.norm == "batch" and self.batch_size < 2 and self.has_networks():
+            raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least --batch-size {self.batch_size}, got {self.source_train}")
         if len(set(self.sizes)) < len(self.sizes):
@@ -190,6 +192,10 @@ class Config(Run):
             group, entry = name.split(".")
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
+
+    def has_networks(self) -> bool:
+        """Whether anything that is trained holds f_d."""
+        return True
 
     def pooled(self) -> int:
         """The number of target trajectories from which a seed draws."""
@@ -213,6 +219,9 @@ class AdaptationConfig(Config):
         distinct("--models", self.models)
         if "no_physics" in self.models and self.residual_outputs != "all":
             raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
+
+    def has_networks(self) -> bool:
+        return set(self.models) != {"physics_only"}
 
 
 def distinct(option: str, names: Sequence[str]) -> None:

@@ -73,7 +73,8 @@ def sweep(
         DIVERGED and the best epoch that it had; it changes no other lane.
 
     Raises:
-        ValueError: bad data, or a plan that asks for more windows than `train` has or for less than a minibatch.
+        ValueError: bad data, a plan that asks for more windows than `train` has or for less than a minibatch, or a
+            minibatch of one window where fields normalise it.
     """
     states, plans = jax.device_get((states, plans))
     block, shared, costs = _ready(states, plans, train, validation, settings, width)
@@ -123,6 +124,7 @@ def _ready(
     """The compiled block of a sweep, the data that all lanes share, and what an epoch of each lane costs."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
+    training.check_minibatch(states.field, settings)
     _check(plans, train, settings)
     shared = (train, validation)
     block = _block(settings, width, _shapes((states, plans), shared))

@@ -12,10 +12,11 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.objective import Learner, Prediction, Settings
+from hybrid_jax.residual import BatchNorm
 from hybrid_jax.rigid_body import moves_a_rigid_body
 from hybrid_jax.rollout import checked
 from hybrid_jax.trajectories import Trajectories, check_attitudes
-from hybrid_jax.vector_field import AbstractVectorField, trainable
+from hybrid_jax.vector_field import AbstractVectorField, Frozen, trainable
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
 WEIGHT = 1e-3  # λ, where none is given
@@ -159,8 +160,9 @@ def fit(
 
     Raises:
         ValueError: data that the objective refuses, that are not of the field's states and inputs, or are of a rigid
-            body and have no unit quaternions; fewer training windows than a minibatch; a field with nothing to learn;
-            rates that do not go with it; a rule that makes no sense; a weight without a regulariser; or no random key.
+            body and have no unit quaternions; fewer training windows than a minibatch, or one window normalised by
+            itself; a field with nothing to learn; rates that do not go with it; a rule that makes no sense; a weight
+            without a regulariser; or no random key.
     """
     settings = Settings() if settings is None else settings
     data = settings.objective.prepare(train, "train")
@@ -170,6 +172,7 @@ def fit(
         _check_match(field, windows, name, settings)
     checks.key("key", key)
     checks.count("settings.batch_size", settings.batch_size)
+    check_minibatch(field, settings)
     if len(data) < settings.batch_size:
         raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
     try:
@@ -193,6 +196,19 @@ def _weight(asked: float | None, settings: Settings) -> float:
             "of hybrid_jax.loss.REGULARISERS"
         )
     return asked
+
+
+def check_minibatch(field: Learner, settings: Settings) -> None:
+    """Refuse minibatches of one window where the minibatch normalises: less its own mean, a window is a constant.
+
+    Raises:
+        ValueError: the field learns through a BatchNorm, and the minibatch is smaller than 2.
+    """
+    nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, Frozen | BatchNorm))
+    if settings.batch_size < 2 and any(isinstance(node, BatchNorm) for node in nodes):
+        raise ValueError(
+            f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {settings.batch_size}"
+        )
 
 
 def _check_learns(field: Learner) -> None:

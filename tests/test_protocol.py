@@ -123,6 +123,7 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"sizes": ()}, "--sizes"),
         ({"sizes": (100, 100)}, "--sizes"),
         ({"models": ()}, "--models"),
+        ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
         ({"source_train": 50}, "--source-train"),
         ({"seeds": 0}, "--seeds"),
         ({"max_epochs": 0}, "--max-epochs"),
@@ -149,6 +150,11 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
 def test_options_that_do_not_fit_are_refused_by_name(change, named):
     with pytest.raises(ValueError, match=named):
         replace(PAPER, **change)
+
+
+def test_minibatches_of_one_window_are_for_what_does_not_normalise_them():
+    for change in ({"norm": "layer"}, {"models": ("physics_only",)}):
+        assert replace(PAPER, batch_size=1, **change).batch_size == 1
 
 
 def test_smoke_is_small_but_whole():

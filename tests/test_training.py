@@ -277,3 +277,18 @@ def test_a_field_with_nothing_to_learn_is_refused(field):
     said = rf"^field: {type(field).__name__} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
     with pytest.raises(ValueError, match=said):
         trained(field)
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["fit", "sweep"])
+def test_one_window_is_not_normalised_by_itself(alone):
+    def train(norm, wrap=lambda network: network):
+        field = Hybrid(pendulum(), wrap(residual_network(2, 1, KEY, hidden=4, norm=norm)))
+        if alone:
+            return trained(field, settings=Settings(1), max_epochs=1)
+        plan = make_plan(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
+        return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
+
+    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
+        train("batch")
+    for trains in (lambda: train("layer"), lambda: train("batch", Frozen)):
+        assert np.all(trains().epoch == 1)
