@@ -13,7 +13,7 @@ from rich.console import Console
 from experiments import command
 from experiments.conditions import settings
 from experiments.external_force import sine_floor
-from experiments.protocol import QUICK, SMOKE, Config, distinct, preset_like
+from experiments.protocol import QUICK, SMOKE, Config, Kind, distinct, preset_like
 from experiments.results import Lanes, rows_of, trained
 from experiments.stages import Stages, stages_of
 from experiments.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
@@ -99,25 +99,36 @@ def variations(choice: str, config: Config) -> dict[str, dict[str, Any]]:
             return {norm: {"norm": norm} for norm in ("batch", "layer", "none")}
         case "start":
             factors = f"random in {config.guess[0]:g} to {config.guess[1]:g}"
-            return {factors: {}} | {f"off by {off:.0%}": {"guess_off": off} for off in (0.2, 0.5, 1.0)}
+            return {factors: {"guess_off": None}} | {f"off by {off:.0%}": {"guess_off": off} for off in (0.2, 0.5, 1.0)}
         case "source":
-            sizes = [n for n in (300, 1000, 3000, 10_000) if n <= config.source_train]
-            return {f"{n} trajectories": {"source_train": n} for n in sizes}
+            sizes = [n for n in (300, 1000, 3000, 10_000) if config.batch_size <= n < config.source_train]
+            return {f"{n} trajectories": {"source_train": n} for n in (*sizes, config.source_train)}
         case "noise":
             return {f"{level:g} × typical": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)}
         case _:
             return {solver: {"solver": solver} for solver in ("rk4", "heun", "tsit5")}
 
 
+def varied(choice: str, config: Kind) -> dict[str, Kind]:
+    """Name of each value of a choice → the configuration with it.
+
+    Raises:
+        ValueError: a value that does not go with the other options.
+    """
+    return {value: replace(config, **changes) for value, changes in variations(choice, config).items()}
+
+
 def experiment(config: AblationConfig, console: Console) -> None:
     """Run every value of every choice and write what came of it, after each choice."""
     trials: list[Trial] = []
     seconds: dict[str, float] = {}
-    for choice in config.over:
-        for value, changes in variations(choice, config).items():
+    # Made before the first one runs: a value that does not go with the other options is refused at once.
+    changed = {choice: varied(choice, config) for choice in config.over}
+    for choice, values in changed.items():
+        for value, other in values.items():
             console.print(f"{choice}: {value}", style="bold", highlight=False)
             stages = stages_of(config, console)
-            trials.append(tried(choice, value, replace(config, **changes), config, stages))
+            trials.append(tried(choice, value, other, config, stages))
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
         if hosts.first():
             write(config, trials, seconds)

@@ -8,9 +8,10 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from rich.console import Console
 from smoke import experiments
 
-from experiments.ablation import PRESETS, Choice, variations
+from experiments.ablation import PRESETS, Choice, experiment, varied
 from experiments.sensors import Noise, measured
 from hybrid_jax.ablations import Trial, by_choice, figure, tables, to_csv
 from hybrid_jax.datasets import Dataset
@@ -41,9 +42,27 @@ TRIALS = [
 @pytest.mark.parametrize("choice", get_args(Choice))
 def test_every_choice_has_its_default_once_among_valid_values(choice):
     config = PRESETS["paper"]
-    changed = [replace(config, **changes) for changes in variations(choice, config).values()]
+    changed = list(varied(choice, config).values())
     assert changed.count(config) == 1
     assert len({str(other) for other in changed}) == len(changed) > 2
+
+
+@pytest.mark.parametrize(("most", "sizes"), [(40, [40]), (1000, [300, 1000]), (5000, [300, 1000, 3000, 5000])])
+def test_the_source_flights_that_were_asked_for_are_the_most_that_are_tried(most, sizes):
+    config = replace(PRESETS["smoke"], source_train=most)
+    assert [other.source_train for other in varied("source", config).values()] == sizes
+
+
+def test_the_start_in_a_range_of_factors_is_that_whatever_the_others_are_off_by():
+    config = replace(PRESETS["paper"], guess_off=0.3)
+    assert [other.guess_off for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
+
+
+def test_values_that_do_not_go_with_the_other_options_are_refused_before_anything_is_flown(tmp_path):
+    config = replace(PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
+    with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):
+        experiment(config, Console(quiet=True))
+    assert not list(tmp_path.iterdir())
 
 
 def test_a_table_has_a_line_for_each_value_in_each_domain_with_means_and_biases():
