@@ -15,6 +15,7 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 - export: any field and its steps as StableHLO in a file and as CasADi functions.
 """
 
+from hybrid_jax import runtime
 from hybrid_jax.models import Model, load, save
 from hybrid_jax.objective import Settings
 from hybrid_jax.residual import residual_network
@@ -42,5 +43,6 @@ __all__ = [
     "rigid_body",
     "rollout",
     "rollout_batch",
+    "runtime",
     "save",
 ]

@@ -148,7 +148,10 @@ def checked(
     checks.count("substeps", substeps)
     solver = RK4() if solver is None else solver
     if not isinstance(solver, diffrax.AbstractSolver):
-        raise ValueError(f"solver must be one of diffrax or hybrid_jax.rollout.SOLVERS, got {checks.shown(solver)}")
+        # An import, as `hybrid_jax.rollout.SOLVERS` would be looked for in the function of that name.
+        raise ValueError(
+            f"solver must be one of diffrax or `from hybrid_jax.rollout import SOLVERS`, got {checks.shown(solver)}"
+        )
     slope = check_field(
         field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
     )

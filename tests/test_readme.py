@@ -4,7 +4,10 @@ import re
 import subprocess
 import sys
 import tomllib
+from importlib import import_module
 from pathlib import Path
+
+import hybrid_jax
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -20,6 +23,16 @@ def test_the_library_example_recovers_the_pendulums_length(tmp_path):
     # Damping pulls at the length until the network has taken it over; 5 % is far inside what a wrong sign would do.
     assert abs(length / 0.7 - 1) < 0.05
     assert loss < 1e-3
+
+
+def test_the_names_that_it_gives_are_there():
+    names = set(re.findall(r"`(hybrid_jax(?:\.\w+)+)[`(]", README))
+    assert {"hybrid_jax.runtime.configure", "hybrid_jax.disturbance"} <= names
+    assert "runtime" in hybrid_jax.__all__
+    for name in names:
+        found = hybrid_jax
+        for part in name.split(".")[1:]:
+            found = getattr(found, part, None) or import_module(f"{found.__name__}.{part}")
 
 
 def test_the_extras_that_it_names_exist():

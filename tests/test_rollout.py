@@ -173,3 +173,8 @@ def test_along_pairs_each_input_with_the_state_it_found():
     pairs = {(*state, *held) for state, held in zip(np.asarray(states).T, np.asarray(inputs).T, strict=True)}
     starts = np.concatenate([x0[None], x[:-1]])
     assert pairs == {(*starts[t, :, b], *u[t, :, b]) for t in range(4) for b in range(3)}
+
+
+def test_the_error_of_a_solver_by_name_says_where_the_names_are():
+    with pytest.raises(ValueError, match=r"`from hybrid_jax\.rollout import SOLVERS`, got 'rk4'"):
+        path_of("rk4")
