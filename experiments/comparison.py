@@ -113,7 +113,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     if not hosts.first():
         return
     covered = stages.timed(
-        "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]))
+        "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]), console)
     )
     write(config, rows, stages, datasets, covered)
 

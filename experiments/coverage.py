@@ -3,6 +3,7 @@
 python -m experiments.coverage --help
 """
 
+import itertools
 import math
 import sys
 from collections.abc import Sequence
@@ -19,9 +20,10 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
 from rich.table import Table
 
-from experiments.command import BAD_INPUT, check_folder
+from experiments.command import BAD_INPUT, INTERRUPTED, check_folder
+from experiments.progress import PartLine
 from experiments.sensors import Noise, measure
-from hybrid_jax import rotation
+from hybrid_jax import checks, rotation
 from hybrid_jax.files import json_text, write_whole
 from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.rigid_body import LEARNED, RigidBody, nominal, rigid_body
@@ -34,6 +36,7 @@ from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
 DT = 0.01  # s
+PART = 10  # repeats between two looks at the clock, at the least: some seconds on a CPU
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's parameter shift
 NoiseOn = Literal["targets", "all"]
 
@@ -129,20 +132,29 @@ class Repeat(NamedTuple):
     converged: Bool[Array, ""]
 
 
-def coverage(config: Config) -> list[CoverageRow]:
+def coverage(config: Config, console: Console) -> list[CoverageRow]:
     """The rows of every case: exact physics and unknown drag, with noise on what was asked for.
+
+    Args:
+        console: where progress is drawn.
 
     Raises:
         ValueError: an option that makes no sense, by its name on the command line.
     """
     check(config)
-    cases = {"exact physics": 0.0, "unknown drag": config.drag}
-    return [
-        row
-        for case, drag in cases.items()
-        for noise_on in config.noise_on
-        for row in _rows(case, noise_on, jax.device_get(_repeats(config, noise_on == "all", drag)))
-    ]
+    drags = {"exact physics": 0.0, "unknown drag": config.drag}
+    cases = list(itertools.product(drags, config.noise_on))
+    parts, done = _parts(config), itertools.count(1)
+    with PartLine(NAME, console, len(cases) * len(parts)) as line:
+
+        def one(case: str, noise_on: str, keys: PRNGKeyArray) -> Repeat:
+            found = jax.device_get(_repeats(config, noise_on == "all", drags[case], keys))
+            line.show(next(done))
+            return found
+
+        found = [[one(*case, keys) for keys in parts] for case in cases]
+    whole = (jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *each) for each in found)
+    return [row for case, repeats in zip(cases, whole, strict=True) for row in _rows(*case, repeats)]
 
 
 def check(config: Config) -> None:
@@ -156,6 +168,7 @@ def check(config: Config) -> None:
     for name in ("repeats", "steps", "batch"):
         if getattr(config, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(config, name)}")
+    checks.count("--seed", config.seed, 0)
     if not 0 < config.level < 1:
         raise ValueError(f"--level must be between 0 and 1, got {config.level}")
     if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
@@ -205,9 +218,17 @@ def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
     return jnp.concatenate([jnp.zeros_like(v), q, v, omega], axis=1)
 
 
+def _parts(config: Config) -> list[PRNGKeyArray]:
+    """The keys of all repeats, a few at a time: between two parts progress is drawn and an interrupt is heard."""
+    size = min(config.batch * -(-PART // config.batch), config.repeats)
+    keys = jax.random.split(jax.random.key(config.seed), config.repeats)
+    # The last part is filled up, so that one program serves all.
+    return [keys[np.arange(begin, begin + size) % config.repeats] for begin in range(0, config.repeats, size)]
+
+
 @partial(jax.jit, static_argnums=0)
-def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""]) -> Repeat:
-    """All repeats, stacked: one program, compiled once for all cases."""
+def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray) -> Repeat:
+    """A part of the repeats, stacked: one program, compiled once for all parts and cases."""
 
     def one(key: PRNGKeyArray) -> Repeat:
         windows = recording(config, start_is_measured, drag, key)
@@ -218,8 +239,7 @@ def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Arr
         inside = (low <= true) & (true <= high) & found.converged
         return Repeat(inside, value / true - 1, (high - low) / (2 * true), found.converged)
 
-    keys = jax.random.split(jax.random.key(config.seed), config.repeats)
-    return jax.lax.map(one, keys, batch_size=min(config.batch, config.repeats))
+    return jax.lax.map(one, keys, batch_size=min(config.batch, len(keys)))
 
 
 def _rows(case: str, noise_on: str, repeats: Repeat) -> list[CoverageRow]:
@@ -257,21 +277,23 @@ def experiment(config: Config, console: Console) -> list[CoverageRow]:
     """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
     folder = config.out / NAME
     check_folder("--out", folder)
-    rows = coverage(config)
-    content = {"config": asdict(config), "rows": [asdict(row) for row in rows]}
-    write_whole(folder / "coverage.json", json_text(content))
+    rows = coverage(config, Console(stderr=True))
+    write_whole(folder / "coverage.json", json_text({"config": asdict(config), "rows": [asdict(row) for row in rows]}))
     console.print(table(rows, config.level))
     return rows
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line. Bad input ends in one line on stderr and exit code 2."""
+    """The command line. Bad input ends in one line on stderr and exit code 2, an interrupt in one and 130."""
     try:
         config = tyro.cli(Config, prog=f"python -m experiments.{NAME}", description=Config.__doc__, args=arguments)
         experiment(config, Console())
     except (ValueError, OSError) as error:
         print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        print(f"{NAME}: interrupted, nothing was written", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 if __name__ == "__main__":

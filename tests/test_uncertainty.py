@@ -6,10 +6,12 @@ import json
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from pendulum import pendulum, swings
+from rich.console import Console
 from test_least_squares import Brake, Push, log_lengths, pushes
 
 from experiments import coverage as command
@@ -167,6 +169,7 @@ def test_the_command_prints_and_writes_every_case(said_and_written, rows):
     [
         ({"n_train": 3}, "--n-train must be more than the 3 parameters, got 3"),
         ({"repeats": 0}, "--repeats must be at least 1, got 0"),
+        ({"seed": -1}, "--seed must be an integer of at least 0, got -1"),
         ({"level": 95.0}, "--level must be between 0 and 1, got 95.0"),
         ({"noise_on": ()}, "--noise-on must be targets, all or both, got nothing"),
         ({"noise": command.Noise(body_rates=-1.0)}, "--noise.body-rates must be a finite number of at least 0"),
@@ -175,7 +178,7 @@ def test_the_command_prints_and_writes_every_case(said_and_written, rows):
 )
 def test_options_that_make_no_sense_are_refused(changed, said):
     with pytest.raises(ValueError, match=said):
-        coverage(replace(Config(), **changed))
+        coverage(replace(Config(), **changed), Console(quiet=True))
 
 
 def test_bad_input_ends_in_one_line(tmp_path, capsys):
@@ -183,3 +186,22 @@ def test_bad_input_ends_in_one_line(tmp_path, capsys):
         command.main(["--level", "2", "--out", str(tmp_path)])
     assert stop.value.code == 2
     assert capsys.readouterr().err == "coverage: --level must be between 0 and 1, got 2.0\n"
+
+
+@pytest.mark.parametrize(("repeats", "batch"), [(100, 1), (25, 1), (25, 4), (3, 8)])
+def test_parts_of_one_size_hold_every_repeat_in_its_order(repeats, batch):
+    parts = command._parts(Config(repeats=repeats, batch=batch))
+    together = np.concatenate([jax.random.key_data(part) for part in parts])
+    assert {len(part) for part in parts} == {len(together) // len(parts)}
+    np.testing.assert_array_equal(together[:repeats], jax.random.key_data(jax.random.split(jax.random.key(0), repeats)))
+
+
+def test_an_interrupt_ends_in_one_line(tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_repeats", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        command.main(["--out", str(tmp_path)])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "coverage: interrupted, nothing was written\n"
