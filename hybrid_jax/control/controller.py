@@ -198,15 +198,18 @@ class Controller:
 
         def attempt(damping):
             step = _solved(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
-            step = step.reshape(point.free.shape)
-            free = jnp.clip(point.free - step, -FREE, FREE)
+            gain = step @ gradient + damping * step @ step  # what it lowers the quadratic model by
+            free = jnp.clip(point.free - step.reshape(point.free.shape), -FREE, FREE)
             states, cost = self._predict(model, reference, x, free)
-            return _Point(free, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping)
+            return _Point(free, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), gain
 
-        tried = jax.vmap(attempt)(dampings)
+        tried, gains = jax.vmap(attempt)(dampings)
         best = jax.tree.map(lambda leaf: leaf[jnp.argmin(tried.cost)], tried)
         kept = eqx.tree_at(lambda p: p.damping, point, jnp.minimum(point.damping * FAILED, MOST))
-        return jax.tree.map(lambda new, old: jnp.where(best.cost < point.cost, new, old), best, kept)
+        best = jax.tree.map(lambda new, old: jnp.where(best.cost < point.cost, new, old), best, kept)
+        # At the best plan chance decides what lowers the cost: no damping did well there, and none is to be blamed.
+        nothing = gains[0] < jnp.finfo(gains.dtype).eps * (1 + point.cost)
+        return eqx.tree_at(lambda p: p.damping, best, jnp.where(nothing, FIRST, best.damping))
 
     def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], free: Float[Array, "t 4"]):
         """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the free numbers."""

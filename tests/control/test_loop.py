@@ -61,6 +61,22 @@ def test_an_upset_of_6_rad_per_s_is_recovered_from():
     assert away[7:].max() < 0.1
 
 
+def test_a_kick_after_a_second_of_quiet_is_answered_as_one_at_the_start():
+    """At the best plan nothing lowers the cost; that is no reason for small steps when there is something to do."""
+    reference = REFERENCES[0]
+
+    @jax.jit
+    def furthest(at):
+        def kicked(x, u, t):
+            x = plant(BODY)(x, u, t)
+            return jnp.where(jnp.abs(t - at) < 0.5 * CONTROLLER.period, upset(x), x)
+
+        flight = fly(kicked, BODY, reference, reference[0], CONTROLLER)
+        return performance(flight, reference, CONTROLLER).largest_error
+
+    assert furthest(1.0) < 1.03 * furthest(0.0)
+
+
 def test_the_observer_finds_the_wind_and_takes_its_error_away():
     reference = REFERENCES[0]
     _, without = alone(WIND, reference, reference[0], 0.0)
