@@ -44,8 +44,8 @@ class ClosedLoopConfig(Config):
     """What is flown at home."""
     away: float = 60.0
     """Distance from home [m] of the flights that are flown there as well."""
-    away_references: tuple[Reference, ...] = ABLATED
-    """What is flown there."""
+    away_references: tuple[Reference, ...] | None = None
+    """What is flown there, of --references; by default hover, figure_eight and low_pass, if they are among these."""
     bandwidth: float = 10.0
     """Of the disturbance observer [rad/s]."""
     safe_inputs: ResidualInputs = "no_xy_yaw"
@@ -68,8 +68,13 @@ class ClosedLoopConfig(Config):
 
     def __post_init__(self):
         Config.__post_init__(self)
-        for option in ("references", "away_references"):
-            distinct(f"--{option.replace('_', '-')}", getattr(self, option))
+        distinct("--references", self.references)
+        if self.away_references is not None:
+            distinct("--away-references", self.away_references)
+        unknown = [name for name in self.flown_away if name not in self.references]
+        if unknown:
+            known = ", ".join(self.references)
+            raise ValueError(f"--away-references must be among --references ({known}), got {', '.join(unknown)}")
         for option in ("seconds", "away", "bandwidth"):
             checks.positive(f"--{option}", getattr(self, option))
         if self.safe_offset is not None:
@@ -84,6 +89,13 @@ class ClosedLoopConfig(Config):
             )
         if self.safe_inputs == "body" or self.residual_inputs == "body" or self.norm == "layer":
             raise ValueError("--residual-inputs and --safe-inputs body, and --norm layer, cannot be flown here")
+
+    @property
+    def flown_away(self) -> tuple[Reference, ...]:
+        """What is flown away from home, and at home as well."""
+        if self.away_references is not None:
+            return self.away_references
+        return tuple(name for name in ABLATED if name in self.references)
 
 
 PRESETS = {
@@ -152,7 +164,7 @@ def fly_models(config: ClosedLoopConfig, space: Airspace, crews: dict[str, Crew]
         crew = crews[domain.name]
         outcome.home += [space.fly(Block(domain, reference, 0.0, crew)) for reference in config.references]
         alone = {flyer: model for flyer, model in crew.items() if not flyer.observer}
-        outcome.away += [space.fly(Block(domain, name, config.away, alone)) for name in config.away_references]
+        outcome.away += [space.fly(Block(domain, name, config.away, alone)) for name in config.flown_away]
 
 
 def fly_ablation(

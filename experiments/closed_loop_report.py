@@ -1,8 +1,9 @@
 """What the closed-loop experiment leaves in its folder: report.json, rows.csv, report.md and the figures."""
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field
+from functools import partial
 from typing import Any
 
 import jax.numpy as jnp
@@ -146,27 +147,41 @@ def draw(
     rows: Sequence[FlightRow], ablated: Sequence[FlightRow], outcome: Outcome, few: int
 ) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
     """Figures with their captions by file, and notes on what could not be drawn."""
-    made: dict[str, tuple[Figure, str]] = {}
+    made, missing = {}, []
+    for file, caption, drawn in _figures(rows, ablated, outcome, few):
+        try:
+            made[file] = drawn(), caption
+        except ValueError as error:  # nothing of it was flown, or no renderer
+            missing.append(f"{file}.png is missing: {error}.")
+    return made, missing
+
+
+def _figures(
+    rows: Sequence[FlightRow], ablated: Sequence[FlightRow], outcome: Outcome, few: int
+) -> Iterator[tuple[str, str, Callable[[], Figure]]]:
+    """The file, the caption and the drawing of each figure."""
     adapted = (Flyer("hybrid", few), Flyer("safe", few), Flyer("nine", few))
     followed = (Flyer("nominal"), Flyer("hybrid"), *adapted, Flyer("oracle"))
     for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
         name = NAMES[domain]
-        made[f"errors_{domain}"] = figures.errors(rows, domain), f"Position RMSE of all seeds of all models, {name}"
-        made[f"gap_{domain}"] = figures.shares(rows, domain), f"How much of the gap to the truth is closed, {name}"
-        made[f"paths_{domain}"] = flown_paths(outcome.home, domain, followed), f"Flights of seed 0, {name}"
+        errors, gap, paths = f"errors_{domain}", f"gap_{domain}", f"paths_{domain}"
+        yield errors, f"Position RMSE of all seeds of all models, {name}", partial(figures.errors, rows, domain)
+        yield gap, f"How much of the gap to the truth is closed, {name}", partial(figures.shares, rows, domain)
+        yield paths, f"Flights of seed 0, {name}", partial(flown_paths, outcome.home, domain, followed)
         if ablated:
-            made[f"ablation_{domain}"] = figures.ablation(ablated, domain), f"The safe network's options, {name}"
-    made["promises"] = figures.promised(rows, followed), "Promised and realised cost of plans"
-    made["away"] = figures.far_from_home(rows), "The same flights far from home"
-    try:
-        made["strip"] = rendered(outcome.home, few), "Hover in the wind, rendered; the red mark is the reference"
-    except ValueError as error:  # no renderer
-        return made, [f"The strip of pictures is missing: {error}."]
-    return made, []
+            drawn = partial(figures.ablation, ablated, domain)
+            yield f"ablation_{domain}", f"The safe network's options, {name}", drawn
+    yield "promises", "Promised and realised cost of plans", partial(figures.promised, rows, followed)
+    yield "away", "The same flights far from home", partial(figures.far_from_home, rows)
+    yield "strip", "Hover in the wind, rendered; the red mark is the reference", partial(rendered, outcome.home, few)
 
 
 def flown_paths(blocks: Sequence[Flights], domain: str, flyers: Sequence[Flyer]) -> Figure:
-    """The flights of seed 0 of some models beside their references."""
+    """The flights of seed 0 of some models beside their references.
+
+    Raises:
+        ValueError: none of the references that are shown was flown.
+    """
     own = {block.block.reference: block for block in blocks if block.block.domain.name == domain}
     chosen = [name for name in ("hover", "figure_eight", "low_pass") if name in own]
     flights = {name: {flyer: own[name].states(flyer) for flyer in flyers} for name in chosen}

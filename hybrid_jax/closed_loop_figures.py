@@ -81,12 +81,13 @@ def far_from_home(rows: Sequence[FlightRow]) -> Figure:
     """At home and far away, each model that flew at both: a column for each reference, a row for each domain.
 
     Raises:
-        ValueError: nothing was flown away from home.
+        ValueError: nothing was flown both at home and away from it.
     """
     found = cells(rows)
-    away = sorted((cell for cell in found if cell[2]), key=lambda cell: (DOMAINS.index(cell[0]), _place(cell[1:])))
+    both = (cell for cell in found if cell[2] and (*cell[:2], 0.0) in found)
+    away = sorted(both, key=lambda cell: (DOMAINS.index(cell[0]), _place(cell[1:])))
     if not away:
-        raise ValueError("rows must not be empty: nothing was flown away from home")
+        raise ValueError("rows must not be empty: nothing was flown both at home and away from it")
     domains, references = (list(dict.fromkeys(cell[i] for cell in away)) for i in (0, 1))
     height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(found[cell]) for cell in away))
     figure = Figure(figsize=(3.6 * len(references) + 2, height), layout="constrained")

@@ -190,11 +190,12 @@ def test_a_second_run_trains_and_flies_nothing(folder):
     ("options", "named"),
     [
         (("--references", "hover", "hover"), "--references must be at least one, each different"),
+        (("--references", "hover", "--away-references", "low_pass"), "--away-references must be among --references"),
         (("--seconds", "0.2"), "--seconds must be at least 1"),
         (("--safe-inputs", "body"), "cannot be flown here"),
         (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
     ],
-    ids=["twice", "short", "body", "no physics without velocities"],
+    ids=["twice", "not at home", "short", "body", "no physics without velocities"],
 )
 def test_options_that_do_not_fit_are_refused_before_anything_is_trained(options, named, tmp_path):
     assert named in refused(command("closed_loop", *options, folder=tmp_path), "closed_loop")

@@ -6,11 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from experiments.closed_loop import ClosedLoopConfig
+from experiments.closed_loop_lanes import Block, Flights
+from experiments.closed_loop_report import Outcome, draw
 from hybrid_jax import closed_loop_figures as figures
 from hybrid_jax.closed_loop_claims import Speed, claims
 from hybrid_jax.closed_loop_paths import paths, strip
 from hybrid_jax.closed_loop_rows import REFERENCES, FlightRow, Flyer, cells, to_csv
 from hybrid_jax.closed_loop_tables import ablation_tables, gap_tables, gaps, tables
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
 
 FEW, SEEDS = 100, 3
 FLYERS = {  # mean RMSE [m] under the parameter shift and in the wind
@@ -148,9 +152,31 @@ def test_figures_have_a_panel_for_each_reference():
     assert len(figures.shares(ROWS, "external_force").axes) == len(REFERENCES)
     assert len(figures.far_from_home(ROWS).axes) == 2
     assert len(figures.promised(ROWS, [Flyer("hybrid")]).axes) == 2
-    for draw in (lambda: figures.errors([], "external_force"), lambda: figures.far_from_home([])):
+    for empty in (lambda: figures.errors([], "external_force"), lambda: figures.far_from_home([])):
         with pytest.raises(ValueError, match="rows must not be empty"):
-            draw()
+            empty()
+
+
+def test_away_from_home_is_flown_what_is_flown_at_home():
+    assert ClosedLoopConfig(references=("step", "low_pass")).flown_away == ("low_pass",)
+    assert ClosedLoopConfig(references=("upset",)).flown_away == ()
+    rows = [row for row in ROWS if row.distance or row.reference == "upset"]
+    with pytest.raises(ValueError, match="both at home and away"):
+        figures.far_from_home(rows)
+
+
+@pytest.mark.parametrize(
+    ("reference", "missing"), [("low_pass", ["away", "strip"]), ("upset", ["paths", "paths", "away", "strip"])]
+)
+def test_a_figure_of_what_was_not_flown_is_left_out_with_a_note(reference, missing):
+    crew = {who: np.zeros(1) for who in FLYERS}
+    home = [
+        Flights(Block(domain, reference, 0.0, crew), {"states": np.ones((len(crew), 11, 13))}, 1.0, 1.0, 1)
+        for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE)
+    ]
+    drawn, notes = draw(make_rows(reference), [], Outcome(home=home), FEW)
+    assert [note.partition(".png is missing")[0].split("_")[0] for note in notes] == missing
+    assert len(drawn) + len(notes) == 2 * 3 + 3
 
 
 def test_paths_are_drawn_beside_their_reference_and_a_lost_one_shrinks_nothing():
