@@ -77,8 +77,9 @@ def fly(
 
     Raises:
         ValueError: shapes that do not fit, a reference no longer than the horizon, or, where it is known, a number that
-            is not finite.
+            is not finite or a bandwidth that is negative.
     """
+    checks.not_negative("bandwidth", bandwidth)
     x0, reference = checks.floating("x0", x0), checks.floating("reference", reference)
     periods = _periods(reference, x0, controller)
 

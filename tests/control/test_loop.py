@@ -150,6 +150,9 @@ def test_what_makes_no_sense_is_refused():
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
             fly(plant(BODY), BODY, samples, x0, CONTROLLER)
+    for bandwidth in (-1.0, np.nan, jnp.asarray(-1.0)):
+        with pytest.raises(ValueError, match="bandwidth must be a finite number of at least 0"):
+            fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
 def test_the_example_of_the_package_flies(capsys):
