@@ -57,6 +57,12 @@ class _Point(eqx.Module):
     damping: Scalar
 
 
+def in_common(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[State, Float[Array, "n 13"], Plan]:
+    """The three in the type that holds the numbers of all: what is carried through a loop must not change its own."""
+    dtype = jnp.result_type(*jax.tree.leaves((x, reference, plan)))
+    return jax.tree.map(lambda leaf: leaf.astype(dtype), (x, reference, plan))
+
+
 def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
     """The state after dt [s] with u held: one step of classical RK4."""
     term = diffrax.ODETerm(lambda t, x, held: model(x, held))
@@ -144,6 +150,7 @@ class Controller:
         x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
+        x, reference, plan = in_common(x, reference, plan)
         x = x.at[QUATERNION].set(one_sheet(x[QUATERNION]))
         free, states, cost = self._first(model, reference, x, plan)
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax import checks
 from hybrid_jax.control import observer
 from hybrid_jax.control.attitude import heading
-from hybrid_jax.control.controller import Controller, Plan
+from hybrid_jax.control.controller import Controller, Plan, in_common
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.disturbance import disturbed
 from hybrid_jax.state import POSITION, QUATERNION, STATE_SIZE, Input, State
@@ -89,10 +89,11 @@ def fly(
         believed = disturbed(model, estimate.disturbance)
         u, plan = controller(believed, controller.horizon(reference, i), x, plan)
         estimate = observer.predict(estimate, model, x, u, controller.period)
-        x = plant(x, u, i * controller.period)
+        x = plant(x, u, i * controller.period).astype(x.dtype)
         return (x, plan, estimate), (x, u, plan, estimate.disturbance)
 
-    start = (x0, controller.begin(), observer.begin(x0))
+    x0, reference, plan = in_common(x0, reference, controller.begin())
+    start = (x0, plan, observer.begin(x0))
     _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))
     return Flight(jnp.concatenate([x0[None], x]), u, plans, disturbance)
 

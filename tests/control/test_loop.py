@@ -155,6 +155,24 @@ def test_what_makes_no_sense_is_refused():
             fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
+@pytest.mark.parametrize("start", [np.float32, np.float64])
+@pytest.mark.parametrize("wanted", [np.float32, np.float64])
+def test_single_and_double_precision_fly_together(start, wanted):
+    """A plant may also be in another one than all the rest; the controller alone takes what it is given as well."""
+    with jax.enable_x64(True):
+        controller, body = Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
+        reference = np.asarray(sample(hover(), controller, 0.02), wanted)
+
+        def single(x, u, t):
+            return advance(body, x, u, controller.period).astype(np.float32)
+
+        flight = fly(single, body, reference, reference[0].astype(start), controller)
+        horizon = controller.horizon(reference, 0)
+        u, _ = controller(body, horizon, reference[0].astype(start), controller.begin())
+    assert flight.x.dtype == u.dtype == np.float64
+    np.testing.assert_allclose(flight.u[0], u, rtol=1e-5)
+
+
 def test_the_example_of_the_package_flies(capsys):
     import hybrid_jax.control as package
 
