@@ -36,7 +36,7 @@ from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
 DT = 0.01  # s
-PART = 10  # repeats between two looks at the clock, at the least: some seconds on a CPU
+PART = 10  # repeats, at the least, between two looks at the clock
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's parameter shift
 NoiseOn = Literal["targets", "all"]
 
