@@ -15,9 +15,9 @@ from jaxtyping import PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.archive import named_leaves
 from hybrid_jax.objective import Learner, Settings
-from hybrid_jax.rigid_body import moves_a_rigid_body
+from hybrid_jax.preparation import prepared
 from hybrid_jax.training import FitState, Plan, make_plan, run, start
-from hybrid_jax.trajectories import Trajectories, check_attitudes
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import trainable
 
 
@@ -110,22 +110,13 @@ def fit_in_stages(
     is kept, from the first stage on.
 
     Raises:
-        ValueError: windows that the objective refuses, or of a rigid body without unit quaternions; fewer than a
-            minibatch of them, or shorter ones than a stage asks for; rates of a group that the field has not; or no
-            stages.
+        ValueError: what `preparation.prepared` refuses; shorter windows than a stage asks
+            for; rates of a group that the field has not; or no stages.
     """
     settings = Settings() if settings is None else settings
-    data, judged_on = (
-        settings.objective.prepare(windows, name) for windows, name in ((train, "train"), (validation, "validation"))
-    )
-    if moves_a_rigid_body(field):
-        check_attitudes(train, "train")
-        check_attitudes(validation, "validation")
-    checks.key("key", key)
+    data, judged_on = prepared(field, train, validation, key, settings)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
-    if len(data) < settings.batch_size:
-        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
     states = []
     for stage, stage_key in zip(stages, jax.random.split(key, len(stages)), strict=True):
         plan = make_plan(

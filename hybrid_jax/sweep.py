@@ -18,6 +18,7 @@ from hybrid_jax import hosts, training
 from hybrid_jax.lanes import LaneMap, count
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
+from hybrid_jax.preparation import check_minibatch
 from hybrid_jax.training import FitState, Plan
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
@@ -124,7 +125,7 @@ def _ready(
     """The compiled block of a sweep, the data that all lanes share, and what an epoch of each lane costs."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
-    training.check_minibatch(states.field, settings)
+    check_minibatch(states.field, settings)
     _check(plans, train, settings)
     shared = (train, validation)
     block = _block(settings, width, _shapes((states, plans), shared))

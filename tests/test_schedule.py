@@ -10,8 +10,11 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 from hybrid_jax import Hybrid, Settings, residual_network
 from hybrid_jax.features import silenced
 from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.schedule import Stage, cut, fit_in_stages, rates_by_group
 from hybrid_jax.training import make_plan
+from hybrid_jax.vector_field import Frozen
+from hybrid_jax.vehicle import IRIS
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
@@ -76,6 +79,21 @@ def test_stages_that_make_no_sense_are_refused(stages, said):
         trained(stages)
     with pytest.raises(ValueError, match="rates"):
         Stage({"": -1.0})
+
+
+@pytest.mark.parametrize(
+    ("field", "size", "said"),
+    [
+        (rigid_body(IRIS), 20, "train: field: RigidBody does not take a state"),
+        (FIELD, 2.5, "settings.batch_size must be an integer of at least 1, got 2.5"),
+        (FIELD, 61, "train has 60 windows, fewer than batch_size=61"),
+        (Frozen(FIELD), 20, "field: Frozen has nothing to learn"),
+    ],
+    ids=["other field", "no count", "few windows", "frozen"],
+)
+def test_what_a_fit_refuses_stages_refuse(field, size, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        fit_in_stages(field, TRAIN, VALIDATION, KEY, [Stage({"": 0.1})], Settings(size))
 
 
 def test_rates_by_group_are_those_of_a_plan():
