@@ -6,6 +6,7 @@ from typing import Any, Protocol
 import diffrax
 from jaxtyping import Array, Float, PyTree
 
+from hybrid_jax import checks
 from hybrid_jax.loss import Minibatch, Regulariser, loss, minibatch
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.rollout import RK4, along, rollout_minibatch
@@ -69,9 +70,18 @@ class Prediction:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all lanes of a sweep and fixed when it is compiled."""
+    """What is the same for all lanes of a sweep and fixed when it is compiled.
+
+    Raises:
+        ValueError: a regulariser that is no function, such as the name of one.
+    """
 
     batch_size: int = 100
     regulariser: Regulariser | None = None
     solver: diffrax.AbstractSolver = field(default_factory=RK4)
     objective: Objective = Prediction()
+
+    def __post_init__(self):
+        if self.regulariser is not None and not callable(self.regulariser):
+            said = checks.shown(self.regulariser)
+            raise ValueError(f"regulariser must be a function, such as one of hybrid_jax.loss.REGULARISERS, got {said}")

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from pendulum import pendulum
 
-from hybrid_jax.loss import REGULARISERS, Minibatch, loss, minibatch, mse
+from hybrid_jax.loss import REGULARISERS, Minibatch, cosine, loss, minibatch, mse
+from hybrid_jax.objective import Settings
 from hybrid_jax.residual import residual_network
 from hybrid_jax.rollout import RK4, along, rollout_batch, rollout_minibatch
 from hybrid_jax.trajectories import Trajectories
@@ -194,3 +195,10 @@ def test_a_field_without_two_parts_has_no_regulariser(name, batch):
 def test_minibatch_is_a_pytree_with_its_step_static(batch):
     assert isinstance(batch, Minibatch)
     assert len(jax.tree.leaves(batch)) == 3
+
+
+def test_a_regulariser_by_name_is_refused_where_it_is_set():
+    said = r"^regulariser must be a function, such as one of hybrid_jax\.loss\.REGULARISERS, got 'cosine'$"
+    with pytest.raises(ValueError, match=said):
+        Settings(regulariser="cosine")
+    assert hash(Settings(regulariser=cosine)) == hash(Settings(regulariser=cosine))
