@@ -145,13 +145,16 @@ class Controller:
             plan: that of the last call, or `begin()`.
 
         Raises:
-            ValueError: shapes that do not fit, or, where it is known, a number that is not finite.
+            ValueError: shapes that do not fit, or, where it is known, a number that is not finite or a quaternion that
+                is none of a rotation. A compiled call normalises that of x.
         """
         x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
+        checks.unit_quaternions("x", x)
+        checks.unit_quaternions("reference", reference)
         x, reference, plan = in_common(x, reference, plan)
-        x = x.at[QUATERNION].set(one_sheet(x[QUATERNION]))
+        x = x.at[QUATERNION].set(one_sheet(normalise(x[QUATERNION])))
         free, states, cost = self._first(model, reference, x, plan)
 
         def iteration(_, point):

@@ -77,7 +77,7 @@ def fly(
 
     Raises:
         ValueError: shapes that do not fit, a reference no longer than the horizon, or, where it is known, a number that
-            is not finite or a bandwidth that is negative.
+            is not finite, a quaternion that is none of a rotation or a bandwidth that is negative.
     """
     checks.not_negative("bandwidth", bandwidth)
     x0, reference = checks.floating("x0", x0), checks.floating("reference", reference)
@@ -92,6 +92,8 @@ def fly(
         x = plant(x, u, i * controller.period).astype(x.dtype)
         return (x, plan, estimate), (x, u, plan, estimate.disturbance)
 
+    checks.unit_quaternions("x0", x0)
+    checks.unit_quaternions("reference", reference)
     x0, reference, plan = in_common(x0, reference, controller.begin())
     start = (x0, plan, observer.begin(x0))
     _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))

@@ -121,6 +121,19 @@ def test_the_cost_of_a_plan_is_that_of_its_rollout_and_has_no_slope_at_the_end(s
     assert np.abs(slope).max() < 1e-4 * begin
 
 
+def test_the_length_of_the_quaternion_says_nothing_and_is_refused_where_it_is_known(still):
+    x, reference = still
+    x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
+    for factor in (0.5, 1.1):
+        long = x.at[3:7].multiply(factor)
+        np.testing.assert_allclose(command(long, reference)[0], command(x, reference)[0], rtol=1e-4)
+    for factor in (0.0, 1.1):
+        with pytest.raises(ValueError, match=r"x\[3:7\] must be a unit quaternion"):
+            CONTROLLER(BODY, reference, x.at[3:7].multiply(factor), CONTROLLER.begin())
+    with pytest.raises(ValueError, match=r"reference\[2, 3:7\] must be a unit quaternion"):
+        CONTROLLER(BODY, reference.at[2, 3:7].multiply(2.0), x, CONTROLLER.begin())
+
+
 def test_lanes_of_fields_references_and_states_are_single_calls(still):
     x, reference = still
     models = [hybrid(i) for i in range(3)]

@@ -150,6 +150,8 @@ def test_what_makes_no_sense_is_refused():
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
             fly(plant(BODY), BODY, samples, x0, CONTROLLER)
+    with pytest.raises(ValueError, match=r"x0\[3:7\] must be a unit quaternion"):
+        fly(plant(BODY), BODY, reference, reference[0].at[3:7].set(0.0), CONTROLLER)
     for bandwidth in (-1.0, np.nan, jnp.asarray(-1.0)):
         with pytest.raises(ValueError, match="bandwidth must be a finite number of at least 0"):
             fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
