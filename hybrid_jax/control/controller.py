@@ -132,7 +132,18 @@ class Controller:
         return self._speeds(jnp.tanh(plan.free))
 
     def horizon(self, reference: Float[Array, "n 13"], i: int | Scalar) -> Float[Array, "t 13"]:
-        """The reference at the end of each interval of a call at sample i, from one sampled every period."""
+        """The reference at the end of each interval of a call at sample i, from one sampled every period.
+
+        A compiled program cannot refuse an i whose horizon goes on beyond the reference: there the last sample stands
+        for all that is missing, with the velocity that it has.
+
+        Raises:
+            ValueError: where i is known, one that is negative or whose horizon goes on beyond the reference.
+        """
+        checks.count("i", i, least=0)
+        last = len(reference) - 1 - self.steps * self.stride
+        if not checks.is_traced(i) and i > last:
+            raise ValueError(f"reference must have {self.steps * self.stride} samples after i, so i ≤ {last}; got {i}")
         return reference[i + self.stride * jnp.arange(1, self.steps + 1)]
 
     def __call__(

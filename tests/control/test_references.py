@@ -30,6 +30,10 @@ def test_it_reaches_to_the_end_of_the_last_horizon(states):
     horizon = CONTROLLER.horizon(jnp.asarray(states), 100)
     np.testing.assert_allclose(horizon[-1], states[-1], rtol=1e-6)
     np.testing.assert_allclose(horizon[0], states[105], rtol=1e-6)
+    with pytest.raises(ValueError, match="i ≤ 100; got 101"):
+        CONTROLLER.horizon(jnp.asarray(states), 101)
+    with pytest.raises(ValueError, match="i must be an integer of at least 0, got -1"):
+        CONTROLLER.horizon(jnp.asarray(states), -1)
 
 
 def test_velocity_and_rates_are_the_derivatives_of_position_and_attitude(states):
