@@ -46,7 +46,8 @@ is known to it without noise.
   which is what a steady force is, moves at a rate of its own in adaptation (--safe-offset)
 - **safe, nine numbers**: the safe hybrid of the source, its network left as it is; least squares fits Ix, Iy, k and a
   constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation flights
-- **true vehicle, mean wind**: the simulator's own equations and the wind's mean, the best that no clock can beat
+- **true vehicle, mean wind**: the simulator's own equations and the wind's mean; no bound, for an observer follows the
+  sine as well
 - **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
 
 RMSE: over the flight after its start. A flight crashed if it went below the ground or 10 m astray, and then counts as

@@ -25,7 +25,7 @@ NOTES = Console(stderr=True)
 class Options:
     """Fly a simulated quadrotor at random and save windows of the flights as one dataset file.
 
-    The pilot wanders between waypoints at up to about 5 m/s, two fifths of the time less than 0.5 m above ground, and
+    The pilot wanders between waypoints at up to about 5 m/s, a quarter of the time less than 0.5 m above ground, and
     shakes the vehicle so that its inertia shows. Every split comes from flights of its own. The same arguments give the
     same file, byte for byte; a file that exists with other content is never overwritten.
 
