@@ -86,7 +86,8 @@ class Controller:
         unit_quaternion: normalise the quaternion after each step of the prediction.
 
     Raises:
-        ValueError: a number out of its range, or an interval that is no multiple of the period.
+        ValueError: no vehicle or no weights, a number out of its range, or an interval that is no multiple of the
+            period.
     """
 
     vehicle: Vehicle
@@ -100,6 +101,9 @@ class Controller:
     unit_quaternion: bool = True
 
     def __post_init__(self):
+        for name, kind in (("vehicle", Vehicle), ("weights", Weights)):
+            if not isinstance(getattr(self, name), kind):
+                raise ValueError(f"{name} must be a {kind.__name__}, got {checks.shown(getattr(self, name))}")
         checks.count("steps", self.steps, least=2)
         checks.count("iterations", self.iterations)
         for name in ("interval", "period", "damping"):
@@ -156,12 +160,15 @@ class Controller:
             plan: that of the last call, or `begin()`.
 
         Raises:
-            ValueError: shapes that do not fit, or, where it is known, a number that is not finite or a quaternion that
-                is none of a rotation. A compiled call normalises that of x.
+            ValueError: no model, no plan of this horizon, shapes that do not fit, or, where it is known, a number that
+                is not finite or a quaternion that is none of a rotation. A compiled call normalises that of x.
         """
+        if not callable(model):
+            raise ValueError(f"model must be a vector field, got {checks.shown(model)}")
         x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
+        self._check_plan(plan)
         checks.unit_quaternions("x", x)
         checks.unit_quaternions("reference", reference)
         x, reference, plan = in_common(x, reference, plan)
@@ -174,6 +181,13 @@ class Controller:
         point = jax.lax.fori_loop(0, self.iterations, iteration, _Point(free, states, cost, plan.damping))
         plan = Plan(point.free, point.cost, point.damping)
         return self.speeds(plan)[0], plan
+
+    def _check_plan(self, plan: Plan) -> None:
+        if not isinstance(plan, Plan):
+            raise ValueError(f"plan must be begin() or that of the last call, got {checks.shown(plan)}")
+        if plan.free.shape != (self.steps, INPUT_SIZE):
+            expected = f"{self.steps} intervals, as begin() has"
+            raise ValueError(f"plan must be one of {expected}, got free numbers of shape {plan.free.shape}")
 
     def _range(self) -> tuple[float, float]:
         return (self.vehicle.max_rotor_speed + self.min_speed) / 2, (self.vehicle.max_rotor_speed - self.min_speed) / 2

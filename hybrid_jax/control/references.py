@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller
 from hybrid_jax.rotation import Quaternion, conjugate, from_axis_angle, multiply
-from hybrid_jax.state import BODY_RATES, State
+from hybrid_jax.state import BODY_RATES, STATE_SIZE, State
 
 Scalar = Float[Array, ""]
 Path = Callable[[Scalar], tuple[Float[Array, "3"], Scalar]]
@@ -28,8 +28,10 @@ def sample(path: Path, controller: Controller, duration: float) -> Float[Array, 
     """Reference states every period for a flight of so many seconds and the horizon after its last call.
 
     Raises:
-        ValueError: a duration that is no positive number.
+        ValueError: no path, or a duration that is no positive number.
     """
+    if not callable(path):
+        raise ValueError(f"path must be a function of time, such as hover(), got {checks.shown(path)}")
     checks.positive("duration", duration, "a positive number of seconds")
     count = round(duration / controller.period) + controller.steps * controller.stride + 1
     times = controller.period * jnp.arange(count)
@@ -62,7 +64,13 @@ def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
 
 
 def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0.0) -> Path:
-    """Stay at a place [m]."""
+    """Stay at a place [m].
+
+    Raises:
+        ValueError: a place that is none, or a number that is not finite.
+    """
+    _check_vector("position", position)
+    checks.number("yaw", yaw)
     return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
 
 
@@ -70,10 +78,12 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
     """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, at an even phase; fastest, √2 a φ̇ [m/s], at its centre.
 
     Raises:
-        ValueError: a speed or a width that is not positive.
+        ValueError: a speed or a width that is not positive, or a number that is not finite.
     """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
+    checks.number("altitude", altitude)
+    checks.number("yaw", yaw)
     turning = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):
@@ -85,7 +95,14 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
 
 
 def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, altitude: float = 1.5) -> Path:
-    """Hover over the origin, and from time `at` [s] on further by `to` [m] and turned by yaw [rad], all at once."""
+    """Hover over the origin, and from time `at` [s] on further by `to` [m] and turned by yaw [rad], all at once.
+
+    Raises:
+        ValueError: a way that is none, or a number that is not finite.
+    """
+    _check_vector("to", to)
+    for name, value in (("at", at), ("yaw", yaw), ("altitude", altitude)):
+        checks.number(name, value)
 
     def path(t):
         after = jnp.where(t >= at, 1.0, 0.0)
@@ -100,8 +117,10 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
     The descent, cos⁴, is flat at the bottom: two fifths of the time are spent in the lowest tenth.
 
     Raises:
-        ValueError: altitudes that are not 0 < low < high, or a time that is not positive.
+        ValueError: altitudes that are not 0 < low < high, a time that is not positive, or a number that is not finite.
     """
+    checks.number("speed", speed)
+    checks.number("high", high)
     checks.positive("low", low)
     checks.positive("every", every)
     if not low < high:
@@ -115,5 +134,19 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
 
 
 def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
-    """The state thrown into a rotation [rad/s, body frame]: a start, from which to recover to hover."""
+    """The state thrown into a rotation [rad/s, body frame]: a start, from which to recover to hover.
+
+    Raises:
+        ValueError: no state, or no rates.
+    """
+    state = checks.floating("state", state)
+    if state.shape != (STATE_SIZE,):
+        raise ValueError(f"state (13,) expected, got {state.shape}")
+    _check_vector("rates", rates)
     return state.at[BODY_RATES].add(jnp.array(rates))
+
+
+def _check_vector(name: str, value: tuple[float, float, float]) -> None:
+    shape = checks.floating(name, value).shape
+    if shape != (3,):
+        raise ValueError(f"{name} must be three numbers (x, y, z), got {checks.shown(value)}")

@@ -165,11 +165,13 @@ def test_the_quaternion_is_normalised_or_not():
         ({"interval": 0.005}, "interval must be a multiple"),
         ({"damping": 0.0}, "damping"),
         ({"min_speed": 700.0}, "hover speed"),
+        ({"weights": {"position": 1.0}}, r"weights must be a Weights, got \{'position': 1.0\}"),
+        ({"vehicle": None}, "vehicle must be a Vehicle, got None"),
     ],
 )
 def test_what_makes_no_sense_is_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
-        Controller(hj.IRIS, **wrong)
+        Controller(**{"vehicle": hj.IRIS, **wrong})
 
 
 def test_wrong_weights_and_shapes_are_refused(still):
@@ -182,3 +184,9 @@ def test_wrong_weights_and_shapes_are_refused(still):
         CONTROLLER(BODY, reference[:-1], x, CONTROLLER.begin())
     with pytest.raises(ValueError, match="finite"):
         CONTROLLER(BODY, reference, x.at[0].set(jnp.nan), CONTROLLER.begin())
+    with pytest.raises(ValueError, match="model must be a vector field, got None"):
+        CONTROLLER(None, reference, x, CONTROLLER.begin())
+    with pytest.raises(ValueError, match=r"plan must be begin\(\) or that of the last call, got None"):
+        CONTROLLER(BODY, reference, x, None)
+    with pytest.raises(ValueError, match=r"plan must be one of 20 intervals, .* of shape \(10, 4\)"):
+        CONTROLLER(BODY, reference, x, Controller(VEHICLE, steps=10).begin())

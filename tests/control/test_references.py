@@ -85,3 +85,24 @@ def test_what_makes_no_sense_is_refused():
         figure_eight(0.0)
     with pytest.raises(ValueError, match="duration"):
         sample(hover(), CONTROLLER, -1.0)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: hover((0.0, 0.0)), r"position must be three numbers \(x, y, z\), got \(0.0, 0.0\)"),
+        (lambda: hover((0.0, 0.0, np.nan)), r"position\[2\] is not finite"),
+        (lambda: hover("abc"), "position must be an array of real numbers"),
+        (lambda: hover(yaw=np.inf), "yaw must be a finite number"),
+        (lambda: figure_eight(3.5, altitude=np.nan), "altitude must be a finite number"),
+        (lambda: step(to=(1.0, 2.0)), "to must be three numbers"),
+        (lambda: step(to=(1.0, 2.0, 3.0), at=np.nan), "at must be a finite number"),
+        (lambda: low_pass(speed=np.inf), "speed must be a finite number"),
+        (lambda: upset(jnp.zeros(4)), r"state \(13,\) expected"),
+        (lambda: upset(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
+        (lambda: sample(None, CONTROLLER, 1.0), "path must be a function of time"),
+    ],
+)
+def test_a_place_or_a_number_that_is_none_is_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
