@@ -10,7 +10,16 @@ import numpy as np
 
 from experiments.flight_protocol import Cleaning, RealFlightConfig
 from hybrid_jax.archive import digest
-from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample, windows
+from hybrid_jax.flights.cleaning import (
+    align_motors,
+    delay_motors,
+    even_segments,
+    in_flight,
+    lag_motors,
+    low_pass,
+    resample,
+    windows,
+)
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
@@ -65,10 +74,11 @@ def require_one_rate(flown: Sequence[Flown]) -> float:
     """The interval [s] between samples, the same in all flights.
 
     Raises:
-        ValueError: two flights of which it differs.
+        ValueError: two flights of which it differs, or one in which it does.
     """
     logs = [log for each in flown for log in each.logs]
     for log in logs:
+        even_segments(log)
         if log.dt != logs[0].dt:
             raise ValueError(
                 f"{log.name}: samples are {log.dt:g} s apart, those of {logs[0].name} {logs[0].dt:g} s; "

@@ -68,6 +68,14 @@ def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
         require_one_rate([found])
 
 
+def test_uneven_samples_are_refused_before_anything_is_trained(tmp_path):
+    t = LOGS[0].t.copy()
+    t[10] += DT / 3
+    found = fly_in("source", write(tmp_path, [LOGS[1], replace(LOGS[0], t=t)]), IRIS, 0.0, CONFIG)
+    with pytest.raises(ValueError, match=r"chirp_run1.*resample the log first"):
+        require_one_rate([found])
+
+
 def test_hidden_files_and_folders_are_no_flights(tmp_path):
     source = write(tmp_path, LOGS[:1])
     (source / "._chirp_run1.csv").write_bytes(b"\x00\x05\x16\x07")  # what macOS leaves beside a file on other disks

@@ -88,7 +88,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     sections = signal.butter(2, cutoff, fs=rate, output="sos")
     log, all_samples = log[~repeats(log)], len(log)  # a copy of what came before would no longer be known as one
     x, u = log.x.copy(), log.u.copy()
-    for part in _even_segments(log):
+    for part in even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
         both = _forward(sections, both) if causal else _both_ways(sections, both)
         x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
@@ -138,7 +138,7 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
     """
     if not 0 <= time_constant < np.inf:
         raise ValueError(f"time_constant must be a number of seconds of at least 0, got {time_constant!r}")
-    _even_segments(log)
+    even_segments(log)
     lagging = FlightLog(log.t, log.x, lagged(log, time_constant), log.name)
     return lagging, f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
 
@@ -172,7 +172,7 @@ def windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectori
     """
     parts = [
         windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps, stride=stride)
-        for part in _even_segments(log)
+        for part in even_segments(log)
         if part.stop - part.start > steps
     ]
     if not parts:
@@ -183,7 +183,12 @@ def windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectori
     return concatenate(parts)
 
 
-def _even_segments(log: FlightLog) -> list[slice]:
+def even_segments(log: FlightLog) -> list[slice]:
+    """Its segments, if the samples of each are evenly spaced.
+
+    Raises:
+        ValueError: where they are not.
+    """
     for part in (found := segments(log)):
         uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
         if uneven.any():
