@@ -1,7 +1,7 @@
 """Figures of closed-loop flight: errors of all that flew, shares of the gap, promises, far from home, and paths."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 
 import matplotlib as mpl
 import numpy as np
@@ -48,7 +48,9 @@ def errors(rows: Sequence[FlightRow], domain: str) -> Figure:
         draw_panel(axes, [_line(flyer, group[flyer]) for flyer in group], REFERENCES[reference])
         axes.set_xlabel(XLABEL)
     figure.suptitle(
-        f"{NAMES[domain].capitalize()}: how far from the reference each model flies (not finite: crashed)", fontsize=12
+        f"{NAMES[domain].capitalize()}: how far from the reference each model flies (not finite: crashed"
+        f"{floored(_nearest(found.values()), NEAREST, '; ')})",
+        fontsize=12,
     )
     add_legend(figure, any(row.crashed for group in found.values() for flown in group.values() for row in flown))
     return figure
@@ -70,7 +72,9 @@ def ablation(rows: Sequence[FlightRow], domain: str) -> Figure:
         draw_panel(axes, lines, REFERENCES[reference] + (f", {away:g} m from home" if away else ""))
         axes.set_xlabel(XLABEL)
     figure.suptitle(
-        f"{NAMES[domain].capitalize()}: what makes a network safe to fly (not finite: crashed)", fontsize=12
+        f"{NAMES[domain].capitalize()}: what makes a network safe to fly (not finite: crashed"
+        f"{floored(_nearest(found.values()), NEAREST, '; ')})",
+        fontsize=12,
     )
     add_legend(figure, any(row.crashed for group in found.values() for flown in group.values() for row in flown))
     return figure
@@ -101,7 +105,10 @@ def far_from_home(rows: Sequence[FlightRow]) -> Figure:
         f"{away[0][2]:g} m away": Line2D([], [], color="0.3", marker=">", linestyle="", markersize=7),
     }
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title="mean over seeds")
-    figure.suptitle("The same flight at home and far from it", fontsize=12)
+    pairs = (_means(found[*cell[:2], 0.0], found[cell]) for cell in away)
+    nearest = min(value for means in pairs for pair in means.values() for value in pair)
+    words = floored(nearest, NEAREST, " (")
+    figure.suptitle("The same flight at home and far from it" + (f"{words})" if words else ""), fontsize=12)
     return figure
 
 
@@ -165,6 +172,11 @@ def promised(rows: Sequence[FlightRow], flyers: Sequence[Flyer]) -> Figure:
     return figure
 
 
+def floored(nearest: float, floor: float, before: str) -> str:
+    """Words for a title after `before`: that less than the floor [cm] is drawn there; none if nothing [cm] is less."""
+    return f"{before}below {floor:g} cm drawn there" if nearest < floor else ""
+
+
 def _grid(count: int, names: Sequence[str], width: float = 3.2) -> tuple[Figure, list[Axes]]:
     """Panels for as many references, with room for a line of each of these names, which may stand there twice."""
     columns = 2 if count == 4 else min(count, 3)
@@ -187,24 +199,42 @@ def _centimetres(rows: Sequence[FlightRow]) -> np.ndarray:
     return np.array([max(100 * row.error, NEAREST) for row in rows])
 
 
+def _nearest(groups: Iterable[Mapping[Flyer, list[FlightRow]]]) -> float:
+    """The least position RMSE [cm]."""
+    return min(100 * row.error for group in groups for rows in group.values() for row in rows)
+
+
 def _line(flyer: Flyer, rows: Sequence[FlightRow]) -> Line:
     marked = "the true vehicle as its own model" if flyer == ORACLE else ""
     return Line(flyer.name, _centimetres(rows), TINTS[flyer.model], marked)
 
 
+def _means(
+    home: Mapping[Flyer, list[FlightRow]], away: Mapping[Flyer, list[FlightRow]]
+) -> dict[Flyer, tuple[float, float]]:
+    """The mean position RMSE [cm] here and there of who flew there."""
+    return {who: (_mean(home[who]), _mean(away[who])) for who in away}
+
+
+def _mean(rows: Sequence[FlightRow]) -> float:
+    return 100 * float(np.mean([row.error for row in rows]))
+
+
 def _draw_away(axes: Axes, home: Mapping[Flyer, list[FlightRow]], away: Mapping[Flyer, list[FlightRow]]) -> None:
-    means = {flyer: [float(np.mean(_centimetres(place[flyer]))) for place in (home, away)] for flyer in away}
-    finite = [value for pair in means.values() for value in pair if math.isfinite(value)] or [1.0]
+    means = _means(home, away)
+    finite = [max(value, NEAREST) for pair in means.values() for value in pair if math.isfinite(value)] or [1.0]
     axes.set(xscale="log", xlim=(min(finite) / 1.4, max(finite) * 1.8), ylim=(len(away) - 0.4, -0.6), xlabel=XLABEL)
     tick_errors(axes.xaxis, *axes.get_xlim())
     axes.set_yticks(range(len(away)), [flyer.name for flyer in away])
     for y, (flyer, (here, there)) in enumerate(means.items()):
         edge = axes.get_xlim()[1]
-        axes.plot([here, min(there, edge)], [y, y], color=TINTS[flyer.model], linewidth=1)
-        axes.plot(here, y, "o", color=TINTS[flyer.model], markersize=5)
+        start, end = max(here, NEAREST), min(max(there, NEAREST), edge)
+        axes.plot([start, end], [y, y], color=TINTS[flyer.model], linewidth=1)
+        axes.plot(start, y, "o", color=TINTS[flyer.model], markersize=5)
         crashed = sum(row.crashed for row in away[flyer])
-        words = f"{crashed} of {len(away[flyer])} crash" if crashed else f"{there:.2g}"
-        axes.plot(min(there, edge), y, "x" if crashed else ">", color=TINTS[flyer.model], markersize=7, clip_on=False)
+        number = f"{there:.2g}" if there >= NEAREST else f"{there:.2f}"
+        words = f"{crashed} of {len(away[flyer])} crash" if crashed else number
+        axes.plot(end, y, "x" if crashed else ">", color=TINTS[flyer.model], markersize=7, clip_on=False)
         style = {
             "va": "bottom" if crashed else "center",
             "fontsize": 7,
@@ -213,7 +243,7 @@ def _draw_away(axes: Axes, home: Mapping[Flyer, list[FlightRow]], away: Mapping[
         }
         axes.annotate(
             words,
-            (min(there, edge), y),
+            (end, y),
             (-8 if crashed else 7, 4 if crashed else 0),
             textcoords="offset points",
             **style,

@@ -1,5 +1,6 @@
 """Flights beside their reference: the path over the ground and the distance from it over time."""
 
+import math
 from collections.abc import Mapping, Sequence
 
 import matplotlib as mpl
@@ -7,7 +8,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.figure import Figure
 
-from hybrid_jax.closed_loop_figures import TINTS
+from hybrid_jax.closed_loop_figures import TINTS, floored
 from hybrid_jax.closed_loop_rows import REFERENCES, Flyer
 from hybrid_jax.error_panels import tick_errors
 from hybrid_jax.figures import STYLE
@@ -37,6 +38,7 @@ def paths(
         raise ValueError("flights must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 0.9 + 2.9 * len(flights)), layout="constrained")
     panels = figure.subplots(len(flights), 2, squeeze=False, width_ratios=(1, 1.25))
+    nearest = math.inf
     for (above, beside), (reference, flown) in zip(panels, flights.items(), strict=True):
         wanted = references[reference][:, POSITION]
         seen = VIEWS.get(reference, ABOVE)
@@ -45,7 +47,9 @@ def paths(
             place = states[:, POSITION]
             style = {"color": TINTS[flyer.model], "linestyle": _dash(flyer), "label": flyer.name}
             above.plot(*place[:, seen].T, linewidth=1.2, **style)
-            error = np.clip(100 * np.linalg.norm(place - wanted, axis=1), NEAREST, FURTHEST)
+            error = 100 * np.linalg.norm(place - wanted, axis=1)
+            nearest = np.fmin(nearest, np.nanmin(error))
+            error = np.clip(error, NEAREST, FURTHEST)
             beside.plot(dt * np.arange(len(error)), error, linewidth=1.2, **style)
         _frame(above, wanted[:, seen], level=seen == ABOVE)
         side = "from above" if seen == ABOVE else "from the side"
@@ -54,7 +58,8 @@ def paths(
         tick_errors(beside.yaxis, *beside.get_ylim())
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(title, fontsize=12)
+    words = floored(nearest, NEAREST, " (")
+    figure.suptitle(title + (f"{words})" if words else ""), fontsize=12)
     return figure
 
 

@@ -15,6 +15,7 @@ from hybrid_jax.figures import DRAWABLE
 
 REACH = 100.0  # the axis ends at this many times the smallest mean; what lies beyond is marked at its edge
 MARGIN = 1.15  # factor of room at either end of the axis
+LONG = 0.05  # numbers up to this are long, such as 0.05
 HALF = 0.3  # of the height of a line of the figure: a mean's bar, and the band over which its seeds are spread
 
 _Limits = tuple[float, float]
@@ -70,7 +71,8 @@ def add_legend(figure: Figure, failed: bool) -> None:
 def tick_errors(axis: Axis, low: float, high: float) -> None:
     """Numbers at 1, 2, 5 of a decade; at round steps where a log axis is shorter, at decades where it is longer."""
     decades = math.log10(high / low)
-    locator = LogLocator(subs=(1.0, 2.0, 5.0) if decades < 2.2 else (1.0,))
+    room = 2.2 if low > LONG else 1.5  # decades
+    locator = LogLocator(subs=(1.0, 2.0, 5.0) if decades < room else (1.0,))
     axis.set_major_locator(MaxNLocator(5) if decades < 0.8 else locator)
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())

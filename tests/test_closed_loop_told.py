@@ -157,6 +157,24 @@ def test_figures_have_a_panel_for_each_reference():
             empty()
 
 
+def test_what_is_drawn_at_the_floor_is_said_and_told_by_its_number():
+    still = changed(ROWS, Flyer("oracle"), "parameter_shift", position_rmse=2.5e-6)
+    assert "below" not in figures.far_from_home(ROWS).get_suptitle()
+    drawn = figures.far_from_home(still)
+    assert drawn.get_suptitle().endswith("(below 0.01 cm drawn there)")
+    assert "0.00" in [text.get_text() for axes in drawn.axes for text in axes.texts]
+    told = [figures.errors(still, domain).get_suptitle() for domain in ("parameter_shift", "external_force")]
+    assert [title.endswith("below 0.01 cm drawn there)") for title in told] == [True, False]
+
+
+def test_ticks_of_small_errors_do_not_stand_in_each_other():
+    """Numbers of four characters, at 1, 2, 5 of two decades."""
+    rows = changed(changed(ROWS, Flyer("oracle"), position_rmse=0.0), Flyer("hybrid"), position_rmse=0.009)
+    axes = figures.errors(rows, "external_force").axes[0]
+    low, high = axes.get_xlim()
+    assert [tick for tick in axes.get_xticks() if low < tick < high] == pytest.approx([0.01, 0.1, 1.0])
+
+
 def test_away_from_home_is_flown_what_is_flown_at_home():
     assert ClosedLoopConfig(references=("step", "low_pass")).flown_away == ("low_pass",)
     assert ClosedLoopConfig(references=("upset",)).flown_away == ()
@@ -185,6 +203,7 @@ def test_paths_are_drawn_beside_their_reference_and_a_lost_one_shrinks_nothing()
     lost = wanted.copy()
     lost[5:, 1] = 1e3
     drawn = paths({"hover": {Flyer("hybrid"): wanted + 0.01, Flyer("oracle"): lost}}, {"hover": wanted}, 0.05, "Paths")
+    assert drawn.get_suptitle() == "Paths (below 0.02 cm drawn there)"
     above, beside = drawn.axes
     assert above.get_ylim()[1] < 2
     assert beside.lines[1].get_ydata().max() == 300.0
