@@ -3,6 +3,7 @@
 Where they disagree, the usual mistakes are undone one at a time, and the one that makes them agree is suggested.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import combinations
 
@@ -46,6 +47,8 @@ NOISE = 0.2  # of the least motion: readings that differ by less are the same
 CLEAR = 1.0  # times the least motion that an axis must move to be judged alone
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
 
+Law = Callable[[Vectors, Vectors, float], str]  # of two records and the least motion: what is wrong, if anything
+
 
 @dataclass(frozen=True)
 class Check:
@@ -74,10 +77,11 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """
     skip = max(0, (len(log) - MOST_SAMPLES) // 2)
     log = log[skip : skip + MOST_SAMPLES]
+    exact = _no_axis_apart, _one_scale  # kinematics; wind and drag part v̇ from thrust
     return [
         *_samples(log),
-        _judge(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"]),
-        _judge(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"]),
+        _judge(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
+        _judge(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
         _judge(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
         *_thrust(log, vehicle),
         _columns(log),
@@ -181,39 +185,38 @@ def _lag(lag: float, limit: float) -> Check:
     return Check("lag of the gyro behind the motors", lag, "ms", limit, *_at_most(abs(lag), limit, advice))
 
 
-def _judge(log: FlightLog, name: str, readings: Readings, limit: float, least: float) -> Check:
-    """Compare two records under every reading."""
+def _judge(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
+    """Compare two records under every reading, and by what else must hold of them."""
     smooth = smoother(log)
     pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in readings.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:
         return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value = _relative_error(a, b)
-    verdict = (OK, NOTHING) if (advice := _advice(pairs, limit, least)) is None else (FAILS, advice)
-    return Check(name, value, "relative error", limit, *verdict)
+    advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
+    advice = advice or next(filter(None, (law(a, b, least) for law in laws)), "")
+    return Check(name, value, "relative error", limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
-def _advice(pairs: Readings, limit: float, least: float) -> str | None:
-    """What to correct, if anything."""
-    a, b = pairs[NOTHING]
+def _nearer(pairs: Readings, limit: float, least: float) -> str:
+    """The reading under which the records are nearest to each other, if that is another than the log's own."""
     left = {reading: a - b for reading, (a, b) in pairs.items()}
+    own = left[NOTHING]
     # Nearer by any margin counts, if the two readings differ by more than noise: a slow axis is a small part of all.
-    nearer = [
-        r for r in left if _size(left[NOTHING] - left[r]) > NOISE * least and _size(left[r]) < _size(left[NOTHING])
-    ]
-    if nearer:
-        best = min(nearer, key=lambda reading: _size(left[reading]))
-        if _relative_error(*pairs[best]) <= limit:
-            return best
-    apart = [axis for axis, ratio in enumerate(_by_axis(a, b, least)) if ratio > AXIS_LIMIT]
-    if _relative_error(a, b) > limit:
-        return UNUSUAL
-    if apart:
-        return f"{' and '.join('xyz'[axis] for axis in apart)} alone: {UNUSUAL}"
+    nearer = [r for r, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
+    best = min(nearer, key=lambda reading: _size(left[reading]), default=NOTHING)
+    return best if nearer and _relative_error(*pairs[best]) <= limit else ""
+
+
+def _no_axis_apart(a: Vectors, b: Vectors, least: float) -> str:
+    apart = [axis for axis, ratio in zip("xyz", _by_axis(a, b, least), strict=True) if ratio > AXIS_LIMIT]
+    return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
+
+
+def _one_scale(a: Vectors, b: Vectors, least: float) -> str:
     gain = float((a * b).sum() / (b * b).sum())
-    if not 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
-        return f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
-    return None
+    said = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
+    return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else said
 
 
 def _by_axis(a: Vectors, b: Vectors, least: float) -> list[float]:

@@ -133,6 +133,17 @@ def test_spins_that_do_not_balance_are_told(flight, spin):
     assert (checks[YAW].verdict, "two of its rotors" in checks[YAW].suggestion) == (FAILS, True)
 
 
+def test_a_steady_wind_is_no_mistake_of_the_log(flight):
+    """A push that no rotor makes is most of what one axis does: that is not the log's fault."""
+    x = flight.x.copy()
+    still = [0, 1, 1]  # along x the rotors move it, but it does not move
+    pushed = FlightLog(
+        flight.t, np.concatenate([x[:, :3] * still, x[:, 3:7], x[:, 7:10] * still, x[:, 10:]], 1), flight.u
+    )
+    check = table(pushed)[THRUST]
+    assert (check.verdict, check.value > 0.3) == (OK, True)
+
+
 def test_time_on_the_ground_is_told_and_hides_no_thrust(flight):
     x = np.tile(flight.x[:1], (600, 1))
     x[:, 7:] = 0
