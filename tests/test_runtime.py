@@ -29,6 +29,22 @@ loop = jax.jit(lambda x: jax.lax.scan(lambda x, _: (x - x[::-1] ** 3, None), x, 
 print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call"))
 """
 
+IMPORTS = """
+import importlib, pkgutil, sys
+from pathlib import Path
+import jax
+import benchmarks, experiments, hybrid_jax
+from hybrid_jax.runtime import configure, cores
+packages = (benchmarks, experiments, hybrid_jax)
+found = [module for package in packages for module in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
+names = [module.name for module in found if not module.name.endswith(("__main__", "torch_rivals"))]
+for name in names:
+    importlib.import_module(name)
+configure(Path(sys.argv[1]))
+assert len(jax.devices()) == cores()
+print(len(names))
+"""
+
 
 def printed(program, cache, **more):
     own = {name: value for name, value in os.environ.items() if name != PROGRAMS}  # not the cache of all tests
@@ -40,6 +56,10 @@ def printed(program, cache, **more):
 
 def hits_and_misses(cache):
     return printed(PROGRAM, cache)
+
+
+def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
+    assert printed(IMPORTS, tmp_path)[0] > 100  # or the number of cores would be fixed before configure sets it
 
 
 def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own(tmp_path):

@@ -147,6 +147,6 @@ def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> 
 
 
 def _check_vector(name: str, value: tuple[float, float, float]) -> None:
-    shape = checks.floating(name, value).shape
-    if shape != (3,):
+    array = checks.finite(name, checks.real_array(name, value))  # no JAX array: modules make paths when imported
+    if array.shape != (3,):
         raise ValueError(f"{name} must be three numbers (x, y, z), got {checks.shown(value)}")
