@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.state import BODY_RATES
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe, taken_up
 
 
 class HoldState(AbstractVectorField):
@@ -49,3 +49,8 @@ def _(field: FrozenRates, x, u):
 @observe.register
 def _(field: FrozenRates, x, u):
     return FrozenRates(observe(field.field, x, u))
+
+
+@taken_up.register
+def _(field: FrozenRates, x, more):
+    return taken_up(field.field, x, more)

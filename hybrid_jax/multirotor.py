@@ -1,14 +1,20 @@
 """f_p of a real multirotor: the rigid body with what else physics knows of it, and with what is learned chosen by name.
 
-    ṗ = R S Rᵀv,    m v̇ = R (T e_z − D Rᵀv) − m g e_z,    J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+    ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+    m f = C (τ_y, −τ_x, 0) − D Rᵀv,   E = diag(1, 1, 0)
 
 T and τ are thrust and torque of the four rotors about a centre of mass that need not be the origin of their positions;
 a rotor's thrust is k_i u_i², with one k or four. Linear rotor drag D, the moment A that grows with the velocity in the
 body frame and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
 dynamics subject to rotor drag for accurate tracking of high-speed trajectories", 2018 (A there has the other sign). The
-gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it. The gain S is no
-physics but the estimator's: what its velocity must be multiplied with, along each axis of the body, to be that of its
-position. A few percent are common, and 0.1 s ahead they are most of the error in position.
+gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it. C is for a cable
+that pulls at 1/C below the centre of mass: no state of the vehicle tells where its load swings, but the rotors hold the
+moment of the pull, and tell it.
+
+S and λ are no physics but the estimator's. Many take all force of flight to be along the body's z axis, so that drag,
+wind or a cable reach their velocity v̂ from the position alone, d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the
+thrust. Then v − v̂ is λ times the force that a log shows there, which is f and what a residual adds to it (`taken_up`).
+The gain S of each axis says the same of drag alone, and of other errors in scale.
 
 The rotors' lag behind what a log says of them is no part of the field but a change to the log: as four more states they
 would start each window unknown, and a window is about as long as the lag. A log knows their past; see
@@ -26,8 +32,8 @@ from hybrid_jax import checks, rotation
 from hybrid_jax.multirotor_terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
 from hybrid_jax.rigid_body import LEARNED, AbstractRigidBody, euler
 from hybrid_jax.rotation import Rows
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
-from hybrid_jax.vector_field import deploy_batch, evaluate_batch
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vector_field import deploy_batch, evaluate_batch, taken_up
 from hybrid_jax.vehicle import Vehicle
 
 Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
@@ -81,8 +87,12 @@ class Multirotor(AbstractRigidBody):
 
     def of_rows(self, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
         """ẋ from θ_p, x and u entry by entry, so that nothing is put together to be taken apart again."""
+        return _derivative(self.vehicle, self.constants(theta), x, u)
+
+    def constants(self, theta: dict[str, Rows]) -> Constants:
+        """Everything in `SHAPES`, number by number: of θ_p what is learned, nominal what is known."""
         known = nominal_values(self.vehicle, self.terms)
-        return _derivative(self.vehicle, {name: theta.get(name, known[name]) for name in SHAPES}, x, u)
+        return {name: theta.get(name, known[name]) for name in SHAPES}
 
 
 def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
@@ -114,33 +124,50 @@ def _derivative(vehicle: Vehicle, constants: Constants, x: Rows, u: Rows) -> Flo
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
     acceleration = (thrust / vehicle.mass) * rotation.body_z(q) + gravity
-    moved, slowed, torque = _by_velocity(vehicle, constants, q, v, torque)
-    damping = constants["rate_damping"]
-    if _is_present(damping):
-        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
-    inertia = tuple(constants[name][0] for name in ("Ix", "Iy", "Iz"))
-    turned = rotation.derivative(q, omega), euler(inertia, torque, omega)
-    return jnp.concatenate([jnp.stack(v) + moved, turned[0], acceleration + slowed, turned[1]])
-
-
-def _by_velocity(vehicle: Vehicle, constants: Constants, q: Rows, v: Rows, torque):
-    """What the velocity in the body frame adds to ṗ and to v̇, and the torque with its moment."""
-    gain, drag, moment = (constants[name] for name in ("velocity_gain", "drag", "aerodynamic_moment"))
-    is_scaled, is_dragged, is_turned = _is_present(gain, absent=1.0), _is_present(drag), _is_present(moment)
-    if not (is_scaled or is_dragged or is_turned):
-        return 0.0, 0.0, torque
     attitude = _matrix(q)
     velocity = [_dot(column, v) for column in zip(*attitude, strict=True)]
+    force = _specific_force(vehicle, constants, velocity, torque)
+    moved = _in_world(attitude, _faster(constants, velocity, force))
+    inertia = tuple(constants[name][0] for name in ("Ix", "Iy", "Iz"))
+    turned = rotation.derivative(q, omega), euler(inertia, _in_air(constants, velocity, omega, torque), omega)
+    return jnp.concatenate([jnp.stack(v) + moved, turned[0], acceleration + _in_world(attitude, force), turned[1]])
 
-    def in_world(factors) -> Array:
-        parts = [factor * part for factor, part in zip(factors, velocity, strict=True)]
-        return jnp.stack([_dot(row, parts) for row in attitude])
 
-    moved = in_world([factor - 1.0 for factor in gain]) if is_scaled else 0.0
-    slowed = in_world([-(coefficient / vehicle.mass) for coefficient in drag]) if is_dragged else 0.0
-    if is_turned:
+def _specific_force(vehicle: Vehicle, constants: Constants, velocity, torque):
+    """What pushes the body beside its thrust, in its frame [m/s²]: drag, and a cable that the rotors' torque holds."""
+    drag, pull = constants["drag"], constants["cable_pull"]
+    x, y, z = 0.0, 0.0, 0.0
+    if _is_present(drag):
+        x, y, z = (-(factor / vehicle.mass) * part for factor, part in zip(drag, velocity, strict=True))
+    if _is_present(pull):
+        x, y = x + pull[0] / vehicle.mass * torque[1], y - pull[1] / vehicle.mass * torque[0]
+    return [x, y, z]
+
+
+def _faster(constants: Constants, velocity, force):
+    """By how much the position moves faster than a log's velocity, in the body frame [m/s]."""
+    gain, lag = constants["velocity_gain"], constants["velocity_lag"]
+    x, y, z = 0.0, 0.0, 0.0
+    if _is_present(gain, absent=1.0):
+        x, y, z = ((factor - 1.0) * part for factor, part in zip(gain, velocity, strict=True))
+    if _is_present(lag):
+        x, y = x + lag[0] * force[0], y + lag[0] * force[1]
+    return [x, y, z]
+
+
+def _in_air(constants: Constants, velocity, omega: Rows, torque):
+    """The torque with the moments of the air."""
+    moment, damping = constants["aerodynamic_moment"], constants["rate_damping"]
+    if _is_present(moment):
         torque = [part + _dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
-    return moved, slowed, torque
+    if _is_present(damping):
+        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
+    return torque
+
+
+def _in_world(attitude, parts) -> Array | float:
+    """A vector of the body, or its first entries where the others are zero, in the world."""
+    return jnp.stack([_dot(row[: len(parts)], parts) for row in attitude]) if _is_present(parts) else 0.0
 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
@@ -178,6 +205,17 @@ def _dot(a, b) -> Array:
 def _is_present(term, absent: float = 0.0) -> bool:
     """Whether a term is learned, or known and does something."""
     return any(not isinstance(number, float) or number != absent for number in term)
+
+
+@taken_up.register
+def _(field: Multirotor, x, more):
+    """A force beside those of physics, too, moves the position before the log's velocity has seen it."""
+    lag = field.constants(field.entries())["velocity_lag"]
+    if not _is_present(lag):
+        return more
+    attitude = _matrix(tuple(x[QUATERNION]))
+    across = [_dot(column, tuple(more[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
+    return jnp.concatenate([more[POSITION] + lag[0] * _in_world(attitude, across), more[POSITION.stop :]])
 
 
 @deploy_batch.register

@@ -12,9 +12,11 @@ SIGNED = {
     "torque_gain": (3,),
     "centre_of_mass": (2,),
     "drag": (3,),
+    "cable_pull": (2,),
     "aerodynamic_moment": (3, 3),
     "rate_damping": (3,),
     "velocity_gain": (3,),
+    "velocity_lag": (),
 }
 SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
 
@@ -30,9 +32,11 @@ class Terms:
         torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
         centre_of_mass: (x, y) in the frame of the rotors' positions [m].
         drag: D [N s/m].
+        cable_pull: C, one over how far below the centre of mass a cable pulls, along x and along y [1/m].
         aerodynamic_moment: A, one row for each of the three moments [N s].
         rate_damping: B [N m s].
         velocity_gain: S, of the position's derivative over the velocity in a log.
+        velocity_lag: λ, by which a log's velocity follows what pushes the vehicle across its thrust [s].
         motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
 
     Raises:
@@ -42,9 +46,11 @@ class Terms:
     torque_gain: Three = (1.0, 1.0, 1.0)
     centre_of_mass: tuple[float, float] = (0.0, 0.0)
     drag: Three = (0.0, 0.0, 0.0)
+    cable_pull: tuple[float, float] = (0.0, 0.0)
     aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     rate_damping: Three = (0.0, 0.0, 0.0)
     velocity_gain: Three = (1.0, 1.0, 1.0)
+    velocity_lag: float = 0.0
     motor_time_constant: float = 0.0
 
     def __post_init__(self):
@@ -85,24 +91,25 @@ def units_of(vehicle: Vehicle) -> dict[str, float]:
         "torque_gain": 1.0,
         "centre_of_mass": arm,
         "drag": weight / SPEED,
+        "cable_pull": 1 / arm,
         "aerodynamic_moment": weight * arm / SPEED,
         "rate_damping": weight * arm / RATE,
         "velocity_gain": 1.0,
+        "velocity_lag": 1.0,
     }
 
 
 def _flat(value) -> tuple[float, ...]:
-    return tuple(number for row in value for number in (row if isinstance(row, tuple) else (row,)))
+    return tuple(number for row in value for number in _flat(row)) if isinstance(value, tuple) else (value,)
 
 
 def _floats(name: str, value, shape: tuple[int, ...]):
-    """Nested tuples of Python's own floats, which can be hashed and written to files."""
+    """Python's own floats, alone or in nested tuples, which can be hashed and written to files."""
+    if not shape:
+        checks.number(name, value)
+        return float(value)
     if not isinstance(value, tuple) or len(value) != shape[0]:
         raise ValueError(
             f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {checks.shown(value)}"
         )
-    if shape[1:]:
-        return tuple(_floats(name, row, shape[1:]) for row in value)
-    for number in value:
-        checks.number(name, number)
-    return tuple(map(float, value))
+    return tuple(_floats(name, part, shape[1:]) for part in value)

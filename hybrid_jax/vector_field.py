@@ -32,7 +32,7 @@ class Hybrid(AbstractVectorField):
     residual: AbstractVectorField
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.physics(x, u) + self.residual(x, u)
+        return self.physics(x, u) + taken_up(self.physics, x, self.residual(x, u))
 
 
 class Frozen(AbstractVectorField):
@@ -61,7 +61,7 @@ def evaluate_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"])
 
 @evaluate_batch.register
 def _(field: Hybrid, x, u):
-    return evaluate_batch(field.physics, x, u) + evaluate_batch(field.residual, x, u)
+    return evaluate_batch(field.physics, x, u) + taken_up(field.physics, x, evaluate_batch(field.residual, x, u))
 
 
 @singledispatch
@@ -72,12 +72,32 @@ def deploy_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -
 
 @deploy_batch.register
 def _(field: Hybrid, x, u):
-    return deploy_batch(field.physics, x, u) + deploy_batch(field.residual, x, u)
+    return deploy_batch(field.physics, x, u) + taken_up(field.physics, x, deploy_batch(field.residual, x, u))
 
 
 @deploy_batch.register
 def _(field: Frozen, x, u):
     return deploy_batch(field.field, x, u)
+
+
+@singledispatch
+def taken_up(
+    field: AbstractVectorField, x: Float[Array, " d *b"], more: Float[Array, " d *b"]
+) -> Float[Array, " d *b"]:
+    """What another field's derivative at x adds when it acts on what this field describes: itself, unless a force shows
+    in more than an acceleration, as where an estimator is slow to see it (`multirotor`).
+    """
+    return more
+
+
+@taken_up.register
+def _(field: Hybrid, x, more):
+    return taken_up(field.physics, x, more)
+
+
+@taken_up.register
+def _(field: Frozen, x, more):
+    return taken_up(field.field, x, more)
 
 
 @singledispatch

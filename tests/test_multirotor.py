@@ -9,13 +9,15 @@ import numpy as np
 import pytest
 from jax.flatten_util import ravel_pytree
 
-from hybrid_jax import Hybrid, load, rigid_body, save
+from hybrid_jax import Hybrid, load, rigid_body, rotation, save
+from hybrid_jax.baselines import FrozenRates, HoldState
+from hybrid_jax.disturbance import disturbed
 from hybrid_jax.multirotor import Multirotor, carried_to, multirotor
 from hybrid_jax.multirotor_terms import SHAPES, SIGNED, Terms
 from hybrid_jax.rigid_body import RigidBody, moves_a_rigid_body
 from hybrid_jax.rollout import rollout_batch
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
-from hybrid_jax.vector_field import deploy_batch, evaluate_batch, trainable
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vector_field import Frozen, deploy_batch, evaluate_batch, trainable
 from hybrid_jax.vehicle import IRIS
 
 ALL = tuple(name for name in SHAPES if name != "k")
@@ -23,9 +25,11 @@ KNOWN = Terms(
     torque_gain=(0.9, 1.1, 0.8),
     centre_of_mass=(0.01, -0.02),
     drag=(0.3, 0.4, 0.1),
+    cable_pull=(4.0, 3.0),
     aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)),
     rate_damping=(0.02, 0.03, 0.01),
     velocity_gain=(0.95, 0.9, 1.02),
+    velocity_lag=0.2,
 )
 
 
@@ -67,11 +71,14 @@ def by_matrices(x, u, vehicle, terms, k):
         torque += np.cross([*(np.array(place) - terms.centre_of_mass), 0.0], lift)
         torque[2] += sign * vehicle.torque_coefficient * speed**2
     inertia = np.diag(vehicle.inertia)
-    torque = np.array(terms.torque_gain) * torque - np.cross(rates, inertia @ rates)
+    torque = np.array(terms.torque_gain) * torque
+    force += np.array((*terms.cable_pull, 0.0)) * [torque[1], -torque[0], 0.0]
     torque += np.array(terms.aerodynamic_moment) @ velocity - np.array(terms.rate_damping) * rates
     acceleration = attitude @ force / vehicle.mass - [0, 0, vehicle.gravity]
+    unseen = terms.velocity_lag * np.array([1, 1, 0]) * force / vehicle.mass
+    moved = attitude @ (terms.velocity_gain * velocity + unseen)
     return np.concatenate(
-        [attitude @ (terms.velocity_gain * velocity), np.zeros(4), acceleration, np.linalg.solve(inertia, torque)]
+        [moved, np.zeros(4), acceleration, np.linalg.solve(inertia, torque - np.cross(rates, inertia @ rates))]
     )
 
 
@@ -106,8 +113,8 @@ def test_a_known_term_is_a_learned_one_at_its_value(name):
     """What is learned is the deviation from the nominal value, in SI units `theta`."""
     x, u = samples()
     value = getattr(KNOWN, name)
-    known = multirotor(IRIS, (), Terms(**{name: value}))
-    learned = multirotor(IRIS, (name,), Terms(**{name: value}))
+    terms = Terms(**{"drag": KNOWN.drag, name: value})  # a lag without a force is none
+    known, learned = multirotor(IRIS, (), terms), multirotor(IRIS, (name,), terms)
     np.testing.assert_allclose(learned.theta()[name], value, rtol=1e-15)
     np.testing.assert_allclose(one_by_one(learned, x, u), one_by_one(known, x, u), rtol=1e-13, atol=1e-12)
     assert (one_by_one(moved(learned), x, u) != one_by_one(known, x, u)).any()
@@ -129,8 +136,8 @@ def test_a_minibatch_and_its_gradient_are_those_of_its_samples(learn):
 
 
 def test_all_terms_are_recovered_from_flights_made_with_them():
-    """Exact data, so what is left is round-off; a gain on the torque is told from inertia by the other terms only."""
-    learn = tuple(name for name in ALL if name != "torque_gain")
+    """Exact data, so what is left is round-off; gains are the inertia's and the lag's as well."""
+    learn = tuple(name for name in ALL if name not in ("torque_gain", "velocity_gain"))
     truth, (x, u) = moved(multirotor(IRIS, learn), 0.05), samples(30)
     start, rebuild = ravel_pytree(multirotor(IRIS, learn))
 
@@ -143,6 +150,39 @@ def test_all_terms_are_recovered_from_flights_made_with_them():
         found = found + jnp.linalg.lstsq(jax.jacfwd(flown)(found), data - flown(found))[0]
     for name, value in truth.theta().items():
         np.testing.assert_allclose(rebuild(found).theta()[name], value, rtol=1e-6, err_msg=name)
+
+
+AROUND = {"itself": lambda body: body, "frozen rates": FrozenRates, "frozen": Frozen}
+AROUND |= {"hybrid": lambda body: Hybrid(body, HoldState())}
+
+
+@pytest.mark.parametrize("around", AROUND.values(), ids=AROUND)
+def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
+    """An estimator that knows thrust alone has v̂˙ = R T e_z / m − g e_z + (v − v̂) / λ, the last across the thrust."""
+    lag, (x, u) = 0.25, samples()
+    field = around(multirotor(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
+    thrust = one_by_one(multirotor(IRIS, ()), x, u)[VELOCITY]
+    behind = jnp.asarray([0.3, -0.2, 0.0])  # v − v̂ in the body
+    for state, inputs, known in zip(x.T, u.T, thrust.T, strict=True):
+        velocity = state[VELOCITY] + rotation.rotate(state[QUATERNION], behind)
+        estimator = known + (velocity - state[VELOCITY]) / lag
+        push = jnp.concatenate([estimator - field(state, inputs)[VELOCITY], jnp.zeros(3)])
+        for evaluate in (evaluate_batch, deploy_batch, lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]):
+            found = evaluate(disturbed(field, push), state[:, None], inputs[:, None])[:, 0]
+            np.testing.assert_allclose(found[POSITION], velocity, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found[VELOCITY], estimator, rtol=1e-12, atol=1e-12)
+
+
+def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
+    """A force at (0, 0, −h) that the rotors hold makes the moment −h e_z × F, so F follows from their torque."""
+    below, pull = 0.05, np.array([0.02, -0.03, 0.0])
+    arms = np.array(IRIS.rotor_positions)
+    held = [*-np.cross([0.0, 0.0, -below], pull)[:2], IRIS.mass * IRIS.gravity]
+    lifts = np.linalg.lstsq(np.stack([arms[:, 1], -arms[:, 0], np.ones(4)]), np.array(held))[0]
+    field = multirotor(IRIS, (), Terms(cable_pull=(1 / below, 1 / below)))
+    level = jnp.zeros(13).at[3].set(1.0)
+    derivative = field(level, jnp.sqrt(lifts / IRIS.thrust_coefficient))
+    np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
 
 
 def test_what_is_learned_goes_with_the_vehicle_to_another():
