@@ -1,9 +1,10 @@
 """The course on recorded flights: learn from the source, adapt in each fold, test on what was held out."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+import jax
 import numpy as np
 from rich.console import Console
 
@@ -78,10 +79,20 @@ def study(before: Craft, after: Craft, flown: Mapping[str, Flown], config: RealF
     return found
 
 
+def in_turn(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
+    """The folds with their numbers; in each, the programs of the one before are let go of.
+
+    A program of a sweep takes hundreds of memory maps, and Linux gives a process 65 530.
+    """
+    for number, fold in enumerate(folds):
+        jax.clear_caches()
+        yield number, fold
+
+
 def _train(course: Course, found: Study) -> None:
     """In each fold, models of its flights, tested as they are."""
     config = course.config
-    for number, fold in enumerate(found.folds):
+    for number, fold in in_turn(found.folds):
         where, trial = f"fold {number}", trial_of(fold, config)
         chosen = _chosen(course, found, fold, lambda name, fold=fold, where=where: _tried(course, where, fold, name))
         lesson = course.lesson(fold, chosen)
@@ -103,7 +114,7 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
     pool = max(len(cut(fold.train, RECIPES[name].window)) for fold in found.folds for name in config.recipes)
     taught: dict[tuple[str, str], Taught] = {}
     first = {name: course.lesson(school, name) for name in config.recipes}
-    for number, fold in enumerate(found.folds):
+    for number, fold in in_turn(found.folds):
         where, trial = f"fold {number}", trial_of(fold, config)
 
         def tried(recipe: str, where=where, fold=fold) -> list[AbstractVectorField]:

@@ -18,7 +18,7 @@ from experiments.flight_folds import apart, drawn, folds_of, lessons
 from experiments.flight_logs import Flown, Windows, count_windows, cut, fly_in, require_one_rate, stretch
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
 from experiments.flight_recipes import RECIPES, alike, stage_of
-from experiments.flight_study import study
+from experiments.flight_study import in_turn, study
 from experiments.flight_tests import body_of, parameters, scores
 from experiments.flight_training import Course
 from hybrid_jax.channels import ChannelPrediction, channels_from
@@ -266,3 +266,13 @@ def test_real_flights_are_parted_without_leaks(name, by, count):
     for fold in folds:
         found = lessons(fold, 25, 25, 10)
         assert not (samples(found.train.windows) | samples(found.validation)) & samples(cut(fold.test, 50, 50).windows)
+
+
+def test_a_fold_does_not_keep_the_programs_of_the_one_before():
+    """Or many folds would need more memory maps than Linux gives a process."""
+    kept = []
+    for number, _ in in_turn(folds_of(LOGS, None, CONFIG)):
+        jax.block_until_ready(jax.jit(lambda x, number=number: x * number)(np.arange(number + 3.0)))
+        kept.append(len(jax.devices()[0].client.live_executables()))
+    assert len(kept) > 1
+    assert kept[-1] <= kept[0]
