@@ -63,7 +63,7 @@ class Recipe:
 
 _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
 # By how much a log's velocity disagrees with its position is the estimator's, which no change of the vehicle changes.
-_SAME = ("velocity_gain",)
+_SAME = ("velocity_gain", "velocity_lag")
 _ADAPTATION = (
     Step(1e-2, 0, 10, 40, 15, _SAME),
     Step(3e-3, 3e-3, 10, 40, 15, _SAME),
