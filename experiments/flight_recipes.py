@@ -64,6 +64,8 @@ class Recipe:
 _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
 # By how much a log's velocity disagrees with its position is the estimator's, which no change of the vehicle changes.
 _SAME = ("velocity_gain", "velocity_lag")
+# A load on a cable comes with the change: fitted to flights without one it would take the air's moments for a pull.
+_BROUGHT = ("cable_pull",)
 _ADAPTATION = (
     Step(1e-2, 0, 10, 40, 15, _SAME),
     Step(3e-3, 3e-3, 10, 40, 15, _SAME),
@@ -98,6 +100,11 @@ RECIPES: Mapping[str, Recipe] = {
         learn=("k", "drag"),
     ),
 }
+
+
+def before_a_change(recipe: Recipe) -> tuple[Step, ...]:
+    """The steps of the source's flights where a target's follow: what only the change brings stays as it is."""
+    return tuple(replace(step, kept=(*step.kept, *_BROUGHT)) for step in recipe.source)
 
 
 def stage_of(step: Step, model: str, share: float = 1.0) -> Stage:

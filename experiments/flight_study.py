@@ -66,7 +66,7 @@ def study(before: Craft, after: Craft, flown: Mapping[str, Flown], config: RealF
     Raises:
         ValueError: too few flights, or too little flight in them, for what is asked.
     """
-    course = Course(before, after, config, stages_of(config, console))
+    course = Course(before, after, config, stages_of(config, console), "target" in flown)
     tested = flown["test"].logs if "test" in flown else None
     folds = folds_of(flown.get("target", flown["source"]).logs, tested, config)
     school = Fold("source", *hold_out_validation(flown["source"].logs, config), []) if "target" in flown else None

@@ -10,7 +10,7 @@ from experiments.flight_folds import Fold, Lessons, drawn, lessons
 from experiments.flight_logs import cut
 from experiments.flight_models import Craft, Lane, Trained, all_windows, fresh, in_stages, moved, refitted, settings_of
 from experiments.flight_protocol import RealFlightConfig
-from experiments.flight_recipes import RECIPES, share_of_epochs
+from experiments.flight_recipes import RECIPES, before_a_change, share_of_epochs
 from experiments.stages import Stages
 from hybrid_jax.lanes import lane
 from hybrid_jax.objective import Settings
@@ -34,12 +34,17 @@ class Taught:
 
 @dataclass(frozen=True)
 class Course:
-    """The vehicle before and after the change, how it is learned, and the stages that are kept."""
+    """The vehicle before and after the change, how it is learned, and the stages that are kept.
+
+    Attributes:
+        changes: whether there are flights from after the change.
+    """
 
     before: Craft
     after: Craft
     config: RealFlightConfig
     stages: Stages
+    changes: bool
 
     def lesson(self, fold: Fold, recipe: str) -> Lesson:
         """Plenty of flight before the change; its channels weigh all that is learned of the recipe."""
@@ -54,8 +59,10 @@ class Course:
         """A model of all windows of a lesson, one lane a seed."""
         everything = np.arange(len(lesson.lessons.train))
         lanes = [Lane(seed, everything, self.config.epochs) for seed in range(seeds)]
-        start = fresh(model, self.before, RECIPES[recipe], self.config.hidden, seeds)
-        what = (f"{name} {model} {recipe}", model, start, lanes, RECIPES[recipe].source)
+        how = RECIPES[recipe]
+        start = fresh(model, self.before, how, self.config.hidden, seeds)
+        steps = before_a_change(how) if self.changes else how.source
+        what = (f"{name} {model} {recipe}", model, start, lanes, steps)
         return Taught(lanes, in_stages(*what, lesson.lessons, len(everything), lesson.settings, self.stages))
 
     def retaught(self, name: str, model: str, recipe: str, fold: Fold, lesson: Lesson, first: Taught) -> Taught:

@@ -14,6 +14,7 @@ from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples
 from rich.console import Console
 
 import hybrid_jax
+from experiments import flight_training
 from experiments.flight_folds import apart, drawn, folds_of, lessons
 from experiments.flight_logs import Flown, Windows, count_windows, cut, fly_in, require_one_rate, stretch
 from experiments.flight_models import Craft, Kinematics, Lane, fresh, moved, settings_of
@@ -193,6 +194,17 @@ def test_a_model_that_is_carried_over_keeps_its_parameters():
         for name, value in was.items():
             np.testing.assert_allclose(now[name], value, rtol=1e-5)
     assert carried.physics.vehicle == heavier
+
+
+@pytest.mark.parametrize("changes", [True, False])
+def test_what_only_a_change_brings_is_learned_where_it_is_there(changes, monkeypatch):
+    """Before a load there is no cable; where nothing is adapted, one may have been there all along."""
+    monkeypatch.setattr(flight_training, "in_stages", lambda _name, _model, _fields, _lanes, steps, *_: steps)
+    course = Course(CRAFT, CRAFT, CONFIG, None, changes)
+    lesson = course.lesson(folds_of(LOGS, None, CONFIG)[0], "staged")
+    steps = course.taught("", "hybrid", "staged", lesson, 1).trained
+    assert [step.epochs for step in steps] == [step.epochs for step in RECIPES["staged"].source]
+    assert {step.kept for step in steps} == {("cable_pull",) if changes else ()}
 
 
 def test_parameters_of_a_lane_have_intervals_around_them():
