@@ -67,11 +67,11 @@ _SAME = ("velocity_gain", "velocity_lag")
 # A load on a cable comes with the change: fitted to flights without one it would take the air's moments for a pull.
 _BROUGHT = ("cable_pull",)
 _ADAPTATION = (
-    Step(1e-2, 0, 10, 40, 15, _SAME),
-    Step(3e-3, 3e-3, 10, 40, 15, _SAME),
-    Step(1e-3, 1e-3, 25, 30, 10, _SAME),
+    Step(1e-2, 0, 10, 80, 30, _SAME),
+    Step(3e-3, 3e-3, 10, 80, 30, _SAME),
+    Step(1e-3, 1e-3, 25, 60, 20, _SAME),
 )
-_SCRATCH = (Step(2e-2, 0, 10, 60), Step(5e-3, 5e-3, 10, 80), Step(1e-3, 1e-3, 25, 30, 10))
+_SCRATCH = (Step(2e-2, 0, 10, 120, 40), Step(5e-3, 5e-3, 10, 160, 40), Step(1e-3, 1e-3, 25, 60, 20))
 _BRIEF = (Step(2e-2, 0, 25, 10, 5), Step(2e-3, 2e-3, 25, 5, 5), Step(1e-3, 1e-3, 50, 5, 5))
 
 _STAGED = Recipe(
