@@ -11,7 +11,9 @@ from hybrid_jax import checks
 from hybrid_jax.vehicle_description import check_learned
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
-LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_gain")
+LEARN = (
+    "Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull",
+)  # fmt: skip
 NANODRONE_STEPS = 50
 FOLDERS = ("source", "target", "test")
 FILES = ("vehicle", "columns")
