@@ -97,7 +97,7 @@ class RealFlightConfig(Run):
     """How the flights that stop the training are held out of those to learn from."""
     refit: bool = False
     """Without --target: train once more, on the validation flights as well, for as many epochs as these found best."""
-    recipes: tuple[RecipeName, ...] = ("staged", "turning")
+    recipes: tuple[RecipeName, ...] = ("turning",)
     """Ways to train; of several, the one whose hybrid does best on each fold's validation flights is taken."""
     models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
     """hybrid: physics and network. no_physics: network with p' = v and the attitude's kinematics. physics_only."""
@@ -159,7 +159,7 @@ class RealFlightConfig(Run):
 
 
 PAPER = RealFlightConfig()
-QUICK = replace(PAPER, preset="quick", seeds=2, n=(100, 1000), folds=2, epochs=0.5, recipes=("staged",))
+QUICK = replace(PAPER, preset="quick", seeds=2, n=(100, 1000), folds=2, epochs=0.5)
 SMOKE = replace(
     PAPER, preset="smoke", seeds=1, n=(20,), horizon=(5, 10), folds=2, batch_size=20, hidden=8, validation=20,
     stride=50, epochs=0.05,

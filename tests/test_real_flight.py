@@ -88,7 +88,11 @@ SHORT = [log[:30] for log in LOGS]
         ({}, {"source": LOGS, "test": [log[:5] for log in OTHERS]}, "no window of 5 intervals"),
         ({"recipes": ("frozen_rates",)}, {"source": SHORT, "target": LOGS}, "no window of 50 intervals"),
         ({"recipes": ("frozen_rates",)}, {"source": LOGS, "target": SHORT}, "no window of 50 intervals"),
-        ({"horizon": (40,)}, {"source": SHORT, "test": LOGS}, "no window of 40 intervals"),
+        (
+            {"horizon": (40,), "recipes": ("staged", "turning")},
+            {"source": SHORT, "test": LOGS},
+            "no window of 40 intervals",
+        ),
     ],
 )
 def test_flights_too_short_are_refused_before_anything_is_trained(options, flights, said, monkeypatch, tmp_path):
