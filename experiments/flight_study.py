@@ -29,6 +29,7 @@ from experiments.flight_training import Course, Lesson, Taught
 from experiments.stages import Stages, stages_of
 from hybrid_jax import schedule
 from hybrid_jax.baselines import HoldState
+from hybrid_jax.flight_rows import least
 from hybrid_jax.flight_scores import flight_errors
 from hybrid_jax.lanes import count, lane
 from hybrid_jax.multirotor import multirotor
@@ -156,7 +157,7 @@ def _chosen(course: Course, found: Study, fold: Fold, tried: Callable[[str], Seq
 
     errors = {name: float(np.mean([error(field) for field in tried(name)])) for name in names}
     found.choices[fold.name] = errors
-    return min(names, key=lambda name: (not np.isfinite(errors[name]), errors[name]))
+    return least(errors)
 
 
 def _tried(course: Course, where: str, fold: Fold, recipe: str) -> list[AbstractVectorField]:

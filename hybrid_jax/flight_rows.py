@@ -102,6 +102,11 @@ def pooled(rows: Sequence[FlightRow], label: str, quantity: str) -> np.ndarray:
     return np.array([one(seed) for seed in seeds])
 
 
+def least(errors: Mapping[str, float]) -> str:
+    """The name with the least error, the first of equal ones; what is not finite is taken only if nothing is."""
+    return min(errors, key=lambda name: (not math.isfinite(errors[name]), errors[name]))
+
+
 def finite(value: float) -> float | None:
     """The number, or None where it is not finite."""
     return float(value) if math.isfinite(value) else None

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, cell_name, cells, pooled
+from hybrid_jax.flight_rows import QUANTITIES, SUM, FlightRow, cell_name, cells, least, pooled
 from hybrid_jax.report_tables import Table
 
 VERDICTS = {"ok": "ok", "fails": "FAILS", "cannot tell": "?"}
@@ -67,10 +67,7 @@ def choice_tables(choices: Mapping[str, Mapping[str, float]]) -> list[Table]:
     if not choices:
         return []
     names = list(next(iter(choices.values())))
-    lines = [
-        (fold, *(f"{error:.3f}" for error in errors.values()), min(errors, key=lambda name: errors[name]))
-        for fold, errors in choices.items()
-    ]
+    lines = [(fold, *(f"{error:.3f}" for error in errors.values()), least(errors)) for fold, errors in choices.items()]
     title = "Recipes: error on validation flights over that of thrust with frozen rates; the least was taken"
     return [Table(title, ("tested on", *names, "taken"), lines)]
 
@@ -127,11 +124,16 @@ def _spread(values: np.ndarray) -> str:
 
 
 def _parameter(rows: Sequence[FlightRow], name: str) -> str:
-    values = np.array([_float((row.theta or {}).get(name)) for row in rows])
+    having = [row for row in rows if name in (row.theta or {})]  # another fold's recipe may not learn it
+    if not having:
+        return "–"
+    values = np.array([_float((row.theta or {})[name]) for row in having])
     text = _number(values.mean()) + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
-    ends = [(row.theta_interval or {}).get(name) for row in rows]
+    ends = [(row.theta_interval or {}).get(name) for row in having]
     known = np.array([end for end in ends if end is not None and None not in end], float)
-    return f"{text} [{_number(known[:, 0].mean())}, {_number(known[:, 1].mean())}]" if len(known) else text
+    text += f" [{_number(known[:, 0].mean())}, {_number(known[:, 1].mean())}]" if len(known) else ""
+    folds, all_folds = (len({row.fold for row in group}) for group in (having, rows))
+    return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
 
 
 def _float(value: float | None) -> float:
