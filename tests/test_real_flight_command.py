@@ -233,13 +233,13 @@ def test_simulated_logs_go_all_the_way(simulated):
     assert "Traceback" not in run.stderr
 
 
-def test_adaptation_leaves_what_is_the_estimator_s_and_finds_what_the_change_brought(simulated):
+def test_adaptation_moves_all_that_physics_learns_and_finds_what_the_change_brought(simulated):
     rows = json.loads((simulated[0] / "report.json").read_text())["rows"]
     theta = {(row["fold"], row["model"], row["mode"]): row["theta"] for row in rows}
     for (fold, model, mode), adapted in theta.items():
         if mode == "fine_tuned":
             source = theta[fold, model, "zero_shot"]
-            assert {name for name, value in adapted.items() if value == source[name]} == {"velocity_lag"}
+            assert not {name for name, value in adapted.items() if value == source[name]}
             assert {name for name, value in source.items() if value == 0.0} == {"cable_pull[0]", "cable_pull[1]"}
 
 
