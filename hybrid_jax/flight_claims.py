@@ -44,7 +44,7 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], found, of: str) -> Cl
         for label in found[cell][0].scores
         for quantity in QUANTITIES
     }
-    words = [f"{where} {ratio:.2f}" for where, ratio in ratios.items()]
+    words = [f"{where} {ratio:.3f}" for where, ratio in ratios.items()]
     holds = all(ratio < 1 for ratio in ratios.values())
     return Claim(name, text, holds, f"error over that of the best of them: {', '.join(words)}")
 
