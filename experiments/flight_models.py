@@ -34,7 +34,6 @@ from hybrid_jax.trajectories import Trajectories, concatenate
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch, trainable
 from hybrid_jax.vehicle import Vehicle
 
-HUBER = 1.0  # errors beyond a simple baseline's count linearly
 NETWORK, ORDER = range(2)  # what the keys of a seed are for
 
 
@@ -121,7 +120,7 @@ def settings_of(craft: Craft, lessons: Lessons, recipe: Recipe, batch_size: int)
     """Each channel weighed by the error of nominal thrust with frozen rates at the end of the training windows."""
     position, *others = channels_from(craft.thrust(), lessons.train.windows)  # in the state's order
     position = replace(position, scale=recipe.position * position.scale)
-    return Settings(batch_size, objective=ChannelPrediction((position, *others), HUBER))
+    return Settings(batch_size, objective=ChannelPrediction((position, *others), recipe.huber))
 
 
 @dataclass(frozen=True)
@@ -225,10 +224,15 @@ def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:
     def plan(each: Lane) -> Plan:
         stage = stage_of(step, model, each.share)
         subset = np.resize(each.subset, longest)  # of one length; only the first len(subset) are used
-        rates = rates_by_group(one, {**stage.rates, **dict.fromkeys(_paths_of(step.kept, one), 0.0)})
+        rates = rates_by_group(one, rates_of(step, model, one))
         return make_plan(rates, subset, len(each.subset), 0, stage.patience, stage.epochs, 0.0)
 
     return jax.device_get(stack([jax.device_get(plan(each)) for each in lanes]))
+
+
+def rates_of(step: Step, model: str, field: AbstractVectorField) -> dict[str, float]:
+    """The learning rate of each group of a field's arrays: none for what the step keeps."""
+    return {**stage_of(step, model).rates, **dict.fromkeys(_paths_of(step.kept, field), 0.0)}
 
 
 def _paths_of(names: Sequence[str], field: AbstractVectorField) -> list[str]:
