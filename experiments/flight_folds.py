@@ -80,11 +80,11 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
     Raises:
         ValueError: all are of one name.
     """
-    of = NAMES_OF[config.validate_by]
+    of = NAMES_OF[config.validated_by]
     names = sorted({of(log) for log in logs})
     if len(names) < 2:
         raise ValueError(
-            f"--validate-by {config.validate_by}: {len(logs)} flights of one name ({names[0]}) are too few to learn "
+            f"--validate-by {config.validated_by}: {len(logs)} flights of one name ({names[0]}) are too few to learn "
             "from and to stop by"
         )
     count = max(1, round(VALIDATION_SHARE * len(names)))
@@ -101,13 +101,13 @@ def require_windows(folds: Sequence[Fold], school: Fold | None, config: RealFlig
     Raises:
         ValueError: which flights have no window, or that a fold's have fewer than --n.
     """
-    longest = max(RECIPES[name].window for name in config.recipes)
+    longest = max(RECIPES[name].window for name in config.tried)
     for fold in (*([school] if school else []), *folds):
         long_enough(fold.train, longest)
         long_enough(fold.validation, longest)
     for fold in folds:
         long_enough(fold.test, config.longest)
-        if len(config.recipes) > 1:
+        if len(config.tried) > 1:
             long_enough(fold.validation, config.longest)
         if school:
             _require_size(max(config.n), count_windows(fold.train, longest))

@@ -131,7 +131,7 @@ def head(outcome: Outcome) -> str:
     flights = ", ".join(f"{len(flown.logs)} {name}" for name, flown in outcome.flown.items())
     seconds = {name: sum(record["seconds"] for record in flown.records) for name, flown in outcome.flown.items()}
     of = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
-    recipes = "\n".join(f"- recipe **{name}**: {RECIPES[name].about}" for name in config.recipes)
+    recipes = "\n".join(f"- recipe **{name}**: {RECIPES[name].about}" for name in config.tried)
     adapted = (
         f"Models learn from the source's flights, then from N windows of the target's ({config.draw}), and predict "
         if "target" in outcome.flown

@@ -15,6 +15,7 @@ LEARN = (
     "Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull",
 )  # fmt: skip
 NANODRONE_STEPS = 50
+ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "staged")
 FOLDERS = ("source", "target", "test")
 FILES = ("vehicle", "columns")
 
@@ -93,12 +94,14 @@ class RealFlightConfig(Run):
     folds_by: Literal["flight", "manoeuvre"] = "flight"
     """What is tested has no flight, or no manoeuvre (file name without number), in common with what is learned from.
     With manoeuvre and without --target, flights in --test take turns by manoeuvre as well."""
-    validate_by: Literal["flight", "manoeuvre"] = "flight"
-    """How the flights that stop the training are held out of those to learn from."""
-    refit: bool = False
+    validate_by: Literal["flight", "manoeuvre"] | None = None
+    """How the flights that stop the training are held out of those to learn from. By default by flight; where another
+    manoeuvre is to be predicted (--folds-by manoeuvre or --protocol nanodrone, and no --target), by manoeuvre."""
+    refit: bool = True
     """Without --target: train once more, on the validation flights as well, for as many epochs as these found best."""
-    recipes: tuple[RecipeName, ...] = ("turning",)
-    """Ways to train; of several, the one whose hybrid does best on each fold's validation flights is taken."""
+    recipes: tuple[RecipeName, ...] | None = None
+    """Ways to train; of several, the one whose hybrid does best on each fold's validation flights is taken. By default
+    turning; where another manoeuvre is to be predicted, frozen_rates, torque_off and staged."""
     models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
     """hybrid: physics and network. no_physics: network with p' = v and the attitude's kinematics. physics_only."""
     learn: tuple[str, ...] | None = None
@@ -122,7 +125,7 @@ class RealFlightConfig(Run):
         for name in ("hidden", "stride", "validation", "batch_size", *(("folds",) if self.folds else ())):
             if getattr(self, name) < 1:
                 raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
-        distinct("--recipes", self.recipes)
+        distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         distinct("--models", self.models)
         distinct("--horizon", tuple(map(str, self.horizon)))
         distinct("--n", tuple(map(str, self.n)))
@@ -151,11 +154,28 @@ class RealFlightConfig(Run):
         """Intervals of a test window."""
         return max(*self.horizon, NANODRONE_STEPS if self.protocol == "nanodrone" else 1)
 
+    @property
+    def another_manoeuvre(self) -> bool:
+        """Whether manoeuvres are to be predicted that nothing is learned from."""
+        asked = self.protocol == "nanodrone" or self.folds_by == "manoeuvre"
+        return asked and self.target is None and not self.simulated
+
+    @property
+    def tried(self) -> tuple[RecipeName, ...]:
+        """The recipes: those asked for, or else what suits the question."""
+        usual: tuple[RecipeName, ...] = ("turning",)
+        return self.recipes or (ANOTHER_MANOEUVRE if self.another_manoeuvre else usual)
+
+    @property
+    def validated_by(self) -> Literal["flight", "manoeuvre"]:
+        """By what validation flights are held out: as asked for, or else as suits the question."""
+        return self.validate_by or ("manoeuvre" if self.another_manoeuvre else "flight")
+
     def described(self) -> dict[str, Any]:
         """All that fixes the results; of folders and files the name alone, since the flights are described apart."""
         options = Run.described(self)
         named = {name: None if options[name] is None else options[name].name for name in (*FOLDERS, *FILES)}
-        return options | named
+        return options | named | {"recipes": self.tried, "validate_by": self.validated_by}
 
 
 PAPER = RealFlightConfig()

@@ -99,7 +99,7 @@ def _train(course: Course, found: Study) -> None:
         lesson = course.lesson(fold, chosen)
         found.scored.extend(_baselines(trial, course.before))
         for model in config.models:
-            recipe = alike(model, chosen, config.recipes)
+            recipe = alike(model, chosen, config.tried)
             taught = course.taught(where, model, recipe, lesson, config.seeds)
             if config.refit:
                 taught = course.retaught(where, model, recipe, fold, lesson, taught)
@@ -112,9 +112,9 @@ def _train(course: Course, found: Study) -> None:
 def _adapt(course: Course, school: Fold, found: Study) -> None:
     """Source models of each recipe that is chosen, and in each fold what becomes of them."""
     config = course.config
-    pool = max(len(cut(fold.train, RECIPES[name].window)) for fold in found.folds for name in config.recipes)
+    pool = max(len(cut(fold.train, RECIPES[name].window)) for fold in found.folds for name in config.tried)
     taught: dict[tuple[str, str], Taught] = {}
-    first = {name: course.lesson(school, name) for name in config.recipes}
+    first = {name: course.lesson(school, name) for name in config.tried}
     for number, fold in in_turn(found.folds):
         where, trial = f"fold {number}", trial_of(fold, config)
 
@@ -126,7 +126,7 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
         here = course.lesson_after(fold, chosen, lesson)
         found.scored.extend(_baselines(trial, course.after))
         for model in config.models:
-            recipe = alike(model, chosen, config.recipes)
+            recipe = alike(model, chosen, config.tried)
             if (model, recipe) not in taught:
                 taught[model, recipe] = course.taught("source", model, recipe, lesson, config.seeds)
             source = taught[model, recipe]
@@ -146,7 +146,7 @@ def _adapt(course: Course, school: Fold, found: Study) -> None:
 
 def _chosen(course: Course, found: Study, fold: Fold, tried: Callable[[str], Sequence[AbstractVectorField]]) -> str:
     """The recipe whose hybrids do best on the fold's validation flights; of one, that one."""
-    names = course.config.recipes
+    names = course.config.tried
     if len(names) == 1:
         return names[0]
     windows = cut(fold.validation, course.config.longest).windows

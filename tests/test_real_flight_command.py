@@ -114,6 +114,17 @@ def test_options_that_do_not_fit_are_refused(options, said):
         replace(CONFIG, **options)
 
 
+@pytest.mark.parametrize("asked", [{"protocol": "nanodrone"}, {"folds_by": "manoeuvre"}], ids=str)
+def test_another_manoeuvre_is_learned_for_by_default_where_it_is_to_be_predicted(asked):
+    usual, config = PRESETS["paper"], replace(PRESETS["paper"], **asked)
+    assert (config.tried, config.validated_by) == (("frozen_rates", "torque_off", "staged"), "manoeuvre")
+    assert config.described()["recipes"] == config.tried  # so that a resumed run, and a reader, knows them
+    adapted = replace(config, target=Path("after"))
+    assert (adapted.tried, adapted.validated_by) == (usual.tried, usual.validated_by) == (("turning",), "flight")
+    own = replace(config, recipes=("short",), validate_by="flight")
+    assert (own.tried, own.validated_by) == (("short",), "flight")
+
+
 def test_too_few_flights_are_refused():
     with pytest.raises(ValueError, match="--folds-by flight: all flights are of one name"):
         folds_of(LOGS[:1], None, CONFIG)
