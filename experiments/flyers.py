@@ -15,7 +15,7 @@ from experiments.protocol import Config
 from experiments.solved import constant_disturbance, solved
 from experiments.stages import Stages, stages_of
 from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
-from hybrid_jax.closed_loop_rows import Flyer
+from hybrid_jax.closed_loop_rows import SOURCES, Flyer
 from hybrid_jax.lanes import lane
 from hybrid_jax.residual import BatchNorm, InputScaling
 from hybrid_jax.rigid_body import rigid_body
@@ -81,8 +81,8 @@ def fleet(
             fields[Flyer(model)] = found.source
         sizes = (few,) if model in ("physics", "nine") else dict.fromkeys((few, many))
         fields |= {Flyer(model, size): found.adapted[domain.name, size] for size in sizes}
-    observed = Flyer("nominal"), Flyer("hybrid"), Flyer("hybrid", few), Flyer("safe", few), Flyer("nine", few)
-    for flyer in observed:
+    sources, adapted = map(Flyer, dict.fromkeys(SOURCES.values())), (Flyer(model, few) for model in SOURCES)
+    for flyer in (Flyer("nominal"), *sources, *adapted):
         fields[replace(flyer, observer=True)] = fields[flyer]
     models = {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()}
     return models | {Flyer("oracle"): single(true_field(domain, vehicle))}

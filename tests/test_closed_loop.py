@@ -163,8 +163,8 @@ def test_the_report_keeps_its_contract(folder):
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     rows = [FlightRow(**row) for row in report["rows"]]
-    # Nominal, oracle; 20 of physics, no-physics, nine numbers; source and 20 of two hybrids; and five with observers.
-    assert len(rows) == 2 * (2 * 14 + 1 * 9)
+    # Nominal, oracle; 20 of physics, no-physics, nine numbers; source and 20 of two hybrids; and six with observers.
+    assert len(rows) == 2 * (2 * 15 + 1 * 9)
     assert {row.distance for row in rows} == {0.0, 60.0}
     assert {row["variant"] for row in report["ablation"]} > {"safe, batch statistics of the source"}
     assert {claim["id"] for claim in report["claims"] + report["not_judged"]} >= {"R1a", "R6b", "R7", "R8"}

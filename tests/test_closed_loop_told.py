@@ -25,6 +25,7 @@ FLYERS = {  # mean RMSE [m] under the parameter shift and in the wind
     Flyer("hybrid", observer=True): (0.016, 0.08),
     Flyer("hybrid", FEW, observer=True): (0.012, 0.06),
     Flyer("safe"): (0.02, 0.4),
+    Flyer("safe", observer=True): (0.016, 0.08),
     Flyer("safe", FEW): (0.011, 0.055),
     Flyer("safe", FEW, observer=True): (0.0105, 0.052),
     Flyer("nine", FEW): (0.0115, 0.0545),
@@ -86,7 +87,7 @@ def test_the_share_of_the_true_vehicle_is_one_and_of_the_source_none():
 def test_all_goals_hold_where_they_are_reached():
     found = verdicts(ROWS)
     assert set(found.values()) == {True}
-    assert len(found) == 3 * 6 + 2
+    assert len(found) == 3 * 7 + 2
 
 
 @pytest.mark.parametrize(
@@ -100,6 +101,8 @@ def test_all_goals_hold_where_they_are_reached():
         ("R4b", changed(ROWS, Flyer("safe", FEW), "parameter_shift", "step", excess=0.11)),
         ("R4a", changed(ROWS, Flyer("hybrid", FEW), "parameter_shift", "step", excess=-0.11)),
         ("R5a", changed(ROWS, Flyer("hybrid", FEW, observer=True), position_rmse=0.075)),
+        ("R5b", changed(ROWS, Flyer("safe", observer=True), position_rmse=0.0523)),
+        ("R9b", changed(ROWS, Flyer("safe", FEW, observer=True), "parameter_shift", "upset", position_rmse=0.017)),
         ("R6b", [replace(row, position_rmse=1.2 * row.position_rmse) if row.distance else row for row in ROWS]),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
