@@ -92,7 +92,7 @@ def test_fresh_moves_all_aside_but_the_lock(tmp_path):
         interrupt(out, replace(SMOKE, seeds=2, fresh=True))
         assert len(list(tmp_path.glob("out.before-*"))) == count
         assert {path.name for path in out.iterdir()} == {".lock", FILE}
-    first = min(tmp_path.glob("out.before-*"), key=lambda path: len(path.name))
+    first = min(tmp_path.glob("out.before-*"), key=lambda path: (len(path.name), path.name))
     assert record(first) == before
     assert (first / "models" / "one.npz").read_bytes() == b"mine"
 
