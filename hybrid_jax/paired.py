@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.stats import t as student
+from scipy.special import stdtrit
 
 LEVEL = 0.95
 
@@ -80,4 +80,4 @@ def _finite(*samples: np.ndarray) -> list[np.ndarray]:
 
 
 def _squared_t(count: int, level: float) -> float:
-    return float(student.ppf((1 + level) / 2, count - 1)) ** 2
+    return float(stdtrit(count - 1, (1 + level) / 2)) ** 2
