@@ -14,14 +14,14 @@ from experiments.closed_loop_ablation import Option, networks, unnormalised, var
 from experiments.closed_loop_lanes import Airspace, Block
 from experiments.closed_loop_report import Outcome, write
 from experiments.common_field import Believed
-from experiments.flyers import Trained, fleet, nine_numbers, train
+from experiments.flyers import Trained, fleet, nine_numbers, train, unchanged_fleet
 from experiments.protocol import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
 from hybrid_jax import checks, hosts
 from hybrid_jax.closed_loop_rows import Flyer
 from hybrid_jax.control import Controller
 from hybrid_jax.lanes import count, lane
 from hybrid_jax.rigid_body import rigid_body
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
@@ -36,6 +36,7 @@ ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 class ClosedLoopConfig(Config):
     """Train as param_shift and external_force do (what they left in --cache is used), then fly both targets with a
     model predictive controller that carries each model in turn: adapted with the smallest and the largest of --sizes.
+    The vehicle as it was before flies with what was not adapted.
     """
 
     seconds: float = 10.0
@@ -117,6 +118,7 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
     trained = models(config, console, outcome)
     few, many = min(config.sizes), max(config.sizes)
     crews = {domain.name: fleet(domain, IRIS, trained, few, many, config) for domain in DOMAINS}
+    crews[SOURCE.name] = unchanged_fleet(IRIS, trained, config)
     capacity = max(sum(map(count, crew.values())) for crew in crews.values())
 
     def airspace(controller: Controller) -> Airspace:
@@ -159,10 +161,12 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
 
 
 def fly_models(config: ClosedLoopConfig, space: Airspace, crews: dict[str, Crew], outcome: Outcome) -> None:
-    """Every model along every reference, at home and away."""
-    for domain in DOMAINS:
+    """Every model along every reference, before and after the changes; after them away from home as well."""
+    for domain in (SOURCE, *DOMAINS):
         crew = crews[domain.name]
         outcome.home += [space.fly(Block(domain, reference, 0.0, crew)) for reference in config.references]
+    for domain in DOMAINS:
+        crew = crews[domain.name]
         alone = {flyer: model for flyer, model in crew.items() if not flyer.observer}
         outcome.away += [space.fly(Block(domain, name, config.away, alone)) for name in config.flown_away]
 

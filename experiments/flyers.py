@@ -81,10 +81,32 @@ def fleet(
             fields[Flyer(model)] = found.source
         sizes = (few,) if model in ("physics", "nine") else dict.fromkeys((few, many))
         fields |= {Flyer(model, size): found.adapted[domain.name, size] for size in sizes}
-    sources, adapted = map(Flyer, dict.fromkeys(SOURCES.values())), (Flyer(model, few) for model in SOURCES)
-    for flyer in (Flyer("nominal"), *sources, *adapted):
-        fields[replace(flyer, observer=True)] = fields[flyer]
+    adapted = [Flyer(model, few) for model in SOURCES]
+    return _crew(domain, vehicle, fields, [Flyer("nominal"), *_sources(), *adapted], config)
+
+
+def unchanged_fleet(vehicle: Vehicle, trained: dict[str, Trained], config: Config) -> dict[Flyer, Believed]:
+    """All that flies the vehicle of the source, which has not changed: what was not adapted.
+
+    Args:
+        trained: as of `fleet`.
+    """
+    fields = {Flyer("nominal"): single(rigid_body(vehicle))}
+    fields |= {flyer: trained[flyer.model].source for flyer in _sources()}
+    return _crew(SOURCE, vehicle, fields, list(fields), config)
+
+
+def _sources() -> list[Flyer]:
+    """The hybrids before adaptation."""
+    return [Flyer(model) for model in dict.fromkeys(SOURCES.values())]
+
+
+def _crew(
+    domain: Domain, vehicle: Vehicle, fields: dict[Flyer, Any], observed: Sequence[Flyer], config: Config
+) -> dict[Flyer, Believed]:
+    """These fields, those `observed` with an observer as well, and the true one."""
     models = {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()}
+    models |= {replace(flyer, observer=True): models[flyer] for flyer in observed}
     return models | {Flyer("oracle"): single(true_field(domain, vehicle))}
 
 

@@ -9,11 +9,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from hybrid_jax.closed_loop_rows import REFERENCES, FlightRow, Flyer, cells
+from hybrid_jax.closed_loop_rows import DOMAINS, NAMES, REFERENCES, FlightRow, Flyer, cells
 from hybrid_jax.closed_loop_tables import ORACLE, gaps
 from hybrid_jax.error_panels import Line, add_legend, draw_panel, tick_errors
 from hybrid_jax.figures import COLOURS, STYLE
-from hybrid_jax.rows import DOMAINS, NAMES
 
 TINTS = {
     "nominal": "0.45",

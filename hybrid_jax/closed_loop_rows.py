@@ -6,8 +6,11 @@ import math
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass, fields
 
-from hybrid_jax.rows import DOMAINS
+from hybrid_jax import rows as shifts
 
+UNCHANGED = "source"  # the domain of the vehicle as it was before the change
+DOMAINS = (UNCHANGED, *shifts.DOMAINS)
+NAMES = {UNCHANGED: "unchanged vehicle"} | {domain: shifts.NAMES[domain] for domain in shifts.DOMAINS}  # for people
 REFERENCES = {  # name → for people
     "hover": "hover",
     "figure_eight": "figure-8, 3.5 m/s",

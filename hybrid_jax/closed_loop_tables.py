@@ -4,10 +4,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
-from hybrid_jax.closed_loop_rows import REFERENCES, SOURCES, Cells, FlightRow, Flyer, cells, paired
+from hybrid_jax.closed_loop_rows import (
+    DOMAINS,
+    NAMES,
+    REFERENCES,
+    SOURCES,
+    UNCHANGED,
+    Cells,
+    FlightRow,
+    Flyer,
+    cells,
+    paired,
+)
 from hybrid_jax.paired import Interval, share_of_gap
 from hybrid_jax.report_tables import Table
-from hybrid_jax.rows import DOMAINS, NAMES
 from hybrid_jax.summary import spread
 
 ORACLE = Flyer("oracle")
@@ -35,9 +45,9 @@ def tables(rows: Sequence[FlightRow]) -> list[Table]:
 
 
 def gap_tables(rows: Sequence[FlightRow]) -> list[Table]:
-    """The share of the gap between the source model and the true vehicle that each way closes, of each domain."""
+    """The share of the gap between the source model and the true vehicle that each way closes, after each change."""
     found, made = cells(rows), []
-    for domain in (domain for domain, distance in _places(found) if not distance):
+    for domain in (domain for domain, distance in _places(found) if not distance and domain != UNCHANGED):
         shares = gaps(found, domain)
         columns = [reference for reference in REFERENCES if any(reference in line for line in shares.values())]
         lines = [

@@ -164,8 +164,10 @@ def test_the_report_keeps_its_contract(folder):
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     rows = [FlightRow(**row) for row in report["rows"]]
     # Nominal, oracle; 20 of physics, no-physics, nine numbers; source and 20 of two hybrids; and six with observers.
-    assert len(rows) == 2 * (2 * 15 + 1 * 9)
+    # On the unchanged vehicle nominal, oracle, two sources, and three with observers.
+    assert len(rows) == 2 * (2 * 15 + 1 * 9) + 2 * 7
     assert {row.distance for row in rows} == {0.0, 60.0}
+    assert {row.n_train for row in rows if row.domain == "source"} == {0}
     assert {row["variant"] for row in report["ablation"]} > {"safe, batch statistics of the source"}
     assert {claim["id"] for claim in report["claims"] + report["not_judged"]} >= {"R1a", "R6b", "R7", "R8"}
     assert set(report["speed"]) == {"nominal physics", "hybrid, N = 20", "safe hybrid, N = 20"}
@@ -179,8 +181,8 @@ def test_a_second_run_trains_and_flies_nothing(folder):
     again = command("closed_loop", folder=folder, out=folder / "again")
     assert again.returncode == 0, again.stderr
     # Four models, and two of the ablation: pre-training and two adaptations each; in each domain
-    # two references at home, one away, and three places of the ablation.
-    assert again.stderr.count("as found in the cache") == 6 * 3 + 2 * 3 + 2 * 3, again.stderr
+    # two references at home, one away, and three places of the ablation; the two at home before the change.
+    assert again.stderr.count("as found in the cache") == 6 * 3 + 2 * 3 + 2 * 3 + 2, again.stderr
     assert "lanes active" not in again.stderr
     reports = [json.loads((folder / out / "closed_loop" / "report.json").read_text()) for out in ("out", "again")]
     assert reports[0]["rows"] == reports[1]["rows"]

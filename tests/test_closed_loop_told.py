@@ -147,6 +147,22 @@ def test_tables_have_a_line_for_each_flyer_and_tell_crashes():
     assert len(table.lines) == 1
 
 
+def test_the_unchanged_vehicle_tells_what_promises_were_worth_before():
+    before = [
+        replace(row, domain="source", excess=0.5)
+        for row in ROWS
+        if row.domain == "parameter_shift" and not row.distance and row.flyer in (Flyer("safe"), Flyer("oracle"))
+    ]
+    told = {claim.id: claim for claim in claims([*before, *ROWS], FEW, SPEED)}
+    assert told["R4b"].measured.startswith("hover: +5.0 % (source +5 %, before the change +50 %); ")
+    assert told["R4a"].measured.startswith("hover: +5.0 % (source +5 %); ")
+    assert told["R4b"].holds is True
+    assert sum("unchanged vehicle" in table.title for table in tables([*before, *ROWS])) == 5
+    assert len(gap_tables([*before, *ROWS])) == 2
+    panels = figures.promised([*before, *ROWS], [Flyer("safe")]).axes
+    assert [axes.get_title() for axes in panels] == ["Unchanged vehicle", "Parameter shift", "External force"]
+
+
 def test_figures_have_a_panel_for_each_reference():
     drawn = figures.errors(ROWS, "external_force")
     assert [axes.get_title() for axes in drawn.axes] == list(REFERENCES.values())
