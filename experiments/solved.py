@@ -1,7 +1,8 @@
 """Adaptation that is solved instead of trained, by least squares or in closed form, for every size and seed."""
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,6 +19,7 @@ from hybrid_jax.lanes import stack
 from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
+from hybrid_jax.sweep import PROGRAMS
 from hybrid_jax.training import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
@@ -50,13 +52,7 @@ def solved(
     Args:
         name: of the stage.
     """
-    shared = settings(config)
-
-    def one(lane, pool: Trajectories, validation: Trajectories) -> Solved:
-        field, subset = lane
-        field, steps, status = solve(field, pool[subset], validation, shared)
-        val_mse = deployed_mse(field, validation, solver=shared.solver)
-        return Solved(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
+    one = _Lane(solve, settings(config))
 
     def of_size(size: int) -> Solved:
         lanes = (fields, subsets(size, config))
@@ -64,6 +60,20 @@ def solved(
 
     parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
+
+
+@dataclass(frozen=True)
+class _Lane:
+    """What is done to one lane; equal for the targets of an experiment, which so share a program."""
+
+    solve: Solve
+    shared: Settings
+
+    def __call__(self, lane: Any, pool: Trajectories, validation: Trajectories) -> Solved:
+        field, subset = lane
+        field, steps, status = self.solve(field, pool[subset], validation, self.shared)
+        val_mse = deployed_mse(field, validation, solver=self.shared.solver)
+        return Solved(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
 
 
 def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):
@@ -80,9 +90,13 @@ def constant_disturbance(field, train: Trajectories, validation: Trajectories, s
 
 def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
     """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
-    # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
-    run = eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
-    return jax.device_get(run(lanes, shared))
+    return jax.device_get(_mapped(function)(lanes, shared))
+
+
+# A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
+@lru_cache(PROGRAMS)
+def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
+    return eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
 
 
 def subsets(size: int, config: Config) -> np.ndarray:
