@@ -112,6 +112,7 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
         content = io.BytesIO()
         with mpl.rc_context(STYLE):
             figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
+            figure.set_layout_engine("none")  # both as the first was laid out: that is half of the work
         paths.append(Path(f"{path}.{suffix}"))
         write_whole(paths[-1], content.getvalue())
     return paths
