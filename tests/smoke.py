@@ -5,14 +5,18 @@ group of commands that share their cache: `out`, `cache`, and for each command i
 look at that instead of running it all again.
 """
 
+import contextlib
+import io
 import json
 import os
 import shutil
 import subprocess
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 ROOT = Path(__file__).parents[1]
 LEFT = os.environ.get("HYBRID_JAX_SMOKE")
@@ -21,9 +25,14 @@ Run = subprocess.CompletedProcess
 
 def command(name: str, *options: str, folder: Path, out: Path | None = None) -> Run:
     """An experiment in its smallest preset, its cache and, by default, its results in a folder."""
+    return python(f"experiments.{name}", *smallest(*options, folder=folder, out=out))
+
+
+def smallest(*options: str, folder: Path, out: Path | None = None) -> list[str]:
+    """The options of an experiment in its smallest preset, all it leaves in a folder."""
     out = folder / "out" if out is None else out
     preset = [] if "--preset" in options else ["--preset", "smoke"]
-    return python(f"experiments.{name}", *preset, "--out", str(out), "--cache", str(folder / "cache"), *options)
+    return [*preset, "--out", str(out), "--cache", str(folder / "cache"), *options]
 
 
 def python(module: str, *options: str) -> Run:
@@ -56,6 +65,19 @@ def told(folder: Path, module: str) -> Run:
     """What a command said that continuous integration ran in a folder."""
     code, out, err = ((folder / f"{module}.{part}.txt").read_text() for part in ("code", "out", "err"))
     return Run([module], int(code), out, err)
+
+
+def unbegun(name: str, *arguments: str) -> Run:
+    """What an experiment says, in this process, whose options end it before it sets anything up."""
+    module, out, err = f"experiments.{name}", io.StringIO(), io.StringIO()
+    begun = mock.patch("experiments.command.configure", side_effect=AssertionError("the command has begun"))
+    said = mock.patch.object(sys, "argv", [module, *arguments])
+    with begun, said, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        try:
+            import_module(module).main()
+        except SystemExit as stop:
+            return Run([module, *arguments], int(stop.code or 0), out.getvalue(), err.getvalue())
+    raise AssertionError("the command has ended without a word")
 
 
 def refused(run: Run, name: str) -> str:

@@ -5,7 +5,7 @@ import json
 import equinox as eqx
 import numpy as np
 import pytest
-from smoke import command, experiments, refused
+from smoke import experiments, refused, smallest, unbegun
 from test_experiments import ROW
 
 import hybrid_jax
@@ -94,5 +94,5 @@ def test_intervals_stand_around_what_was_fitted(folder):
     ids=["twice", "last layer of a view", "no physics without velocities", "repeats", "sizes", "box", "patience"],
 )
 def test_methods_that_do_not_fit_are_refused_before_anything_is_flown(options, named, tmp_path):
-    assert named in refused(command("comparison", *options, folder=tmp_path), "comparison")
+    assert named in refused(unbegun("comparison", *smallest(*options, folder=tmp_path)), "comparison")
     assert not list(tmp_path.iterdir())

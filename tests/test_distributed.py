@@ -146,10 +146,12 @@ def whole(tmp_path_factory):
     return said.split()[-1], programs
 
 
-@pytest.mark.parametrize(("victim", "later"), [(0, 2), (1, 1), (1, 2)])
+@pytest.mark.parametrize(("victim", "later"), [(0, (2,)), (1, (1, 2))])
 def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, later, whole, tmp_path):
     digest, programs = whole
-    both = pair(programs, tmp_path)
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    both = pair(programs, folder)
     assert any("lanes active" in line for line in both[0].stderr)
     killed, other = both[victim], both[1 - victim]
     killed.send_signal(signal.SIGKILL)
@@ -158,11 +160,13 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     assert time.monotonic() - since < FAST
     assert other.returncode == 1
     assert said.strip().splitlines()[-1].startswith("gone: another process of this run has ended; the same command")
-    assert len(list(tmp_path.glob("*.begun"))) == (victim == 1)  # process 0 saves when another is lost
-    texts = ended(pair(programs, tmp_path) if later == 2 else [sweep(programs, tmp_path)])
-    assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
-    assert {said.split()[-1] for said, _ in texts} == {digest}
-    assert all(said.split()[-2] == str(2 * later) for said, _ in texts)
+    assert len(list(folder.glob("*.begun"))) == (victim == 1)  # process 0 saves when another is lost
+    for processes in later:
+        left = shutil.copytree(folder, tmp_path / f"left to {processes}", dirs_exist_ok=True)
+        texts = ended(pair(programs, left) if processes == 2 else [sweep(programs, left)])
+        assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
+        assert {said.split()[-1] for said, _ in texts} == {digest}
+        assert all(said.split()[-2] == str(2 * processes) for said, _ in texts)
 
 
 @pytest.mark.parametrize(

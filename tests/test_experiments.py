@@ -9,7 +9,7 @@ import sys
 
 import numpy as np
 import pytest
-from smoke import ROOT, command, experiments, refused
+from smoke import ROOT, command, experiments, refused, smallest, unbegun
 
 import hybrid_jax
 from experiments.external_force import sine_floor
@@ -166,7 +166,7 @@ def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent
     ids=["preset", "sizes", "text for a number", "unknown"],
 )
 def test_wrong_options_are_refused_in_one_line(options, named, tmp_path):
-    assert named in refused(command("param_shift", *options, folder=tmp_path), "param_shift")
+    assert named in refused(unbegun("param_shift", *smallest(*options, folder=tmp_path)), "param_shift")
     assert not list(tmp_path.iterdir())
 
 
