@@ -51,6 +51,12 @@ class ClosedLoopConfig(Config):
     """Of the disturbance observer [rad/s]."""
     safe_inputs: ResidualInputs = "no_xy_yaw"
     """What the safe network sees (see --residual-inputs); it adds to v̇ and ω̇ alone."""
+    safe_hidden: int = 256
+    """Its hidden units. With 64 what it errs by on the vehicle that it learned is most of what is left to err by."""
+    safe_norm: Literal["batch", "none"] = "none"
+    """Normalisation of its hidden layer."""
+    safe_rates: tuple[float, ...] = (3e-3, 3e-4, 3e-5)
+    """Its rates in pre-training, one after the other, each from the best of the one before; those of θ_p fall alike."""
     safe_source: int = 10_000
     """Source trajectories of the safe network, if --source-train is more."""
     safe_epochs: int = 2000
@@ -78,6 +84,11 @@ class ClosedLoopConfig(Config):
             raise ValueError(f"--away-references must be among --references ({known}), got {', '.join(unknown)}")
         for option in ("seconds", "away", "bandwidth"):
             checks.positive(f"--{option}", getattr(self, option))
+        if not self.safe_rates:
+            raise ValueError("--safe-rates must be at least one")
+        for rate in self.safe_rates:
+            checks.positive("--safe-rates", rate)
+        checks.count("--safe-hidden", self.safe_hidden)
         if self.safe_offset is not None:
             checks.positive("--safe-offset", self.safe_offset)
         if self.seconds < 1.0:
@@ -107,7 +118,7 @@ PRESETS = {
     ),
     "smoke": preset_like(
         ClosedLoopConfig, SMOKE, sizes=(20,), source_train=20, seconds=1.0, references=("hover", "low_pass"),
-        away_references=("hover",), ablation=("statistics",), calls=20,
+        away_references=("hover",), safe_hidden=8, safe_norm="batch", ablation=("statistics",), calls=20,
     ),
 }  # fmt: skip
 
@@ -151,8 +162,13 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
         trained[name] = _train(name, model, config, console, outcome)
     # Of the sizes only the two that fly: nobody else has trained this network.
     sizes = tuple(dict.fromkeys((min(config.sizes), max(config.sizes))))
-    seen: dict[str, Any] = {"residual_inputs": config.safe_inputs, "residual_outputs": "accelerations"}
-    wanted = shared(config, sizes=sizes, pool=config.pooled(), rates=safe_rates(config), **seen)
+    network: dict[str, Any] = {
+        "residual_inputs": config.safe_inputs,
+        "residual_outputs": "accelerations",
+        "hidden": config.safe_hidden,
+        "norm": config.safe_norm,
+    }
+    wanted = shared(config, sizes=sizes, pool=config.pooled(), rates=safe_rates(config), **network)
     own = limited(wanted, config.safe_source, config.safe_epochs)
     trained["safe"] = _train("safe", "hybrid", own, console, outcome)
     trained["nine"], stages = nine_numbers(trained["safe"].source, min(sizes), own, console, DOMAINS)
@@ -175,7 +191,7 @@ def fly_ablation(
     config: ClosedLoopConfig, usual: Airspace, drifting: Airspace, console: Console, outcome: Outcome
 ) -> None:
     """Train the ablation's networks and fly them, one change at a time."""
-    few = shared(config, sizes=(min(config.sizes),), pool=config.pooled(), rates=safe_rates(config))
+    few = shared(config, sizes=(min(config.sizes),), pool=config.pooled(), rates=offset_rates(config))
     small = limited(few, config.ablation_source, config.ablation_epochs)
     trained, seconds, notes = networks(config.ablation, IRIS, small, console, DOMAINS)
     outcome.seconds |= seconds
@@ -196,6 +212,12 @@ def shared(config: ClosedLoopConfig, **changes: Any) -> Config:
 
 def safe_rates(config: ClosedLoopConfig) -> Rates:
     """The learning rates of the safe network."""
+    first, *others = config.safe_rates
+    return replace(offset_rates(config), pretraining=first, decay=tuple(rate / first for rate in others))
+
+
+def offset_rates(config: ClosedLoopConfig) -> Rates:
+    """The learning rates of the ablation's networks: the usual ones, but for the output bias."""
     return config.rates if config.safe_offset is None else replace(config.rates, offset=config.safe_offset)
 
 

@@ -100,8 +100,8 @@ class Block:
 
     def parts(self) -> list["Block"]:
         """Blocks of fields of one kind: what one program flies."""
-        kinds = dict.fromkeys(type(field) for field in self.flyers.values())
-        chosen = [{who: field for who, field in self.flyers.items() if type(field) is kind} for kind in kinds]
+        kinds = dict.fromkeys(map(kind_of, self.flyers.values()))
+        chosen = [{who: field for who, field in self.flyers.items() if kind_of(field) == kind} for kind in kinds]
         return [replace(self, flyers=flyers) for flyers in chosen]
 
     def keys(self) -> list[tuple[Flyer, int]]:
@@ -126,6 +126,11 @@ class Block:
         )
 
 
+def kind_of(fields: Believed) -> tuple:
+    """What stacked fields must have in common to be stacked with others."""
+    return type(fields), *(leaf.shape[1:] for leaf in jax.tree.leaves(fields))
+
+
 @dataclass(frozen=True)
 class Flights:
     """What is kept of a block.
@@ -144,8 +149,10 @@ class Flights:
     devices: int
 
     def rows(self) -> list[FlightRow]:
-        """A row for each flight."""
-        return [self._row(i, *key) for i, key in enumerate(self.block.keys())]
+        """A row for each flight, in the order of the block's flyers."""
+        order = list(self.block.flyers)
+        rows = [self._row(i, *key) for i, key in enumerate(self.block.keys())]
+        return sorted(rows, key=lambda row: order.index(row.flyer))
 
     def states(self, flyer: Flyer, seed: int = 0) -> np.ndarray:
         """The states of one flight, every 0.05 s from the start on."""
@@ -189,7 +196,7 @@ class Airspace:
         thrown = list(PATHS).index("upset")
         starts[thrown] = upset(jnp.asarray(references[thrown, 0]))
         self._shared = (references, starts)
-        self._maps: dict[int, LaneMap] = {}  # by their width
+        self._maps: dict[tuple, LaneMap] = {}  # by their width and the kind of field
 
     def fly(self, block: Block) -> Flights:
         """The flights of a block, found in the cache or flown now.
@@ -235,7 +242,7 @@ class Airspace:
         alone = total == 1
         padded = lane(lanes, np.resize(np.arange(total), 1 if alone else max(total, self._capacity)))
         width = 1 if alone else WIDTH.get(jax.default_backend(), 0)
-        run = self._maps.setdefault(width, LaneMap(partial(simulate, self._controller), width))
+        run = self._maps.setdefault((width, kind_of(lanes.model)), LaneMap(partial(simulate, self._controller), width))
         costs = np.ones(count(padded))
         run(padded, self._shared, costs, [])  # compiles, flies nothing
         began, worked = time.perf_counter(), time.process_time()

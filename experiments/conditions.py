@@ -50,10 +50,16 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
 
 def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, Plan]:
     """One lane a seed, on all source trajectories."""
+    return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
+
+
+def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, Plan]:
+    """Pre-training that goes on from the seeds' fields, with all its rates times a factor."""
     rate, rule = _pretraining_rule(model, config)
     everything = np.arange(config.source_train)
     plan = _plan(model, config, rate, rule, everything, config.source_train)
-    starts = _starts(fresh_fields(model, vehicle, config), np.arange(config.seeds), PRETRAINING)
+    plan = replace(plan, rates=jax.tree.map(lambda rate: factor * rate, plan.rates))
+    starts = _starts(fields, np.arange(config.seeds), PRETRAINING)
     return starts, stack([plan] * config.seeds)
 
 

@@ -39,6 +39,8 @@ class Rates:
     """θ_p, in pre-training and fine-tuning."""
     pretraining: float = 1e-4
     """θ_d, both models."""
+    decay: tuple[float, ...] = ()
+    """Pre-training goes on from its best model with all its rates times each of these in turn; by default it ends."""
     hybrid: tuple[float, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
     """θ_d of the hybrid, fine-tuned and target-only."""
     no_physics: tuple[float, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
@@ -176,7 +178,7 @@ class Config(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         check_numbers("--", self, RULES)
-        check_numbers("--rates.", self.rates, {"offset": checks.positive})
+        check_numbers("--rates.", self.rates, dict.fromkeys(("offset", "decay"), checks.positive))
         factors("--guess", self.guess)
         if not self.sizes or min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")

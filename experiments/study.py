@@ -10,7 +10,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.ahead import Ahead, blank
-from experiments.conditions import adaptation, fresh_fields, pretraining, settings
+from experiments.conditions import adaptation, annealing, fresh_fields, pretraining, settings
 from experiments.make_flights import chosen_flights, flights
 from experiments.protocol import AdaptationConfig, Config
 from experiments.results import Lanes, rows_of, solution, trained
@@ -78,7 +78,11 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
     """A model after pre-training on source flight, one lane a seed."""
-    return stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), settings(config), source)
+    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), settings(config), source)
+    for factor in config.rates.decay:
+        lanes = annealing(model, found.best, factor, config)
+        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, settings(config), source)
+    return found
 
 
 def adapted(

@@ -13,7 +13,7 @@ from rich.console import Console
 from smoke import command, experiments, refused, smallest, unbegun
 
 import hybrid_jax as hj
-from experiments.closed_loop_lanes import PATHS, Airspace, Block
+from experiments.closed_loop_lanes import PATHS, Airspace, Block, Flights
 from experiments.common_field import common, true_field
 from experiments.flyers import in_common, single, with_statistics_of
 from experiments.protocol import SMOKE
@@ -122,6 +122,18 @@ def flights(crew, tmp_path_factory):
     return flown
 
 
+def test_networks_of_two_sizes_are_flown_apart_and_told_in_the_order_of_the_crew(crew):
+    small = crew[0][Flyer("hybrid")]
+    large = jax.tree.map(lambda *leaves: jnp.stack(leaves), *[common(BODY, hj.IRIS, 16, SCALING)] * 2)
+    flyers = {Flyer("hybrid"): small, Flyer("safe"): large, Flyer("hybrid", 20): small}
+    block = Block(PARAMETER_SHIFT, "hover", 0.0, flyers)
+    assert [list(part.flyers) for part in block.parts()] == [[Flyer("hybrid"), Flyer("hybrid", 20)], [Flyer("safe")]]
+    names = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "excess", "promised", "realised", "crashed")
+    found = Flights(block, {name: np.arange(6.0) for name in names}, 1.0, 1.0, 1).rows()
+    assert [row.flyer for row in found] == [flyer for flyer in flyers for _ in range(2)]
+    assert [row.position_rmse for row in found] == [0, 1, 4, 5, 2, 3]
+
+
 def test_a_lane_is_the_lone_flight_of_its_model(crew, flights):
     _, hybrid = crew
     reference = sample(PATHS["figure_eight"], CONTROLLER, SECONDS)
@@ -181,8 +193,9 @@ def test_a_second_run_trains_and_flies_nothing(folder):
     less = ("--references", "hover", "--away-references", "hover", "--ablation", "--calls", "1")
     again = command("closed_loop", *less, folder=folder, out=folder / "again")
     assert again.returncode == 0, again.stderr
-    # Four models: pre-training and two adaptations each; hover in three domains, and away in two.
-    assert again.stderr.count("as found in the cache") == 4 * 3 + 3 + 2, again.stderr
+    # Four models: pre-training, of the safe one in three stages, and two adaptations each; hover in three domains, and
+    # away in two.
+    assert again.stderr.count("as found in the cache") == 4 * 3 + 2 + 3 + 2, again.stderr
     assert "lanes active" not in again.stderr
     first, second = (json.loads((folder / out / "closed_loop" / "report.json").read_text()) for out in ("out", "again"))
     assert second["rows"] == [row for row in first["rows"] if row["reference"] == "hover"]

@@ -11,6 +11,7 @@ import pytest
 
 from experiments.conditions import adaptation, fresh_fields, pretraining
 from experiments.protocol import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
+from experiments.study import pretrained
 from hybrid_jax.lanes import lane
 from hybrid_jax.vector_field import Hybrid
 from hybrid_jax.vehicle import IRIS
@@ -81,6 +82,24 @@ def test_pretraining_lanes_use_all_source_flights(model, minimum, patience):
         np.testing.assert_allclose(jax.tree.leaves(plan.rates), expected, rtol=1e-6)
 
 
+def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
+    config = replace(SMALL, rates=replace(SMALL.rates, decay=(0.1, 0.01)))
+    begun = []
+
+    class Trained:
+        def run(self, name, states, plans, *_):
+            begun.append((states.field, plans.rates))
+            return eqx.tree_at(lambda state: state.best, states, jax.tree.map(lambda leaf: leaf + 1, states.field))
+
+    found = pretrained("hybrid", IRIS, config, Trained(), None)
+    fields, rates = zip(*begun, strict=True)
+    for field, before in zip((*fields[1:], found.best), fields, strict=True):
+        assert eqx.tree_equal(field, jax.tree.map(lambda leaf: leaf + 1, before))
+    for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
+        np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)
+        np.testing.assert_allclose(each.residual, factor * 1e-4, rtol=1e-6)
+
+
 def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():
     subsets = {(n, seed): plan.subset for n, seed, plan in plans_by_lane("hybrid", "fine_tuned")}
     for (n, seed), subset in subsets.items():
@@ -138,6 +157,7 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"rates": replace(PAPER.rates, physics=-1.0)}, "--rates.physics must be a finite number of at least 0"),
         ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
         ({"rates": replace(PAPER.rates, offset=0.0)}, "--rates.offset"),
+        ({"rates": replace(PAPER.rates, decay=(0.1, 0.0))}, "--rates.decay"),
         (
             {"patience": replace(PAPER.patience, hybrid_patience=(20,) * 4 + (-1,))},
             "--patience.hybrid-patience must be",
