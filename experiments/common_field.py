@@ -85,7 +85,7 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
     A single one, so map it over stacked ones.
 
     Args:
-        hidden, scaling: of the networks of all lanes.
+        hidden, scaling: of the network that a rigid body alone is given, which is silent.
 
     Raises:
         ValueError: a field of another kind, or a network whose norm is no affine map of a sample.
