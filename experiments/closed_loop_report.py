@@ -53,7 +53,7 @@ is known to it without noise.
 RMSE: over the flight after its start. A flight crashed if it went below the ground or 10 m astray, and then counts as
 infinitely far off. Promised: what the plan of a call costs by the model; realised: what its inputs, flown for 1 s
 without another call, cost in the truth; of calls every 0.5 s. Before the change (unchanged vehicle) what was not
-adapted flies as well: what a source network gets wrong of the vehicle that it learned, adaptation finds there.
+adapted flies as well: what promises were worth on the vehicle that the source networks learned.
 """
 
 
