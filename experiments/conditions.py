@@ -18,6 +18,7 @@ from hybrid_jax.objective import Settings
 from hybrid_jax.residual import InputScaling
 from hybrid_jax.rigid_body import RigidBody, guess, guess_off
 from hybrid_jax.rollout import SOLVERS
+from hybrid_jax.runtime import SOONEST
 from hybrid_jax.training import FitState, Plan, make_plan
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
@@ -38,7 +39,8 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
     return jax.device_get(_fresh_fields(model, vehicle, config, np.arange(config.seeds)))
 
 
-@eqx.filter_jit
+# Equinox hands the options on to jax.jit, but does not declare them.
+@eqx.filter_jit(compiler_options=SOONEST)  # pyright: ignore[reportCallIssue]
 def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
     def build(seed):
         physics = _first_guess(vehicle, config, _key(seed, PHYSICS))

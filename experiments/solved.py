@@ -19,6 +19,7 @@ from hybrid_jax.lanes import stack
 from hybrid_jax.least_squares import fit_physics
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
+from hybrid_jax.runtime import SOONER
 from hybrid_jax.sweep import PROGRAMS
 from hybrid_jax.training import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.trajectories import Trajectories
@@ -96,7 +97,11 @@ def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
 # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
 @lru_cache(PROGRAMS)
 def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
-    return eqx.filter_jit(lambda lanes, shared: jax.lax.map(lambda lane: function(lane, *shared), lanes))
+    def mapped(lanes, shared):
+        return jax.lax.map(lambda lane: function(lane, *shared), lanes)
+
+    # Equinox hands the options on to jax.jit, but does not declare them.
+    return eqx.filter_jit(mapped, compiler_options=SOONER)  # pyright: ignore[reportCallIssue]
 
 
 def subsets(size: int, config: Config) -> np.ndarray:

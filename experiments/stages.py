@@ -20,7 +20,7 @@ from hybrid_jax.environment import PACKAGES
 from hybrid_jax.files import aside
 from hybrid_jax.models import describe
 from hybrid_jax.objective import Prediction, Settings
-from hybrid_jax.sweep import Progress, sweep
+from hybrid_jax.sweep import NO_MORE, Progress, Room, sweep
 from hybrid_jax.training import FitState, Plan
 
 FORMAT = "hybrid_jax sweep 1"
@@ -47,8 +47,13 @@ class Stages:
         self.reused: list[str] = []
         self._ran = self._saving = 0.0
 
-    def run(self, name: str, states: FitState, plans: Plan, settings: Settings, data: Dataset) -> FitState:
+    def run(
+        self, name: str, states: FitState, plans: Plan, settings: Settings, data: Dataset, room: Room = NO_MORE
+    ) -> FitState:
         """The final states of a sweep on the train and validation splits of a dataset.
+
+        Args:
+            room: that its program has (see `sweep`); of no matter for what comes out.
 
         Raises:
             OtherRun: it was begun by other versions of the libraries.
@@ -69,7 +74,7 @@ class Stages:
             return states
         with Held() as held:
             keeper = _Keeper(checkpoints, held, name, spent, self._share)
-            states = self._sweep(name, states, plans, settings, data, keeper)
+            states = self._sweep(name, states, plans, settings, data, room, keeper)
             self.seconds[name] = keeper.seconds()
             if hosts.first():
                 _save(finished, name, states, self.seconds[name])
@@ -136,7 +141,7 @@ class Stages:
         self._say(f"{name}: goes on where it was interrupted, at epoch {states.epoch.max()}, after {clock(spent)}")
         return states, spent
 
-    def _sweep(self, name, states, plans, settings, data: Dataset, keeper: "_Keeper") -> FitState:
+    def _sweep(self, name, states, plans, settings, data: Dataset, room: Room, keeper: "_Keeper") -> FitState:
         with SweepLine(name, self._console) as line:
 
             def on_block(states: FitState, progress: Progress) -> None:
@@ -145,7 +150,7 @@ class Stages:
 
             train, validation = data.splits["train"], data.splits["validation"]
             try:
-                return sweep(states, plans, train, validation, settings, on_block=on_block)
+                return sweep(states, plans, train, validation, settings, room=room, on_block=on_block)
             except hosts.Gone:
                 keeper.rescue()
                 raise

@@ -23,7 +23,7 @@ from hybrid_jax.datasets import ARRAYS, Dataset
 from hybrid_jax.rows import SOURCE_OF, Row, with_rho
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
-from hybrid_jax.sweep import compile_evaluation, compile_sweep, evaluate
+from hybrid_jax.sweep import Room, compile_evaluation, compile_sweep, evaluate
 from hybrid_jax.training import FitState
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
@@ -78,10 +78,11 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
     """A model after pre-training on source flight, one lane a seed."""
-    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), settings(config), source)
+    shared = settings(config), source, room(config)
+    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
     for factor in config.rates.decay:
         lanes = annealing(model, found.best, factor, config)
-        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, settings(config), source)
+        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, *shared)
     return found
 
 
@@ -90,7 +91,7 @@ def adapted(
 ) -> FitState:
     """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
     lanes = adaptation(model, mode, fields, config)
-    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target)
+    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, room(config))
 
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
@@ -134,6 +135,11 @@ def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
     return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
+def room(config: Config) -> Room:
+    """Of all programs of a model: pre-training has fewer lanes, adaptation fewer windows, and both share one."""
+    return Room(config.seeds * len(config.sizes), max(config.source_train, config.pooled()))
+
+
 def source_of(model: str) -> str:
     """The model whose pre-training an adaptation starts from."""
     return SOURCE_OF.get(model, model)
@@ -159,8 +165,8 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     before = pretraining(model, vehicle, config)
     after = adaptation(model, "target_only", fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
-        compile_sweep(states, plans, windows["train"], windows["validation"], shared)
-        compile_evaluation(states.best, target["test"], EVERY, shared)
+        compile_sweep(states, plans, windows["train"], windows["validation"], shared, room(config))
+        compile_evaluation(states.best, target["test"], EVERY, shared, room(config))
 
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
@@ -177,7 +183,7 @@ def _solved(model: str, source: AbstractVectorField, config: Config, stages: Sta
 
 def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> np.ndarray:
     """L^T_MSE of stacked fields on the test flights."""
-    return stages.timed(stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config)))
+    return stages.timed(stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config), room(config)))
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

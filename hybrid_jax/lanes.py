@@ -79,6 +79,9 @@ class LaneMap:
         width: lanes in a chunk; by default what was measured for the backend; 0 for as many as fit into memory.
         devices: where chunks run, ordered by process; by default all devices of all processes.
         memory: bytes that a program may take on a device; by default most of what the device says is free.
+        room: lanes that the program has places for, so that calls of fewer share it. Of no use where a chunk holds as
+            many as fit: idle places of a chunk are computed.
+        compiler: options of XLA.
     """
 
     def __init__(
@@ -87,13 +90,15 @@ class LaneMap:
         width: int | None = None,
         devices: Any = None,
         memory: int | None = None,
+        room: int = 0,
+        compiler: dict[str, bool | int] | None = None,
     ):
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
-        self._memory = memory
+        self._memory, self._room = memory, room
         self._fitting: dict[int, int] = {}  # number of lanes → width
         self._mesh = Mesh(np.array(self.devices), (AXIS,))
-        self._run = jax.jit(self._on_mesh(function), static_argnums=0)
+        self._run = jax.jit(self._on_mesh(function), static_argnums=0, compiler_options=compiler)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
@@ -119,7 +124,8 @@ class LaneMap:
 
     def _most(self, total: int, width: int) -> int:
         """Chunks that a device has room for: twice the even share, enough to balance costs, and all if it is alone."""
-        return min(-(-total // width), 2 * -(-total // (width * len(self.devices))))
+        places = max(total, self._room if self.width else 0)
+        return min(-(-places // width), 2 * -(-places // (width * len(self.devices))))
 
     def _width(self, lanes: PyTree, shared: tuple) -> int:
         """The width that was asked for, or an even share of the lanes, halved until the program fits into memory."""

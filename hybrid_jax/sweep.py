@@ -6,7 +6,7 @@ so that these cost nothing, reports progress, and is where a run can be interrup
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import equinox as eqx
@@ -15,16 +15,33 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hybrid_jax import hosts, training
-from hybrid_jax.lanes import LaneMap, count
+from hybrid_jax.lanes import LaneMap, count, lane
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
 from hybrid_jax.preparation import check_minibatch
+from hybrid_jax.runtime import SOONER
 from hybrid_jax.training import FitState, Plan
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vector_field import AbstractVectorField
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
 PROGRAMS = 16  # of a kind that are kept: more than an experiment needs, and a bound on a long process's memory
+
+
+@dataclass(frozen=True)
+class Room:
+    """What a program has places for, so that sweeps of less share it; a sweep of more has a program of its own.
+
+    Attributes:
+        lanes: where a chunk is of a fixed width (see `LaneMap`).
+        windows: of training.
+    """
+
+    lanes: int = 0
+    windows: int = 0
+
+
+NO_MORE = Room()  # than is asked for
 
 
 @dataclass(frozen=True)
@@ -56,6 +73,7 @@ def sweep(
     validation: Trajectories,
     settings: Settings,
     *,
+    room: Room = NO_MORE,
     width: int | None = None,
     block_seconds: float = 4.0,
     on_block: Callable[[FitState, Progress], None] | None = None,
@@ -66,6 +84,7 @@ def sweep(
         states: stacked starts, one a lane (`training.start`, `lanes.stack`).
         plans: stacked plans, one a lane.
         train: the windows that plans index into; shared by all lanes.
+        room: that the program has at the least.
         width: lanes in a chunk; see `LaneMap`.
         on_block: called after each block with all states and the progress.
 
@@ -78,7 +97,7 @@ def sweep(
             minibatch of one window where fields normalise it.
     """
     states, plans = jax.device_get((states, plans))
-    block, shared, costs = _ready(states, plans, train, validation, settings, width)
+    plans, block, shared, costs = _ready(states, plans, train, validation, settings, room, width)
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == training.RUNNING)):
         start = time.perf_counter()
@@ -93,7 +112,12 @@ def sweep(
 
 
 def compile_sweep(
-    states: FitState, plans: Plan, train: Trajectories, validation: Trajectories, settings: Settings
+    states: FitState,
+    plans: Plan,
+    train: Trajectories,
+    validation: Trajectories,
+    settings: Settings,
+    room: Room = NO_MORE,
 ) -> None:
     """Compile what `sweep` of arguments of these shapes would; on another thread, say, while data are being made.
 
@@ -101,38 +125,55 @@ def compile_sweep(
         ValueError: as `sweep`.
     """
     states, plans = jax.device_get((states, plans))
-    _ready(states, plans, train, validation, settings, None)
+    _ready(states, plans, train, validation, settings, room, None)
 
 
 def evaluate(
-    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings
+    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, room: Room = NO_MORE
 ) -> Float[np.ndarray, " lanes"]:
     """L_MSE of each lane's field as deployed, on windows that all lanes share."""
-    lanes = count(fields)
-    errors = _evaluation(settings, every, _shapes(fields, windows))
-    return errors(jax.device_get(fields), (windows,), np.ones(lanes), range(lanes))
+    return _errors(fields, windows, every, settings, room, range(count(fields)))
 
 
-def compile_evaluation(fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings) -> None:
+def compile_evaluation(
+    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, room: Room = NO_MORE
+) -> None:
     """Compile what `evaluate` of arguments of these shapes would."""
-    errors = _evaluation(settings, every, _shapes(fields, windows))
-    errors(jax.device_get(fields), (windows,), np.ones(count(fields)), ())
+    _errors(fields, windows, every, settings, room, ())
+
+
+def _errors(fields, windows, every: int, settings: Settings, room: Room, active) -> Float[np.ndarray, " active"]:
+    fields = jax.device_get(fields)
+    places = max(count(fields), room.lanes)
+    errors = _evaluation(settings, every, places, _shapes(lane(fields, 0), windows))
+    return errors(fields, (windows,), np.ones(count(fields)), active)
 
 
 def _ready(
-    states: FitState, plans: Plan, train: PyTree, validation: PyTree, settings: Settings, width: int | None
-) -> tuple[LaneMap, tuple, np.ndarray]:
-    """The compiled block of a sweep, the data that all lanes share, and what an epoch of each lane costs."""
+    states: FitState, plans: Plan, train: PyTree, validation: PyTree, settings: Settings, room: Room, width: int | None
+) -> tuple[Plan, LaneMap, tuple, np.ndarray]:
+    """Plans and shared data as the compiled block takes them, that block, and what an epoch of each lane costs."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
     check_minibatch(states.field, settings)
     _check(plans, train, settings)
+    plans, train = _padded(plans, train, room.windows)
     shared = (train, validation)
-    block = _block(settings, width, _shapes((states, plans), shared))
+    places = max(count(states), room.lanes)
+    block = _block(settings, width, places, _shapes(lane((states, plans), 0), shared))
     costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
-    return block, shared, costs
+    return plans, block, shared, costs
+
+
+def _padded(plans: Plan, train: PyTree, windows: int) -> tuple[Plan, PyTree]:
+    """Plans and data as if there were so many windows; no plan asks for what is added."""
+    listed = plans.subset.shape[-1]
+    subset = np.pad(plans.subset, ((0, 0), (0, max(windows, listed) - listed)))
+    if len(train) < windows:
+        train = train[np.minimum(np.arange(windows), len(train) - 1)]
+    return replace(plans, subset=subset), train
 
 
 def _shapes(*trees: PyTree) -> tuple:
@@ -143,17 +184,20 @@ def _shapes(*trees: PyTree) -> tuple:
 
 # A sweep of the same shapes, later in the same process, compiles nothing; one map a shape, so that old programs go.
 @lru_cache(PROGRAMS)
-def _block(settings: Settings, width: int | None, shapes: tuple) -> LaneMap:
+def _block(settings: Settings, width: int | None, places: int, shapes: tuple) -> LaneMap:
     def block(lane: tuple[FitState, Plan, Int[Array, ""]], train, validation) -> FitState:
         state, plan, epochs = lane
         return training.run(state, plan, train, validation, settings, state.epoch + epochs)
 
-    return LaneMap(block, width)
+    return LaneMap(block, width, room=places)
 
 
 @lru_cache(PROGRAMS)
-def _evaluation(settings: Settings, every: int, shapes: tuple) -> LaneMap:
-    return LaneMap(lambda field, windows: deployed_mse(field, windows, every, settings.solver))
+def _evaluation(settings: Settings, every: int, places: int, shapes: tuple) -> LaneMap:
+    def errors(field: AbstractVectorField, windows: Trajectories) -> Float[Array, ""]:
+        return deployed_mse(field, windows, every, settings.solver)
+
+    return LaneMap(errors, room=places, compiler=SOONER)
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:

@@ -15,10 +15,10 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax import training
-from hybrid_jax.lanes import LaneMap, count, deal, lane, slack, stack
+from hybrid_jax.lanes import lane, stack
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
-from hybrid_jax.sweep import evaluate, sweep
+from hybrid_jax.sweep import Room, evaluate, sweep
 from hybrid_jax.training import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, start
 
 BATCH = 10
@@ -104,6 +104,42 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert len(blocks) > 3
     assert sum("run" in message for message in compiled) == 1
+
+
+def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
+    own, room = replace(SETTINGS, batch_size=4), Room(lanes=3, windows=40)
+    states, plans = lane((starts(), stack(PLANS)), np.array([2]))
+    few = states, replace(plans, subset=plans.subset % 20), TRAIN[:20]
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        shared = [
+            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, room=room),
+            sweep(*few, VALIDATION, own, width=1, room=room),
+        ]
+        errors = [evaluate(each.best, VALIDATION, 2, own, room) for each in shared]
+    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
+    assert sum("jit(run)" in message for message in compiled) == 2  # one to train, one to test
+    apart = [
+        sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1),
+        sweep(*few, VALIDATION, own, width=1),
+    ]
+    for one, other, error in zip(shared, apart, errors, strict=True):
+        np.testing.assert_array_equal(one.epoch, other.epoch)
+        np.testing.assert_allclose(one.field.log_length, other.field.log_length, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(error, evaluate(other.best, VALIDATION, 2, own), rtol=1e-4)
+
+
+@pytest.mark.parametrize("listed", [3, 40, 1000])
+def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
+    subset, key = np.random.default_rng(0).permutation(listed), jax.random.key_data(jax.random.key(1))
+    for n in {1, listed // 8, listed // 8 + 1, listed} - {0}:
+        orders = [
+            training._shuffled(make_plan(0.1, padded, n, 1, 1, 1, 0.0), key)
+            for padded in (subset, np.pad(subset, (0, 10 * listed)))
+        ]
+        np.testing.assert_array_equal(*(order[:listed] for order in orders))
+        assert set(np.asarray(orders[0][:n])) == set(subset[:n])
+        if n > 20:
+            assert (orders[0][:n] != subset[:n]).any()
 
 
 @pytest.mark.parametrize("width", [1, 3])
@@ -200,80 +236,6 @@ def test_bad_data_are_refused_by_name():
     spoiled = eqx.tree_at(lambda w: w.u, VALIDATION, VALIDATION.u.at[1, 2, 0].set(jnp.nan))
     with pytest.raises(ValueError, match=r"^validation: u\[1, 2, 0\] is not finite"):
         swept(starts(), PLANS, validation=spoiled)
-
-
-def test_lanes_are_stacked_and_picked():
-    stacked = starts()
-    assert count(stacked) == 3
-    assert same(lane(stacked, 1), start(pendulum(LENGTHS[1], DAMPING), jax.random.key(1)))
-    assert lane(stacked, 1).epoch.shape == ()
-
-
-@pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5)])
-def test_dealing_gives_every_lane_once_and_balances(devices, width):
-    rng = np.random.default_rng(0)
-    costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
-    hands = deal(costs, active, devices, width, 40)
-    assert len(hands) == devices
-    assert sorted(np.concatenate(hands).tolist()) == active
-    chunks = [[hand[i : i + width] for i in range(0, len(hand), width)] for hand in hands]
-    loads = [sum(max(costs[chunk]) for chunk in hand) for hand in chunks]
-    # Dearest first to the idlest: two devices never differ by more than one chunk.
-    assert max(loads) - min(loads) <= max(costs)
-    assert all(np.diff(costs[hand]).max(initial=-1) <= 0 for hand in hands)
-
-
-def test_more_devices_than_lanes_leave_some_idle():
-    assert [hand.tolist() for hand in deal([3.0, 1.0], [1], 3, 1, 1)] == [[1], [], []]
-
-
-def test_no_device_is_dealt_more_chunks_than_it_has_room_for():
-    costs = [100.0, *[1.0] * 9]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 10)] == [1, 9]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 6)] == [4, 6]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 2, 3)] == [4, 6]
-
-
-@pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5), (4, 30)])
-def test_a_device_with_less_to_do_is_given_as_much_more(devices, width):
-    rng = np.random.default_rng(1)
-    costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
-    hands = deal(costs, active, devices, width, 40)
-    times = slack(hands, costs, width)
-    busy = [sum(costs[i] * times[i] for i in hand[::width]) for hand in hands if len(hand)]
-    assert busy == pytest.approx([max(busy)] * len(busy))
-    assert times[active].min() == 1
-    assert not np.delete(times, active).any()
-
-
-def test_a_chunk_is_halved_until_its_program_fits_into_memory():
-    """A lane sorts a megabyte on its way; the programs of both widths give the same."""
-    lanes, shared = {"x": np.arange(8, dtype=np.float32)}, (np.ones(2**18, np.float32),)
-
-    def function(lane, ones):
-        return jnp.sum(jnp.sort(ones * lane["x"]))
-
-    whole = LaneMap(function, width=0)
-    assert whole._needed(8, lanes, shared) > whole._needed(2, lanes, shared) > 2 * shared[0].nbytes
-    narrow = LaneMap(function, width=0, memory=int(whole._needed(2, lanes, shared)))
-    results = [mapped(lanes, shared, [1.0] * 8, range(8)) for mapped in (whole, narrow)]
-    assert [mapped._width(lanes, shared) for mapped in (whole, narrow)] == [8, 2]
-    np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
-
-
-@pytest.mark.parametrize("width", [1, 3])
-def test_a_lane_is_traced_once(width):
-    traced = []
-
-    def function(lane, shared):
-        traced.append(lane)
-        return lane * shared
-
-    mapped = LaneMap(function, width)
-    lanes = np.arange(4, dtype=np.float32)
-    for active in ([0, 1, 2, 3], [2]):
-        np.testing.assert_array_equal(mapped(lanes, (np.float32(2),), np.ones(4), active), 2 * lanes[active])
-    assert len(traced) == 1
 
 
 DEVICES = """

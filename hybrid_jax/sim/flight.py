@@ -1,7 +1,6 @@
 """Random flights of a domain: the pilot and the true vehicle in closed loop."""
 
 from functools import partial
-from importlib.metadata import version
 from typing import NamedTuple
 
 import jax
@@ -10,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from hybrid_jax import checks
+from hybrid_jax.runtime import SOONEST
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -22,13 +22,6 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), so that windows
 
 # A flight that leaves these bounds, or whose centre is below ground, has gone wrong.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
-
-# XLA's first level of optimisation compiles the simulator in two thirds of the time of its third, for flights that are
-# 3 % slower. It is set here because none at all, which XLA_FLAGS may ask for, makes them five times as slow.
-# Its fusion emitters make it compile longer and fly slower; later versions may have no other way.
-COMPILER = {"xla_backend_optimization_level": 1}
-if version("jaxlib").split(".")[:2] == ["0", "10"]:
-    COMPILER["xla_cpu_use_fusion_emitters"] = False
 
 
 class Flights(NamedTuple):
@@ -69,7 +62,7 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(jax.jit, static_argnames="steps", compiler_options=COMPILER)
+@partial(jax.jit, static_argnames="steps", compiler_options=SOONEST)
 def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int) -> Flights:
     return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps))(keys)
 
