@@ -25,7 +25,7 @@ FLOORS = (
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 # What each sub-package may import of the core: none of them learns or reports, and none knows another.
 NEEDS = {
-    "sim": {"state", "rotation", "files", "checks", "vehicle", "trajectories", "datasets"},
+    "sim": {"state", "rotation", "files", "runtime", "checks", "vehicle", "trajectories", "datasets"},
     "flights": {"state", "vehicle", "trajectories"},
     "control": {"state", "rotation", "checks", "vehicle", "vector_field", "rollout", "disturbance"},  # any field
     "export": {"state", "checks", "archive", "vector_field", "rollout"},  # likewise
