@@ -1,4 +1,5 @@
-"""How this process uses the machine: a JAX device for each CPU core, small loops compiled whole, programs kept."""
+"""How this process uses the machine: a JAX device for each CPU core, small loops compiled whole, programs kept, and
+products in single precision on GPUs as well."""
 
 import contextlib
 import os
@@ -50,6 +51,8 @@ def configure(cache: Path) -> None:
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+    # A GPU's default rounds the factors of a product to 10 bits, which is 0.6 % of a gradient; on a CPU it is the same.
+    jax.config.update("jax_default_matmul_precision", "float32")
 
 
 def cores() -> int:

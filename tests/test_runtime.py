@@ -29,6 +29,15 @@ loop = jax.jit(lambda x: jax.lax.scan(lambda x, _: (x - x[::-1] ** 3, None), x, 
 print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call"))
 """
 
+PRECISION = """
+import sys
+from pathlib import Path
+import jax
+from hybrid_jax.runtime import configure
+configure(Path(sys.argv[1]))
+print(jax.jit(lambda x: x @ x.T).lower(jax.numpy.ones((5, 5))).as_text().count("precision = [HIGHEST, HIGHEST]"))
+"""
+
 IMPORTS = """
 import importlib, pkgutil, sys
 from pathlib import Path
@@ -65,6 +74,10 @@ def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
 def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own(tmp_path):
     assert printed(LOOP, tmp_path) == [1]
     assert printed(LOOP, tmp_path, **{FLAGS: f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=1"}) == [0]
+
+
+def test_products_are_in_single_precision_on_every_device(tmp_path):
+    assert printed(PRECISION, tmp_path) == [1]
 
 
 def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
