@@ -49,8 +49,12 @@ class ClosedLoopConfig(Config):
     """What is flown there, of --references; by default hover, figure_eight and low_pass, if they are among these."""
     bandwidth: float = 10.0
     """Of the disturbance observer [rad/s]."""
-    safe_inputs: ResidualInputs = "no_xy_yaw"
-    """What the safe network sees (see --residual-inputs); it adds to v̇ and ω̇ alone."""
+    safe_inputs: ResidualInputs = "near_ground"
+    """What the safe network sees (see --residual-inputs)."""
+    safe_outputs: Literal["accelerations", "wrench"] = "wrench"
+    """What it adds to (see --residual-outputs)."""
+    safe_linear: bool = True
+    """A linear map goes past its hidden layer (see --residual-linear)."""
     safe_hidden: int = 256
     """Its hidden units. With 64 what it errs by on the vehicle that it learned is most of what is left to err by."""
     safe_norm: Literal["batch", "none"] = "none"
@@ -97,7 +101,7 @@ class ClosedLoopConfig(Config):
             raise ValueError(f"--calls must be at least 1, got {self.calls}")
         if self.residual_outputs != "all":
             raise ValueError(
-                "--residual-outputs accelerations: no_physics must write all derivatives; see the safe model"
+                f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives; see the safe model"
             )
         if self.safe_inputs == "body" or self.residual_inputs == "body" or self.norm == "layer":
             raise ValueError("--residual-inputs and --safe-inputs body, and --norm layer, cannot be flown here")
@@ -164,7 +168,8 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
     sizes = tuple(dict.fromkeys((min(config.sizes), max(config.sizes))))
     network: dict[str, Any] = {
         "residual_inputs": config.safe_inputs,
-        "residual_outputs": "accelerations",
+        "residual_outputs": config.safe_outputs,
+        "residual_linear": config.safe_linear,
         "hidden": config.safe_hidden,
         "norm": config.safe_norm,
     }

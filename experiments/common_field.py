@@ -10,37 +10,40 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import Accelerations, Placeless, TiltOnly, View
-from hybrid_jax.residual import BatchNorm, Bias, InputScaling, ResidualNetwork
-from hybrid_jax.rigid_body import RigidBody, nominal, rigid_body
+from hybrid_jax.features import Accelerations, NearGround, Placeless, TiltOnly, View, nearness
+from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LinearPath, ResidualNetwork
+from hybrid_jax.rigid_body import ForcedBody, RigidBody, nominal, rigid_body
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 from hybrid_jax.vehicle import Vehicle
 
-UP_SIZE = 3
+UP_SIZE, ROTORS = 3, 4
 NOW = 0.0  # s: forces that are known here do not change with time
 
 Scalar = Float[Array, ""]
 
 
 class CommonField(AbstractVectorField):
-    """ẋ = s f_p(x, u) + f_d(x, Rᵀe_z, u).
+    """ẋ = s f_p(x, u) + f_d(x, Rᵀe_z, u), or f_d(x, Rᵀe_z, R / h of each rotor, u).
 
     Attributes:
         share: s, 1, or 0 for a network alone.
         body: f_p.
         network: f_d; reads the state and the direction of the world's up in the body. Its norm is a bias.
+        feels_ground: whether it reads how near the rotors are to it as well.
     """
 
     share: Scalar
     body: RigidBody
     network: ResidualNetwork
+    feels_ground: bool = eqx.field(static=True, default=False)
 
     def __call__(self, x: State, u: Input) -> State:
         up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
-        return self.share * self.body(x, u) + self.network(jnp.concatenate([x, up]), u)
+        near = [nearness(x[2], up, self.body.vehicle)] if self.feels_ground else []
+        return self.share * self.body(x, u) + self.network(jnp.concatenate([x, up, *near]), u)
 
     def described(self) -> dict[str, Any]:
         """What is the same for all lanes, as JSON values."""
@@ -97,10 +100,13 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
         case Hybrid(physics=RigidBody() as body):
             share, network = 1.0, wide(field.residual)
         case RigidBody() as body:
-            share, network = 1.0, silent(hidden, scaling)
+            share, network = 1.0, silent(hidden, STATE_SIZE + UP_SIZE, scaling)
         case _:
             share, network, body = 0.0, wide(field), rigid_body(vehicle)
-    return CommonField(jnp.asarray(share), body, network)
+    if isinstance(body, ForcedBody):
+        network, body = _times(body.yielding(), network), RigidBody(body.log_ratios, body.vehicle)
+    feels_ground = isinstance(getattr(field, "residual", field), NearGround)
+    return CommonField(jnp.asarray(share), body, network, feels_ground)
 
 
 def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
@@ -115,11 +121,10 @@ def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
     return TrueField(body, jnp.asarray(domain.drag_coefficient), push)
 
 
-def silent(hidden: int, scaling: InputScaling) -> ResidualNetwork:
-    """A network that returns zero."""
-    reads = STATE_SIZE + UP_SIZE + INPUT_SIZE
+def silent(hidden: int, reads: int, scaling: InputScaling) -> ResidualNetwork:
+    """A network that reads so many numbers beside u and returns zero."""
     return ResidualNetwork(
-        weight_in=jnp.zeros((hidden, reads)),
+        weight_in=jnp.zeros((hidden, reads + INPUT_SIZE)),
         norm=Bias(jnp.zeros(hidden)),
         weight_out=jnp.zeros((STATE_SIZE, hidden)),
         bias_out=jnp.zeros(STATE_SIZE),
@@ -128,35 +133,59 @@ def silent(hidden: int, scaling: InputScaling) -> ResidualNetwork:
 
 
 def wide(field: Any) -> ResidualNetwork:
-    """The network in a view as one that reads [x, Rᵀe_z, u] and writes all of ẋ, as it is deployed.
+    """The network in a view as one that reads [x, Rᵀe_z, u], or [x, Rᵀe_z, R / h, u], and writes all of ẋ, deployed.
 
     Raises:
         ValueError: as `common`.
     """
-    columns, rows = np.arange(STATE_SIZE), np.arange(STATE_SIZE)
+    columns, rows, reads = np.arange(STATE_SIZE), np.arange(STATE_SIZE), STATE_SIZE + UP_SIZE
+    up = STATE_SIZE + np.arange(UP_SIZE)
     while isinstance(field, View):
         match field:
             case Placeless():
                 columns = columns[2:]
             case TiltOnly():
-                up = STATE_SIZE + np.arange(UP_SIZE)
                 columns = np.concatenate([[2], up, columns[VELOCITY], columns[BODY_RATES]])
+            case NearGround():
+                near = reads + np.arange(ROTORS)
+                columns = np.concatenate([[2], near, up, columns[VELOCITY], columns[BODY_RATES]])
+                reads += ROTORS
             case Accelerations():
                 rows = rows[VELOCITY.start :]
             case _:
                 raise ValueError(f"--residual-inputs: a network behind {type(field).__name__} cannot be flown here")
         field = field.field
-    if not isinstance(field, ResidualNetwork):
+    network = _bent(field) if isinstance(field, LinearPath) else field
+    if not isinstance(network, ResidualNetwork):
         raise ValueError(f"a model must be a rigid body, a network or a hybrid of these, got {type(field).__name__}")
-    weight, shift = _affine(field)
-    empty = silent(len(shift), field.scaling)
-    columns = np.concatenate([columns, STATE_SIZE + UP_SIZE + np.arange(INPUT_SIZE)])
+    weight, shift = _affine(network)
+    empty = silent(len(shift), reads, network.scaling)
+    columns = np.concatenate([columns, reads + np.arange(INPUT_SIZE)])
     return ResidualNetwork(
         weight_in=empty.weight_in.at[:, columns].set(weight),
         norm=Bias(shift),
-        weight_out=empty.weight_out.at[rows].set(field.weight_out),
-        bias_out=empty.bias_out.at[rows].set(field.bias_out),
-        scaling=field.scaling,
+        weight_out=empty.weight_out.at[rows].set(network.weight_out),
+        bias_out=empty.bias_out.at[rows].set(network.bias_out),
+        scaling=network.scaling,
+    )
+
+
+def _times(factors: Float[Array, " d"], network: ResidualNetwork) -> ResidualNetwork:
+    """The network with each number that it returns times its factor."""
+    scaled = factors[:, None] * network.weight_out, factors * network.bias_out
+    return eqx.tree_at(lambda n: (n.weight_out, n.bias_out), network, scaled)
+
+
+def _bent(path: LinearPath) -> ResidualNetwork:
+    """The same map as a network alone: a line is two units, z = relu(z) − relu(−z)."""
+    weight, shift = _affine(path.field)
+    straight = jnp.eye(weight.shape[1])
+    return ResidualNetwork(
+        weight_in=jnp.concatenate([weight, straight, -straight]),
+        norm=Bias(jnp.concatenate([shift, jnp.zeros(2 * len(straight))])),
+        weight_out=jnp.concatenate([path.field.weight_out, path.weight, -path.weight], axis=1),
+        bias_out=path.field.bias_out,
+        scaling=path.field.scaling,
     )
 
 

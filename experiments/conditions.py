@@ -16,7 +16,7 @@ from hybrid_jax.lanes import count, lane, stack
 from hybrid_jax.loss import REGULARISERS
 from hybrid_jax.objective import Settings
 from hybrid_jax.residual import InputScaling
-from hybrid_jax.rigid_body import RigidBody, guess, guess_off
+from hybrid_jax.rigid_body import ForcedBody, RigidBody, guess, guess_off
 from hybrid_jax.rollout import SOLVERS
 from hybrid_jax.runtime import SOONEST
 from hybrid_jax.training import FitState, Plan, make_plan
@@ -113,18 +113,22 @@ def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
 
 def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
     if config.guess_off is None:
-        return guess(vehicle, key, low=config.guess[0], high=config.guess[1])
-    return guess_off(vehicle, key, config.guess_off)
+        body = guess(vehicle, key, low=config.guess[0], high=config.guess[1])
+    else:
+        body = guess_off(vehicle, key, config.guess_off)
+    return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs == "wrench" else body
 
 
 def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
     return restricted(
         key,
         inputs=config.residual_inputs,
-        outputs=config.residual_outputs,
+        outputs="accelerations" if config.residual_outputs == "wrench" else config.residual_outputs,
         hidden=config.hidden,
         norm=config.norm,
         scaling=input_scaling(vehicle, config),
+        linear=config.residual_linear,
+        vehicle=vehicle,
     )
 
 

@@ -17,8 +17,8 @@ TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of 
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
-ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "body"]
-ResidualOutputs = Literal["all", "accelerations"]
+ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
+ResidualOutputs = Literal["all", "accelerations", "wrench"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
 Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
@@ -153,9 +153,13 @@ class Config(Run):
     norm: Literal["batch", "layer", "none"] = "batch"
     """Normalisation of f_d's hidden layer."""
     residual_inputs: ResidualInputs = "all"
-    """What f_d sees of the state: all; all but p_x, p_y; no yaw either; or altitude and what the body feels, no yaw."""
+    """What f_d sees of the state: all; all but p_x, p_y; no yaw either; that and how near the ground each rotor is; or
+    altitude and what the body feels, no yaw."""
     residual_outputs: ResidualOutputs = "all"
-    """What f_d adds to: all 13 derivatives, or v̇ and ω̇ alone."""
+    """What f_d adds to: all 13 derivatives; v̇ and ω̇ alone; or to these as a force and a torque, so that Ix and Iy turn
+    what it says of ω̇ as well."""
+    residual_linear: bool = False
+    """A linear map goes past f_d's hidden layer, and both begin at zero."""
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
     guess_off: float | None = None
@@ -220,7 +224,9 @@ class AdaptationConfig(Config):
         Config.__post_init__(self)
         distinct("--models", self.models)
         if "no_physics" in self.models and self.residual_outputs != "all":
-            raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
+            raise ValueError(
+                f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives, leave it out"
+            )
 
     def has_networks(self) -> bool:
         return set(self.models) != {"physics_only"}

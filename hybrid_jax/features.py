@@ -17,9 +17,10 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.residual import InputScaling, ResidualNetwork, residual_network
+from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork, residual_network
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe
+from hybrid_jax.vehicle import Vehicle
 
 Features = Float[Array, " n *b"]
 
@@ -68,6 +69,44 @@ class TiltOnly(View):
 
     def write(self, x, inside):
         return inside
+
+
+class NearGround(View):
+    """`TiltOnly` that also feels the ground: after p_z the field inside reads R / h of each rotor (14).
+
+    What the ground does to a rotor falls with its altitude h over its radius R (Cheeseman and Bennett 1955): in R / h
+    it is nearly a line, in p_z a cliff, which moves as the vehicle tilts.
+
+    Attributes:
+        vehicle: whose rotors they are.
+
+    Raises:
+        ValueError: nothing is known of the rotors' radius.
+    """
+
+    field: AbstractVectorField
+    vehicle: Vehicle = eqx.field(static=True)
+
+    def __check_init__(self):
+        checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
+
+    def read(self, x):
+        up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
+        return jnp.concatenate([x[2:3], nearness(x[2], up, self.vehicle), up, x[VELOCITY], x[BODY_RATES]])
+
+    def write(self, x, inside):
+        return inside
+
+
+def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
+    """R / h of each rotor, h at least R / 2: nothing is flown below.
+
+    Args:
+        altitude: of the body [m].
+        up: the direction of the world's up in the body.
+    """
+    heights = jnp.stack([altitude + x * up[0] + y * up[1] for x, y in vehicle.rotor_positions])
+    return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)
 
 
 class BodyFrame(View):
@@ -163,13 +202,14 @@ def _as_it_is(field: AbstractVectorField) -> AbstractVectorField:
     return field
 
 
-Wrapper = Callable[[AbstractVectorField], AbstractVectorField]
+Wrapper = Callable[..., AbstractVectorField]
 
 # Name → how many numbers the network reads beside u, or returns, and the view around it.
 INPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "no_xy": (STATE_SIZE - 2, Placeless),
     "no_xy_yaw": (10, TiltOnly),
+    "near_ground": (14, NearGround),
     "body": (10, BodyFrame),
     "body_motion": (9, BodyMotion),
 }
@@ -190,18 +230,23 @@ def restricted(
     hidden: int = 64,
     norm: str = "batch",
     scaling: InputScaling | None = None,
+    linear: bool = False,
+    vehicle: Vehicle | None = None,
 ) -> AbstractVectorField:
     """A network that reads and writes only part of a multirotor's state; by default all of it, as the paper's.
 
     Args:
-        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`); "body",
-            seen from the body (see `BodyFrame`); "body_motion", that without the height.
+        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`);
+            "near_ground", that and how near the rotors are to it (see `NearGround`); "body", seen from the body (see
+            `BodyFrame`); "body_motion", that without the height.
         outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; the "angular_acceleration" ω̇ alone; "motion", v̇ and
             ω̇ with ṗ and body rates as well (`Motion`).
         norm: as in `residual_network`.
+        linear: a linear map goes past the hidden layer (see `LinearPath`), and both are silent until they have learned.
+        vehicle: which "near_ground" needs, and nothing else.
 
     Raises:
-        ValueError: another name, or "motion" of what is not seen from the body.
+        ValueError: another name, "motion" of what is not seen from the body, or "near_ground" of an unknown vehicle.
     """
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
@@ -209,12 +254,16 @@ def restricted(
     if outputs == "motion" and inputs not in FROM_THE_BODY:
         raise ValueError(f"outputs 'motion' needs inputs of {' or '.join(FROM_THE_BODY)}, got {inputs!r}")
     (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
+    if seen is NearGround and vehicle is None:
+        raise ValueError("inputs 'near_ground' needs the vehicle whose rotors feel the ground, got None")
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
-    return seen(written(network))
+    both = silenced(LinearPath(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
+    return seen(written(both), vehicle) if seen is NearGround else seen(written(both))
 
 
 def silenced(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with the output layer of every network in it at zero: training begins at what physics says.
+    """The field with the output layer, and the linear path, of every network in it at zero: training begins at what
+    physics says.
 
     Raises:
         ValueError: there is no network in it.
@@ -227,9 +276,11 @@ def silenced(field: AbstractVectorField) -> AbstractVectorField:
         raise ValueError(f"field: there is no ResidualNetwork in {checks.shown(field)}")
 
     def silent(node):
+        if isinstance(node, LinearPath):
+            return LinearPath(jnp.zeros_like(node.weight), silent(node.field))
         if not is_network(node):
             return node
         zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
         return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
 
-    return jax.tree.map(silent, field, is_leaf=is_network)
+    return jax.tree.map(silent, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearPath))

@@ -16,11 +16,11 @@ from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly
+from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
-from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearResidual, ResidualNetwork
-from hybrid_jax.rigid_body import RigidBody, check_start
+from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearPath, LinearResidual, ResidualNetwork
+from hybrid_jax.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, Statistics
 from hybrid_jax.vehicle import Vehicle
@@ -39,10 +39,10 @@ def portable(kind: type) -> type:
 
 
 _FIELDS = (
-    *(ConstantDisturbance, Frozen, FrozenRates, HoldState, Hybrid, LinearResidual, Multirotor),
-    *(ResidualNetwork, RigidBody),
+    *(ConstantDisturbance, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid, LinearPath, LinearResidual),
+    *(Multirotor, ResidualNetwork, RigidBody),
 )
-_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, Placeless, TiltOnly)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)

@@ -159,6 +159,19 @@ class LinearResidual(AbstractVectorField):
         return product + _beside(self.bias, product)
 
 
+class LinearPath(AbstractVectorField):
+    """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear map past a network, which is left what is not linear.
+
+    Linear drag is one, which units that bend can only approach; and where no data were, a line goes on as it was.
+    """
+
+    weight: Float[Array, "d m"]
+    field: ResidualNetwork
+
+    def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        return self.weight @ self.field.inputs(x, u) + self.field(x, u)
+
+
 def residual_network(
     state_size: int,
     input_size: int,
@@ -228,8 +241,19 @@ def _(field: ResidualNetwork, x, u) -> Array:
 
 @deploy_batch.register(ResidualNetwork)
 @deploy_batch.register(LinearResidual)
+@deploy_batch.register(LinearPath)
 def _(field, x, u):
     return field(x, u)
+
+
+@evaluate_batch.register
+def _(field: LinearPath, x, u):
+    return field.weight @ field.field.inputs(x, u) + evaluate_batch(field.field, x, u)
+
+
+@observe.register
+def _(field: LinearPath, x, u):
+    return eqx.tree_at(lambda path: path.field, field, observe(field.field, x, u))
 
 
 @observe.register

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks, rotation
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, taken_up
 from hybrid_jax.vehicle import Vehicle
 
 LEARNED = ("Ix", "Iy", "k")
@@ -66,6 +66,24 @@ class RigidBody(AbstractRigidBody):
         return jnp.concatenate(
             [jnp.stack(v), rotation.derivative(q, omega), acceleration, euler(inertia, torque, omega)]
         )
+
+
+class ForcedBody(RigidBody):
+    """A rigid body to which a residual is a force and a torque, not accelerations.
+
+    What the residual says of v̇ and ω̇ holds at the nominal inertia; at another, ω̇ is nominal / I times that. So what was
+    learned of the air and the ground stays true of a vehicle whose inertia changes. The mass is known.
+    """
+
+    def yielding(self) -> Float[Array, " 13"]:
+        """By what ẋ of a residual is multiplied: ones, but nominal / I for ω̇ about x and y."""
+        easier = [jnp.exp(-self.log_ratios[name]) for name in ("Ix", "Iy")]
+        return jnp.ones(STATE_SIZE, jnp.result_type(*easier)).at[BODY_RATES.start : -1].set(jnp.stack(easier))
+
+
+@taken_up.register
+def _(field: ForcedBody, x, more):
+    return jnp.reshape(field.yielding(), (-1,) + (1,) * (more.ndim - 1)) * more
 
 
 def rigid_body(vehicle: Vehicle) -> RigidBody:

@@ -22,17 +22,22 @@ from hybrid_jax.control import Controller, fly, performance, sample
 from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import restricted
 from hybrid_jax.residual import BatchNorm, InputScaling
+from hybrid_jax.rigid_body import ForcedBody
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 
 CONTROLLER = Controller(hj.IRIS)
 SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 BODY = hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)
+FORCED = ForcedBody(BODY.log_ratios, hj.IRIS)
 SECONDS = 0.6
 
 
-def network(inputs="all", outputs="all", norm="batch"):
-    """A network whose statistics are not those that it began with."""
-    made = restricted(jax.random.key(1), inputs=inputs, outputs=outputs, hidden=8, norm=norm, scaling=SCALING)
+def network(inputs="all", outputs="all", norm="batch", linear=False):
+    """A network whose statistics, and linear path, are not those that it began with."""
+    known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
+    made = restricted(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    if linear:
+        made = jax.tree.map(lambda leaf: leaf + jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
     def seen(node):
         if not isinstance(node, BatchNorm):
@@ -49,6 +54,12 @@ MODELS = {
     "without a norm": hj.Hybrid(BODY, network(norm="none")),
     "no place": hj.Hybrid(BODY, network("no_xy", "all")),
     "safe": hj.Hybrid(BODY, network("no_xy_yaw", "accelerations")),
+    "near the ground": hj.Hybrid(BODY, network("near_ground", "accelerations", "none")),
+    "linear": hj.Hybrid(FORCED, network("near_ground", "accelerations", "none", linear=True)),
+    "linear, with batch norm": hj.Hybrid(BODY, network("no_xy_yaw", "accelerations", "batch", linear=True)),
+    "forced and disturbed": hj.Hybrid(
+        hj.Hybrid(FORCED, ConstantDisturbance(jnp.arange(6.0))), network("near_ground", "accelerations", linear=True)
+    ),
     "disturbed": hj.Hybrid(
         hj.Hybrid(BODY, ConstantDisturbance(jnp.arange(6.0))), network("no_xy_yaw", "accelerations")
     ),

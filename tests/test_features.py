@@ -1,6 +1,7 @@
 """Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
 
 import itertools
+from dataclasses import replace
 
 import equinox as eqx
 import jax
@@ -11,6 +12,7 @@ import pytest
 from hybrid_jax import Hybrid, features, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.features import BodyFrame, BodyMotion, restricted, silenced
 from hybrid_jax.residual import InputScaling
+from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vector_field import (
     AbstractVectorField,
@@ -41,7 +43,8 @@ def double_precision():
 
 
 def view(inputs="all", outputs="all", **options):
-    return restricted(KEY, inputs=inputs, outputs=outputs, **({"hidden": 9, "scaling": HOVER} | options))
+    known = {"hidden": 9, "scaling": HOVER, "vehicle": IRIS}
+    return restricted(KEY, inputs=inputs, outputs=outputs, **(known | options))
 
 
 def samples(count=7, seed=0):
@@ -114,14 +117,33 @@ def test_a_world_frame_network_does_see_yaw():
 
 
 @pytest.mark.parametrize("outputs", ["all", "accelerations"])
-def test_without_yaw_a_turned_vehicle_is_the_same_in_the_axes_of_the_world(outputs):
+@pytest.mark.parametrize("inputs", ["no_xy_yaw", "near_ground"])
+def test_without_yaw_a_turned_vehicle_is_the_same_in_the_axes_of_the_world(inputs, outputs):
     """The attitude alone is turned; the velocity, which a wind of the world acts on, is not."""
-    field, (x, u) = view("no_xy_yaw", outputs), samples()
+    field, (x, u) = view(inputs, outputs), samples()
     for yaw in (0.3, 2.0, -3.0):
         other = x.at[QUATERNION].set(turned(x, yaw)[QUATERNION])
         np.testing.assert_allclose(deployed(field, other, u), deployed(field, x, u), atol=1e-12)
         moved = deployed(field, x.at[VELOCITY].set(turned(x, yaw)[VELOCITY]), u)
         assert (jnp.abs(moved - deployed(field, x, u)).max(0) > 1e-3).all()
+
+
+def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
+    """Up to half a radius, below which both stop."""
+    x = samples()[0].at[2].set(jnp.linspace(-0.5, 1.0, 7))
+    heights = jax.vmap(rotor_altitudes, (-1, None), -1)(x, parameters_of(IRIS).rotor_positions)
+    near = IRIS.rotor_radius / jnp.maximum(heights, IRIS.rotor_radius / 2)
+    assert (near.max(), near.min()) == (2, pytest.approx(0.1, abs=0.05))
+    seen = view("near_ground").read(x)
+    np.testing.assert_allclose(seen[1:5], near, atol=1e-6)  # the simulator's parameters are of single precision
+    np.testing.assert_array_equal(jnp.delete(seen, np.arange(1, 5), axis=0), view("no_xy_yaw").read(x))
+
+
+def test_near_the_ground_of_an_unknown_vehicle_is_refused():
+    with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
+        restricted(KEY, inputs="near_ground")
+    with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
+        view("near_ground", vehicle=replace(IRIS, rotor_radius=0.0))
 
 
 def test_the_body_s_view_of_a_state():
@@ -156,6 +178,18 @@ def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
     assert (network_of(slope).weight_out != 0).any()
     with pytest.raises(ValueError, match="no ResidualNetwork"):
         silenced(rigid_body(IRIS))
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
+    field, (x, u) = view(inputs, outputs, linear=True), samples()
+    assert (evaluate_batch(field, x, u) == 0).all()
+    slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field)
+    path = network_of(slope)
+    assert (path.weight != 0).any()
+    assert (path.field.weight_out != 0).any()
+    moved = jax.tree.map(lambda leaf: leaf + 1, field)
+    assert (deployed(silenced(moved), x, u) == 0).all()
 
 
 @pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])

@@ -12,11 +12,12 @@ from hybrid_jax.residual import (
     Bias,
     InputScaling,
     LayerNorm,
+    LinearPath,
     LinearResidual,
     ResidualNetwork,
     residual_network,
 )
-from hybrid_jax.vector_field import Hybrid, Statistics, evaluate_batch, observe, trainable
+from hybrid_jax.vector_field import Hybrid, Statistics, deploy_batch, evaluate_batch, observe, trainable
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
 
@@ -110,6 +111,18 @@ def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
     value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(evaluate_batch(field, x, u))))(x)
     assert jnp.isfinite(value)
     assert jnp.isfinite(slope).all()
+
+
+def test_a_linear_path_adds_its_map_in_training_and_in_deployment():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        weight = jax.random.normal(jax.random.key(3), (STATES, STATES + INPUTS))
+        path = LinearPath(weight, field)
+        line = weight @ jnp.concatenate([x, (u - 2) / 3])
+        for evaluate in (evaluate_batch, deploy_batch):
+            np.testing.assert_allclose(evaluate(path, x, u), evaluate(field, x, u) + line, rtol=0, atol=1e-12)
+        assert eqx.tree_equal(observe(path, x, u), LinearPath(weight, observe(field, x, u)))
+        assert sum(jax.tree.leaves(trainable(path))) == 1 + sum(jax.tree.leaves(trainable(field)))
 
 
 def test_running_statistics_are_not_trainable_and_all_else_is():

@@ -7,10 +7,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.rigid_body import LEARNED, RigidBody, guess, rigid_body
+from hybrid_jax.baselines import HoldState
+from hybrid_jax.rigid_body import LEARNED, ForcedBody, RigidBody, guess, rigid_body
 from hybrid_jax.rollout import rollout
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
-from hybrid_jax.vector_field import evaluate_batch
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch
 from hybrid_jax.vehicle import IRIS
 
 ODD = replace(
@@ -131,6 +132,28 @@ def test_a_guess_lies_in_its_box_and_follows_its_key():
         assert 1.96 < factors.max() <= 2.0
     again = guess(IRIS, jax.random.split(jax.random.key(0), 500)[3], low=0.5, high=2.0)
     assert all(again.log_ratios[name] == guesses.log_ratios[name][3] for name in LEARNED)
+
+
+def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
+    """A body that is told the nominal vehicle's ω̇ under a torque τ turns by τ / I, whatever its I."""
+    force, torque = jnp.array([1.0, -2.0, 3.0]), jnp.array([0.1, -0.2, 0.3])
+
+    class Push(AbstractVectorField):
+        def __call__(self, x, u):
+            nominal = jnp.concatenate([jnp.zeros(7), force / ODD.mass, torque / jnp.array(ODD.inertia)])
+            return jnp.broadcast_to(nominal.reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
+
+    logs = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
+    inertia = np.array(ODD.inertia) * np.exp([0.3, -0.4, 0.0])
+    added = np.concatenate([np.zeros(7), force / ODD.mass, torque / inertia])
+    body = ForcedBody(logs, ODD)
+    for field in (Hybrid(body, Push()), Hybrid(Hybrid(body, HoldState()), Push())):
+        for x, u in zip(*samples(3), strict=True):
+            np.testing.assert_allclose(field(x, u), RigidBody(logs, ODD)(x, u) + added, rtol=1e-12, atol=1e-11)
+        x, u = (jnp.asarray(part).T for part in samples(3))
+        expected = jax.vmap(field, -1, -1)(x, u)
+        for evaluate in (evaluate_batch, deploy_batch):
+            np.testing.assert_allclose(evaluate(field, x, u), expected, rtol=1e-12, atol=1e-11)
 
 
 def test_a_batch_is_its_columns():

@@ -11,7 +11,7 @@ from hybrid_jax.features import FROM_THE_BODY, INPUTS, OUTPUTS, restricted
 from hybrid_jax.multirotor import multirotor
 from hybrid_jax.multirotor_terms import SHAPES, Terms
 from hybrid_jax.residual import NORMS, InputScaling, LinearResidual, residual_network
-from hybrid_jax.rigid_body import RigidBody, guess
+from hybrid_jax.rigid_body import ForcedBody, RigidBody, guess
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid
 from hybrid_jax.vehicle import IRIS
@@ -41,7 +41,7 @@ def moved(field, size=0.1):
 
 
 def network(**options):
-    return moved(restricted(KEY, hidden=5, scaling=SCALING, **options))
+    return moved(restricted(KEY, hidden=5, scaling=SCALING, vehicle=IRIS, **options))
 
 
 def plain(x, u):
@@ -65,6 +65,9 @@ FIELDS = {
         for outputs in OUTPUTS
         if outputs != "motion" or inputs in FROM_THE_BODY
     },
+    "linear path": Hybrid(
+        moved(ForcedBody(BODY.log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
+    ),
     "linear residual": Hybrid(BODY, moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
     "frozen rates": FrozenRates(PER_ROTOR),
     "frozen": Frozen(BODY),
