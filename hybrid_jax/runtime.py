@@ -1,5 +1,7 @@
-"""How this process uses the machine: a JAX device for each CPU core, small loops compiled whole, programs kept, and
-products in single precision on GPUs as well."""
+"""How this process uses the machine: a JAX device for each CPU core, small loops compiled whole, programs kept.
+
+And in what precision: products of single precision are that on a GPU as well.
+"""
 
 import contextlib
 import os
