@@ -9,7 +9,8 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks.subjects import DT
-from hybrid_jax.residual import BatchNorm, ResidualNetwork
+from hybrid_jax.normalisation import BatchNorm
+from hybrid_jax.residual import ResidualNetwork
 from hybrid_jax.vector_field import AbstractVectorField, Hybrid, Statistics, trainable
 
 SAMPLES = "samples"  # the axis over a minibatch

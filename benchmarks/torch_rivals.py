@@ -16,7 +16,8 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from hybrid_jax.residual import BatchNorm, ResidualNetwork
+from hybrid_jax.normalisation import BatchNorm
+from hybrid_jax.residual import ResidualNetwork
 from hybrid_jax.rigid_body import LEARNED, nominal
 from hybrid_jax.rigid_body import RigidBody as OurRigidBody
 from hybrid_jax.trajectories import Trajectories

@@ -11,7 +11,8 @@ from jaxtyping import Array, Float
 from hybrid_jax import rotation
 from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import Accelerations, NearGround, Placeless, TiltOnly, View, nearness
-from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LinearPath, ResidualNetwork
+from hybrid_jax.normalisation import BatchNorm, Bias
+from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork
 from hybrid_jax.rigid_body import ForcedBody, RigidBody, nominal, rigid_body
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind

@@ -17,7 +17,8 @@ from experiments.stages import Stages, stages_of
 from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
 from hybrid_jax.closed_loop_rows import SOURCES, Flyer
 from hybrid_jax.lanes import lane
-from hybrid_jax.residual import BatchNorm, InputScaling
+from hybrid_jax.normalisation import BatchNorm
+from hybrid_jax.residual import InputScaling
 from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.vector_field import AbstractVectorField

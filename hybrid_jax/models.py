@@ -19,7 +19,8 @@ from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
-from hybrid_jax.residual import BatchNorm, Bias, InputScaling, LayerNorm, LinearPath, LinearResidual, ResidualNetwork
+from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm
+from hybrid_jax.residual import InputScaling, LinearPath, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, Statistics

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
+from hybrid_jax.normalisation import BatchNorm
 from hybrid_jax.objective import Learner, Settings
-from hybrid_jax.residual import BatchNorm
 from hybrid_jax.rigid_body import moves_a_rigid_body
 from hybrid_jax.rollout import checked
 from hybrid_jax.trajectories import Trajectories, check_attitudes

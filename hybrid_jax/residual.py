@@ -1,10 +1,8 @@
 """f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and simpler rivals.
 
-Layer normalisation, or none, stands in for batch normalisation where a network should be the same map in training and
-in deployment; a linear map stands in for the whole network where the data are too few for one.
+A linear map stands in for the whole network where the data are too few for one.
 """
 
-from abc import abstractmethod
 from collections.abc import Callable
 
 import equinox as eqx
@@ -13,8 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.normalised_layer import normalised_layer, row_means
-from hybrid_jax.vector_field import AbstractVectorField, Batch, Statistics, deploy_batch, evaluate_batch, observe
+from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm, Normalisation, beside
+from hybrid_jax.vector_field import AbstractVectorField, Statistics, deploy_batch, evaluate_batch, observe
 
 
 class InputScaling(eqx.Module):
@@ -35,93 +33,6 @@ class InputScaling(eqx.Module):
         return (u - self.offset) / self.scale
 
 
-class Normalisation(eqx.Module):
-    """What is done to the hidden pre-activations h = W z before the ReLU."""
-
-    @abstractmethod
-    def deployed(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The normalised W z of each sample, as in deployment."""
-
-    @abstractmethod
-    def layers(
-        self, weight_in: Float[Array, "h m"], weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], z: Batch
-    ) -> Batch:
-        """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b), as in training."""
-
-    @abstractmethod
-    def observed(self, hidden: Float[Array, "h b"]) -> "Normalisation":
-        """This after it has seen the pre-activations of a training batch."""
-
-
-class BatchNorm(Normalisation):
-    """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
-
-    In training by the minibatch's mean and variance, in deployment by running ones, which fold into a map of z.
-    """
-
-    gain: Float[Array, " h"]
-    shift: Float[Array, " h"]
-    running: Statistics
-    momentum: float = eqx.field(static=True, default=0.1)
-    epsilon: float = eqx.field(static=True, default=1e-5)
-
-    def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
-        """(W', c) such that W' z + c is W z normalised by the running statistics."""
-        scale = self.gain * jax.lax.rsqrt(self.running.variance + self.epsilon)
-        return weight * scale[:, None], self.shift - scale * self.running.mean
-
-    def deployed(self, weight, z):
-        weight, bias = self.fold(weight)
-        hidden = weight @ z
-        return hidden + _beside(bias, hidden)
-
-    def layers(self, weight_in, weight_out, bias_out, z):
-        return normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
-
-    def observed(self, hidden):
-        """The running statistics moved towards the batch's by the momentum."""
-        mean = row_means(hidden)
-        batch = Statistics(mean, row_means(jnp.square(hidden - mean[:, None])))
-        running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
-        return eqx.tree_at(lambda norm: norm.running, self, running)
-
-
-class LayerNorm(Normalisation):
-    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016)."""
-
-    gain: Float[Array, " h"]
-    shift: Float[Array, " h"]
-    epsilon: float = eqx.field(static=True, default=1e-5)
-
-    def deployed(self, weight, z):
-        hidden = weight @ z
-        centred = hidden - jnp.mean(hidden, axis=0)
-        normal = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=0) + self.epsilon)
-        return _beside(self.gain, normal) * normal + _beside(self.shift, normal)
-
-    def layers(self, weight_in, weight_out, bias_out, z):
-        return _output(weight_out, bias_out, self.deployed(weight_in, z))
-
-    def observed(self, hidden):
-        return self
-
-
-class Bias(Normalisation):
-    """No normalisation: the pre-activations plus a bias, as in a plain linear layer."""
-
-    shift: Float[Array, " h"]
-
-    def deployed(self, weight, z):
-        hidden = weight @ z
-        return hidden + _beside(self.shift, hidden)
-
-    def layers(self, weight_in, weight_out, bias_out, z):
-        return _output(weight_out, bias_out, self.deployed(weight_in, z))
-
-    def observed(self, hidden):
-        return self
-
-
 class ResidualNetwork(AbstractVectorField):
     """ẋ = W₂ relu(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13 with batch normalisation in the paper.
 
@@ -137,7 +48,7 @@ class ResidualNetwork(AbstractVectorField):
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         """Deployment: normalised by the running statistics."""
         product = self.weight_out @ self.activations(x, u)
-        return product + _beside(self.bias_out, product)
+        return product + beside(self.bias_out, product)
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units as deployed: what the output layer is linear in."""
@@ -156,7 +67,7 @@ class LinearResidual(AbstractVectorField):
 
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         product = self.weight @ jnp.concatenate([x, u])
-        return product + _beside(self.bias, product)
+        return product + beside(self.bias, product)
 
 
 class LinearPath(AbstractVectorField):
@@ -265,13 +176,3 @@ def _(field: ResidualNetwork, x, u):
 @evaluate_batch.register
 def _(field: LinearResidual, x, u):
     return field(x, u)
-
-
-def _output(weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], hidden: Float[Array, "h b"]) -> Batch:
-    active = jax.nn.relu(hidden)
-    return weight_out @ active + _beside(bias_out, active)
-
-
-def _beside(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
-    """The values shaped so that they are the same for each column of rows, or for one sample."""
-    return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))

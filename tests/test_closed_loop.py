@@ -21,7 +21,8 @@ from hybrid_jax.closed_loop_rows import FlightRow, Flyer
 from hybrid_jax.control import Controller, fly, performance, sample
 from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import restricted
-from hybrid_jax.residual import BatchNorm, InputScaling
+from hybrid_jax.normalisation import BatchNorm
+from hybrid_jax.residual import InputScaling
 from hybrid_jax.rigid_body import ForcedBody
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 
