@@ -78,7 +78,7 @@ class ExpertAugmented(eqx.Module):
         """The expert with other parameters."""
         return parametrise(self.expert.field)[1](parameters)
 
-    def predict(self, past: Trajectories, u: Float[Array, "t m"], solver=None) -> Float[Array, "t d"]:
+    def predict(self, past: Trajectories, u: Float[Array | np.ndarray, "t m"], solver=None) -> Float[Array, "t d"]:
         """The states after the end of one past flight, under the inputs that follow."""
         return rollout(self.flying(self.estimate(past)), past.x[-1], u, past.dt, solver)
 

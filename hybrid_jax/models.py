@@ -4,7 +4,7 @@ import dataclasses
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
@@ -28,9 +28,10 @@ from hybrid_jax.vehicle import Vehicle
 
 FORMAT = "hybrid_jax model 1"
 _KINDS: dict[str, type] = {}
+Kind = TypeVar("Kind", bound=type)
 
 
-def portable(kind: type) -> type:
+def portable(kind: Kind) -> Kind:
     """Let a module class be saved and loaded under its name; use it as a decorator on a field of one's own.
 
     The class must be made from its fields: numbers, text, arrays, tuples, dictionaries and other portable classes.
