@@ -19,7 +19,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks, rotation
 from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork, residual_network
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe, pushed, pushforward
 from hybrid_jax.vehicle import Vehicle
 
 Features = Float[Array, " n *b"]
@@ -191,6 +191,13 @@ def _(field: View, x, u):
 @deploy_batch.register
 def _(field: View, x, u):
     return field.write(x, deploy_batch(field.field, field.read(x), u))
+
+
+@pushforward.register
+def _(field: View, x, u, dx, du):
+    seen, seeing = pushed(field.read, (x,), (dx,))
+    inside, moving = pushforward(field.field, seen, u, seeing, du)
+    return pushed(field.write, (x, inside), (dx, moving))
 
 
 @observe.register

@@ -11,8 +11,16 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm, Normalisation, beside
-from hybrid_jax.vector_field import AbstractVectorField, Statistics, deploy_batch, evaluate_batch, observe
+from hybrid_jax.normalisation import AffineNorm, BatchNorm, Bias, LayerNorm, Normalisation, beside
+from hybrid_jax.vector_field import (
+    AbstractVectorField,
+    Statistics,
+    deploy_batch,
+    evaluate_batch,
+    observe,
+    pushed,
+    pushforward,
+)
 
 
 class InputScaling(eqx.Module):
@@ -160,6 +168,25 @@ def _(field, x, u):
 @evaluate_batch.register
 def _(field: LinearPath, x, u):
     return field.weight @ field.field.inputs(x, u) + evaluate_batch(field.field, x, u)
+
+
+@pushforward.register
+def _(field: ResidualNetwork, x, u, dx, du):
+    """By one product of the layers: hundreds of hidden units are gone before any direction is met."""
+    if not isinstance(field.norm, AffineNorm):  # units that depend on each other
+        return pushed(field, (x, u), (dx, du))
+    read, reading = pushed(field.inputs, (x, u), (dx, du))
+    weight, bias = field.norm.fold(field.weight_in)
+    hidden = weight @ read + bias
+    jacobian = jnp.where(hidden > 0, field.weight_out, 0) @ weight
+    return field.weight_out @ jax.nn.relu(hidden) + field.bias_out, jacobian @ reading
+
+
+@pushforward.register
+def _(field: LinearPath, x, u, dx, du):
+    value, slope = pushforward(field.field, x, u, dx, du)
+    read, reading = pushed(field.field.inputs, (x, u), (dx, du))
+    return field.weight @ read + value, field.weight @ reading + slope
 
 
 @observe.register

@@ -15,6 +15,7 @@ import jax
 from jaxtyping import Array, Float
 
 Batch = Float[Array, "d b"]
+Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
 
 class AbstractVectorField(eqx.Module):
@@ -98,6 +99,35 @@ def _(field: Hybrid, x, more):
 @taken_up.register
 def _(field: Frozen, x, more):
     return taken_up(field.field, x, more)
+
+
+def pushed(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
+    """The value of a function of some vectors, and its derivative in each direction of which they have a column."""
+    value, slope = jax.linearize(function, *values)
+    return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
+
+
+@singledispatch
+def pushforward(
+    field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
+) -> tuple[Float[Array, " d"], Columns]:
+    """ẋ of one sample as in deployment, and its derivative in the directions dx (d, c), du (m, c): a pair of columns
+    for each. A field that knows a shorter way than one direction after the other registers its own.
+    """
+    return pushed(field, (x, u), (dx, du))
+
+
+@pushforward.register
+def _(field: Hybrid, x, u, dx, du):
+    alone, slope = pushforward(field.physics, x, u, dx, du)
+    more = pushforward(field.residual, x, u, dx, du)
+    added, further = pushed(lambda x, more: taken_up(field.physics, x, more), (x, more[0]), (dx, more[1]))
+    return alone + added, slope + further
+
+
+@pushforward.register
+def _(field: Frozen, x, u, dx, du):
+    return pushforward(field.field, x, u, dx, du)
 
 
 @singledispatch

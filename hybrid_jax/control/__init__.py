@@ -24,10 +24,11 @@ Your own vehicle, with a model of it and whatever turns rotor speeds into the ne
 `loop.fly` does that in one compiled program, with the observer, for many lanes at once.
 """
 
-from hybrid_jax.control.controller import Controller, Plan, advance
+from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import Flight, Performance, fly, performance, realised
 from hybrid_jax.control.references import figure_eight, hover, low_pass, sample, step, upset
+from hybrid_jax.control.sensitivities import advance
 
 __all__ = [
     "Controller",

@@ -12,7 +12,6 @@ length of one step: after an upset a long Gauss–Newton step, cut to any of thr
 import math
 from dataclasses import dataclass, field
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -21,8 +20,8 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.control.attitude import one_sheet
 from hybrid_jax.control.cost import Scalar, Weights, deviations, plan_cost, stage_factors, unrest
+from hybrid_jax.control.sensitivities import advance, advanced
 from hybrid_jax.control.steadying import steadying_speeds
-from hybrid_jax.rollout import RK4
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vector_field import AbstractVectorField
@@ -61,13 +60,6 @@ def in_common(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[St
     """The three in the type that holds the numbers of all: what is carried through a loop must not change its own."""
     dtype = jnp.result_type(*jax.tree.leaves((x, reference, plan)))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), (x, reference, plan))
-
-
-def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
-    """The state after dt [s] with u held: one step of classical RK4."""
-    term = diffrax.ODETerm(lambda t, x, held: model(x, held))
-    x = RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
-    return x.at[QUATERNION].set(normalise(x[QUATERNION])) if unit_quaternion else x
 
 
 @dataclass(frozen=True)
@@ -204,16 +196,22 @@ class Controller:
     def _first(self, model, reference, x: State, plan: Plan):
         """What to improve on, its states and cost: the last plan shifted, or one that only steadies the vehicle."""
 
-        def interval(x, wanted):
-            middle, half = self._range()
-            share = (steadying_speeds(self.vehicle, wanted, x) - middle) / half
-            free = jnp.arctanh(jnp.clip(share, -math.tanh(FREE), math.tanh(FREE)))
-            return self._step(model, x, free), free
+        def interval(x, given):
+            wanted, shifted = given
+            free = jnp.stack([shifted, self._steadying(wanted, x[1])])
+            x = jax.vmap(lambda x, free: self._step(model, x, free))(x, free)
+            return x, (x, free)
 
-        shifted, steadying = self._shifted(plan.free), jax.lax.scan(interval, x, reference)[1]
-        free = jnp.stack([shifted, steadying])
-        states, costs = jax.vmap(lambda candidate: self._predict(model, reference, x, candidate))(free)
+        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, self._shifted(plan.free)))[1]
+        states, free = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
+        costs = jax.vmap(lambda states, free: self._cost(reference, states, free))(states, free)
         return jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (free, states, costs))
+
+    def _steadying(self, wanted: State, x: State) -> Float[Array, "4"]:
+        """The free numbers that turn the vehicle to the attitude wanted."""
+        middle, half = self._range()
+        share = (steadying_speeds(self.vehicle, wanted, x) - middle) / half
+        return jnp.arctanh(jnp.clip(share, -math.tanh(FREE), math.tanh(FREE)))
 
     def _step(self, model: AbstractVectorField, x: State, free: Float[Array, "4"]) -> State:
         return advance(model, x, self._speeds(jnp.tanh(free)), self.interval, self.unit_quaternion)
@@ -224,7 +222,10 @@ class Controller:
             return x, x
 
         states = jax.lax.scan(interval, x, free)[1]
-        return states, plan_cost(self.weights, reference, states, jnp.tanh(free))
+        return states, self._cost(reference, states, free)
+
+    def _cost(self, reference, states: Float[Array, "t 13"], free: Float[Array, "t 4"]) -> Scalar:
+        return plan_cost(self.weights, reference, states, jnp.tanh(free))
 
     def _improve(self, model, reference, x: State, point: "_Point") -> "_Point":
         """The best of the damped Gauss–Newton steps, if it lowers the cost; its damping is tried around next time."""
@@ -264,10 +265,14 @@ class Controller:
     def _sensitivities(self, model, x: Float[Array, "t 13"], free: Float[Array, "t 4"]) -> Float[Array, "t 13 4*t"]:
         """∂(state at the end of each interval) / ∂(all free numbers)."""
 
-        def step(both):
-            return self._step(model, both[:STATE_SIZE], both[STATE_SIZE:])
+        share = jnp.tanh(free)
+        slope = self._range()[1] * (1 - jnp.square(share))  # of the rotor speeds in the free numbers
 
-        stages = jax.vmap(jax.jacfwd(step))(jnp.concatenate([x, free], axis=1))
+        def stage(x, u, slope):
+            jacobian = advanced(model, x, u, self.interval, self.unit_quaternion)[1]
+            return jnp.concatenate([jacobian[:, :STATE_SIZE], jacobian[:, STATE_SIZE:] * slope], axis=1)
+
+        stages = jax.vmap(stage)(x, self._speeds(share), slope)
 
         def interval(carried, stage):
             jacobian, i = stage

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.control.attitude import one_sheet
-from hybrid_jax.control.controller import advance
+from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.disturbance import disturbed
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
 from hybrid_jax.vector_field import AbstractVectorField

@@ -1,0 +1,75 @@
+"""Laws of a step's derivative: it is autodiff's, for any field, and that of what is flown."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control import advance
+from hybrid_jax.control.sensitivities import advanced
+from hybrid_jax.disturbance import disturbed
+from hybrid_jax.features import restricted
+from hybrid_jax.residual import InputScaling, LinearResidual
+from hybrid_jax.rigid_body import ForcedBody
+from hybrid_jax.vector_field import Frozen
+
+DT = 0.05
+BODY = hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)
+FORCED = ForcedBody(BODY.log_ratios, hj.IRIS)
+SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
+
+
+def network(inputs="all", outputs="all", norm="batch", linear=False):
+    """With every number of it at work."""
+    known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
+    made = restricted(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
+
+
+class Spun(hj.AbstractVectorField):
+    """A user's own field, of which nothing is known but what it returns."""
+
+    def __call__(self, x, u):
+        return jnp.sin(x) + jnp.concatenate([x[5:9] * u / 600, x[:9]])
+
+
+SAFE = hj.Hybrid(FORCED, network("near_ground", "accelerations", "none", linear=True))
+FIELDS = {
+    "physics": BODY,
+    "paper": hj.Hybrid(BODY, network()),
+    "layer norm": hj.Hybrid(BODY, network(norm="layer")),
+    "no place": hj.Hybrid(BODY, network("no_xy", norm="none")),
+    "from the body": hj.Hybrid(BODY, network("body", "motion")),
+    "safe": SAFE,
+    "safe, observed": disturbed(SAFE, jnp.ones(6)),
+    "no physics": network(),
+    "frozen": hj.Hybrid(BODY, Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))),
+    "one's own": Spun(),
+}
+
+
+def samples(count=3):
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(count, 13))
+    x[:, 2] = rng.uniform(0.2, 1.0, count)
+    x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
+    return x, rng.uniform(500, 800, (count, 4))
+
+
+@pytest.mark.parametrize("unit_quaternion", [True, False], ids=["|q| = 1", "|q| as it is"])
+@pytest.mark.parametrize("name", FIELDS)
+def test_the_jacobian_of_a_step_is_that_of_autodiff(name, unit_quaternion):
+    """In double precision, where nothing hides behind rounding."""
+
+    def both(field, x, u):
+        expected = jax.jacfwd(lambda x, u: advance(field, x, u, DT, unit_quaternion), argnums=(0, 1))(x, u)
+        state = advance(field, x, u, DT, unit_quaternion)
+        return advanced(field, x, u, DT, unit_quaternion), (state, jnp.concatenate(expected, axis=1))
+
+    with jax.enable_x64(True):
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), FIELDS[name])
+        x, u = map(jnp.asarray, samples())
+        found, expected = jax.jit(jax.vmap(both, in_axes=(None, 0, 0)))(field, x, u)
+        for one, other in zip(found, expected, strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
