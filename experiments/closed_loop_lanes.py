@@ -25,13 +25,14 @@ from hybrid_jax.control.references import Path as Reference
 from hybrid_jax.datasets import versions
 from hybrid_jax.files import aside
 from hybrid_jax.lanes import LaneMap, count, lane
+from hybrid_jax.models import describe
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, Domain
 from hybrid_jax.sim.forces import Parameters, Wrench
 from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.state import POSITION, STATE_SIZE
 
 FORMAT = "hybrid_jax closed loop 1"
-RECIPE = 2  # raise it when the same lanes no longer fly the same
+RECIPE = 3  # raise it when the same lanes no longer fly the same
 MADE_BY = ("jax", "hybrid_jax")
 FORCES = EXTERNAL_FORCE.forces  # all that act in any domain
 WIDTH = {"cpu": 4}  # lanes side by side; see docs/control.md
@@ -128,7 +129,7 @@ class Block:
 
 def kind_of(fields: Believed) -> tuple:
     """What stacked fields must have in common to be stacked with others."""
-    return type(fields), *(leaf.shape[1:] for leaf in jax.tree.leaves(fields))
+    return jax.tree.structure(fields), *(leaf.shape[1:] for leaf in jax.tree.leaves(fields))
 
 
 @dataclass(frozen=True)
@@ -224,7 +225,7 @@ class Airspace:
         return about, arrays, False
 
     def _identity(self, lanes: Lane) -> str:
-        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), lanes.model.described()]
+        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), describe(lanes.model)]
         return digest(fixed, named_leaves({"lanes": lanes, "shared": self._shared}))
 
     def _found(self, path: Path):
