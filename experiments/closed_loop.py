@@ -9,7 +9,7 @@ from typing import Any, Literal, get_args
 from rich.console import Console
 
 from experiments import command
-from experiments.call_times import call_times
+from experiments.call_times import on_one_core
 from experiments.closed_loop_ablation import Option, networks, unnormalised, variants
 from experiments.closed_loop_lanes import Airspace, Block
 from experiments.closed_loop_report import Outcome, write
@@ -103,8 +103,6 @@ class ClosedLoopConfig(Config):
             raise ValueError(
                 f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives; see the safe model"
             )
-        if self.safe_inputs == "body" or self.residual_inputs == "body" or self.norm == "layer":
-            raise ValueError("--residual-inputs and --safe-inputs body, and --norm layer, cannot be flown here")
 
     @property
     def flown_away(self) -> tuple[Reference, ...]:
@@ -144,19 +142,20 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
     fly_models(config, usual, crews, outcome)
     if config.ablation:
         fly_ablation(config, usual, airspace(Controller(IRIS, unit_quaternion=False)), console, outcome)
-    outcome.speeds = speeds(config, trained)
     if hosts.first():
+        outcome.speeds = speeds(config, trained)
         write(NAME, config, outcome, Console())
 
 
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
-    """How long a call takes: with physics alone, with the paper's network and with the safe one."""
+    """How long a call takes on one core: with physics alone, with the paper's network and with the safe one."""
     few = min(config.sizes)
     fields = {Flyer("nominal"): rigid_body(IRIS)}
     fields |= {
         Flyer(name, few): lane(trained[name].adapted[PARAMETER_SHIFT.name, few], 0) for name in ("hybrid", "safe")
     }
-    return {flyer.name: call_times(field, Controller(IRIS), config.calls) for flyer, field in fields.items()}
+    named = {flyer.name: field for flyer, field in fields.items()}
+    return on_one_core(named, Controller(IRIS), config.calls, config.cache)
 
 
 def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:

@@ -65,7 +65,7 @@ class Outcome:
 
     Attributes:
         home, away, ablation: blocks of flights.
-        speeds: by model, see `call_times`.
+        speeds: by model, see `call_times.on_one_core`.
         seconds: of the stages of training.
         notes: on these.
     """

@@ -250,7 +250,7 @@ _RULES: Sequence[tuple[int, str, Callable[[_Evidence], tuple[bool, str]]]] = (
 _SPEED_RULES: Sequence[tuple[str, str, Callable[[Any], tuple[bool, str]]]] = (
     (
         "R7",
-        f"A call of the controller with the adapted hybrid takes at most {STEP_MS:g} ms of one core (processor time).",
+        f"A call of the controller with the adapted hybrid takes at most {STEP_MS:g} ms on one core (processor time).",
         _fast_enough,
     ),
     (

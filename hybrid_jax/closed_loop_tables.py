@@ -100,7 +100,7 @@ def speed_table(speeds: Mapping[str, Mapping[str, Any]]) -> Table:
         (name, *(f"{speed[key]:.2f}" for key in ("median_ms", "p99_ms", "processor_ms")))
         for name, speed in speeds.items()
     ]
-    return Table("One call of the controller, alone", header, lines)
+    return Table("One call of the controller, on one core", header, lines)
 
 
 def number_text(name: str, factor: float, digits: int) -> Text:
