@@ -51,7 +51,7 @@ class ClosedLoopConfig(Config):
     """Of the disturbance observer [rad/s]."""
     safe_inputs: ResidualInputs = "near_ground"
     """What the safe network sees (see --residual-inputs)."""
-    safe_outputs: Literal["accelerations", "wrench"] = "wrench"
+    safe_outputs: Literal["accelerations", "wrench", "thrust"] = "thrust"
     """What it adds to (see --residual-outputs)."""
     safe_linear: bool = True
     """A linear map goes past its hidden layer (see --residual-linear)."""

@@ -25,6 +25,7 @@ from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
+FORCED = {"wrench": "accelerations", "thrust": "thrust"}  # what f_d as a force and a torque is called in `restricted`
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
 
 
@@ -116,14 +117,14 @@ def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBo
         body = guess(vehicle, key, low=config.guess[0], high=config.guess[1])
     else:
         body = guess_off(vehicle, key, config.guess_off)
-    return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs == "wrench" else body
+    return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs in FORCED else body
 
 
 def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
     return restricted(
         key,
         inputs=config.residual_inputs,
-        outputs="accelerations" if config.residual_outputs == "wrench" else config.residual_outputs,
+        outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
         hidden=config.hidden,
         norm=config.norm,
         scaling=input_scaling(vehicle, config),

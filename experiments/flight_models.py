@@ -20,13 +20,13 @@ from hybrid_jax.archive import named_leaves
 from hybrid_jax.baselines import FrozenRates
 from hybrid_jax.channels import ChannelPrediction, channels_from
 from hybrid_jax.datasets import Dataset
-from hybrid_jax.features import restricted, silenced
+from hybrid_jax.features import restricted
 from hybrid_jax.lanes import lane, stack
 from hybrid_jax.models import portable
 from hybrid_jax.multirotor import Multirotor, carried_to, multirotor
 from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.objective import Settings
-from hybrid_jax.residual import InputScaling
+from hybrid_jax.residual import InputScaling, silenced
 from hybrid_jax.schedule import cut, judged, rates_by_group
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.training import FitState, Plan, make_plan

@@ -10,14 +10,14 @@ The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch a
 
 from abc import abstractmethod
 from collections.abc import Callable
+from functools import partial
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork, residual_network
+from hybrid_jax.residual import InputScaling, LinearPath, residual_network, silenced
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe, pushed, pushforward
 from hybrid_jax.vehicle import Vehicle
@@ -167,6 +167,25 @@ class Accelerations(View):
         return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
 
 
+class AlongThrust(View):
+    """The field inside returns an acceleration along the body's z axis, v̇ [world] and ω̇ (7).
+
+    What more the rotors push near the ground, or less in fast flight, acts along that axis however the vehicle tilts; a
+    network that writes it in the world would have to learn the axis as well. Outermost, for what the network sees of
+    the attitude may be too little to know it.
+    """
+
+    field: AbstractVectorField
+
+    def read(self, x):
+        return x
+
+    def write(self, x, inside):
+        acceleration = inside[1:4] + inside[0] * rotation.body_z(x[QUATERNION])
+        still = jnp.zeros((VELOCITY.start, *inside.shape[1:]), inside.dtype)
+        return jnp.concatenate([still, acceleration, inside[4:]])
+
+
 class Motion(View):
     """The field inside returns corrections of ṗ, of the body rates that turn q, and v̇ and ω̇ (12), seen from the body.
 
@@ -223,10 +242,13 @@ INPUTS: dict[str, tuple[int, Wrapper]] = {
 OUTPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "accelerations": (6, Accelerations),
+    "thrust": (7, AlongThrust),
     "angular_acceleration": (3, Accelerations),
     "motion": (12, Motion),
 }
-FROM_THE_BODY = ("body", "body_motion")  # the inputs that "motion" goes with
+FROM_THE_BODY = ("body", "body_motion")
+# Outputs → the inputs that they go with, where these are not all.
+GO_WITH = {"motion": FROM_THE_BODY, "thrust": tuple(name for name in INPUTS if name not in FROM_THE_BODY)}
 
 
 def restricted(
@@ -246,48 +268,26 @@ def restricted(
         inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`);
             "near_ground", that and how near the rotors are to it (see `NearGround`); "body", seen from the body (see
             `BodyFrame`); "body_motion", that without the height.
-        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; the "angular_acceleration" ω̇ alone; "motion", v̇ and
-            ω̇ with ṗ and body rates as well (`Motion`).
+        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "thrust", these and one along the thrust
+            (`AlongThrust`); the "angular_acceleration" ω̇ alone; "motion", v̇ and ω̇ with ṗ and body rates as well
+            (`Motion`).
         norm: as in `residual_network`.
         linear: a linear map goes past the hidden layer (see `LinearPath`), and both are silent until they have learned.
         vehicle: which "near_ground" needs, and nothing else.
 
     Raises:
-        ValueError: another name, "motion" of what is not seen from the body, or "near_ground" of an unknown vehicle.
+        ValueError: another name, outputs that do not go with the inputs (see `GO_WITH`), or "near_ground" of an unknown
+            vehicle.
     """
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
             raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
-    if outputs == "motion" and inputs not in FROM_THE_BODY:
-        raise ValueError(f"outputs 'motion' needs inputs of {' or '.join(FROM_THE_BODY)}, got {inputs!r}")
+    if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
+        raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
     (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
     if seen is NearGround and vehicle is None:
         raise ValueError("inputs 'near_ground' needs the vehicle whose rotors feel the ground, got None")
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
     both = silenced(LinearPath(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
-    return seen(written(both), vehicle) if seen is NearGround else seen(written(both))
-
-
-def silenced(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with the output layer, and the linear path, of every network in it at zero: training begins at what
-    physics says.
-
-    Raises:
-        ValueError: there is no network in it.
-    """
-
-    def is_network(node) -> bool:
-        return isinstance(node, ResidualNetwork)
-
-    if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
-        raise ValueError(f"field: there is no ResidualNetwork in {checks.shown(field)}")
-
-    def silent(node):
-        if isinstance(node, LinearPath):
-            return LinearPath(jnp.zeros_like(node.weight), silent(node.field))
-        if not is_network(node):
-            return node
-        zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
-        return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
-
-    return jax.tree.map(silent, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearPath))
+    seeing = partial(seen, vehicle=vehicle) if seen is NearGround else seen
+    return written(seeing(both)) if written is AlongThrust else seeing(written(both))

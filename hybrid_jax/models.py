@@ -16,7 +16,16 @@ from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly
+from hybrid_jax.features import (
+    Accelerations,
+    AlongThrust,
+    BodyFrame,
+    BodyMotion,
+    Motion,
+    NearGround,
+    Placeless,
+    TiltOnly,
+)
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm
@@ -44,7 +53,7 @@ _FIELDS = (
     *(ConstantDisturbance, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid, LinearPath, LinearResidual),
     *(Multirotor, ResidualNetwork, RigidBody),
 )
-_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
+_VIEWS = (Accelerations, AlongThrust, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)

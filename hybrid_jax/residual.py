@@ -152,6 +152,31 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) / fan_in**0.5
 
 
+def silenced(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with the output layer, and the linear path, of every network in it at zero: training begins at what
+    physics says.
+
+    Raises:
+        ValueError: there is no network in it.
+    """
+
+    def is_network(node) -> bool:
+        return isinstance(node, ResidualNetwork)
+
+    if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
+        raise ValueError(f"field: there is no ResidualNetwork in {checks.shown(field)}")
+
+    def silent(node):
+        if isinstance(node, LinearPath):
+            return LinearPath(jnp.zeros_like(node.weight), silent(node.field))
+        if not is_network(node):
+            return node
+        zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
+        return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
+
+    return jax.tree.map(silent, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearPath))
+
+
 @evaluate_batch.register
 def _(field: ResidualNetwork, x, u) -> Array:
     """Training: where the norm is the batch's, each evaluation normalises by its own minibatch."""

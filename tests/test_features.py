@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from hybrid_jax import Hybrid, features, load, residual_network, rigid_body, rotation, save
-from hybrid_jax.features import BodyFrame, BodyMotion, restricted, silenced
-from hybrid_jax.residual import InputScaling
+from hybrid_jax.features import BodyFrame, BodyMotion, restricted
+from hybrid_jax.residual import InputScaling, silenced
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vector_field import (
@@ -30,9 +30,9 @@ HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 VIEWS = [
     (inputs, outputs)
     for inputs, outputs in itertools.product(features.INPUTS, features.OUTPUTS)
-    if outputs != "motion" or inputs in features.FROM_THE_BODY
+    if inputs in features.GO_WITH.get(outputs, features.INPUTS)
 ]
-FROM_THE_BODY = list(itertools.product(features.FROM_THE_BODY, features.OUTPUTS))
+FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in features.FROM_THE_BODY]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -170,6 +170,15 @@ def test_motion_is_not_written_in_the_world():
         view("all", "motion")
 
 
+def test_a_push_along_the_thrust_turns_with_the_vehicle():
+    field, (x, u) = view("near_ground", "thrust"), samples()
+    inside = deployed(field.field, x, u)
+    axis = rotation.rotate(x[QUATERNION], jnp.zeros_like(x[:3]).at[2].set(1.0))
+    np.testing.assert_allclose(deployed(field, x, u)[VELOCITY], inside[1:4] + inside[0] * axis, atol=1e-12)
+    with pytest.raises(ValueError, match=r"outputs 'thrust' needs inputs of all or .*, got 'body'"):
+        view("body", "thrust")
+
+
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
 def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
     field, (x, u) = silenced(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
@@ -227,11 +236,11 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     trained = evaluate_batch(field, x, u)
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
-    def seen(node):
-        return node.read(x) if isinstance(node, features.View) else x
+    def seen(node, x):
+        return seen(node.field, node.read(x)) if isinstance(node, features.View) else x
 
     network = network_of(field)
-    hidden = network.weight_in @ jnp.concatenate([seen(field), network.scaling(u)])
+    hidden = network.weight_in @ jnp.concatenate([seen(field, x), network.scaling(u)])
     here = Statistics(hidden.mean(1), hidden.var(1))
     exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
     np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)

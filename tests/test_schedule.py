@@ -8,8 +8,8 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, residual_network
-from hybrid_jax.features import silenced
 from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.residual import silenced
 from hybrid_jax.rigid_body import rigid_body
 from hybrid_jax.schedule import Stage, cut, fit_in_stages, rates_by_group
 from hybrid_jax.training import make_plan

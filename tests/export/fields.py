@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.baselines import FrozenRates, HoldState
-from hybrid_jax.features import FROM_THE_BODY, INPUTS, OUTPUTS, restricted
+from hybrid_jax.features import GO_WITH, INPUTS, OUTPUTS, restricted
 from hybrid_jax.multirotor import multirotor
 from hybrid_jax.multirotor_terms import SHAPES, Terms
 from hybrid_jax.residual import NORMS, InputScaling, LinearResidual, residual_network
@@ -63,7 +63,7 @@ FIELDS = {
         f"residual from {inputs} to {outputs}": Hybrid(PER_ROTOR, network(inputs=inputs, outputs=outputs))
         for inputs in INPUTS
         for outputs in OUTPUTS
-        if outputs != "motion" or inputs in FROM_THE_BODY
+        if inputs in GO_WITH.get(outputs, INPUTS)
     },
     "linear path": Hybrid(
         moved(ForcedBody(BODY.log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
