@@ -51,12 +51,12 @@ class ClosedLoopConfig(Config):
     """Of the disturbance observer [rad/s]."""
     safe_inputs: ResidualInputs = "near_ground"
     """What the safe network sees (see --residual-inputs)."""
-    safe_outputs: Literal["accelerations", "wrench", "thrust"] = "thrust"
+    safe_outputs: Literal["accelerations", "wrench", "rotors"] = "rotors"
     """What it adds to (see --residual-outputs)."""
     safe_linear: bool = True
     """A linear map goes past its hidden layer (see --residual-linear)."""
-    safe_hidden: int = 256
-    """Its hidden units. With 64 what it errs by on the vehicle that it learned is most of what is left to err by."""
+    safe_hidden: int = 64
+    """Its hidden units, and those of the rotors' network."""
     safe_norm: Literal["batch", "none"] = "none"
     """Normalisation of its hidden layer."""
     safe_rates: tuple[float, ...] = (3e-3, 3e-4, 3e-5)

@@ -43,9 +43,9 @@ is known to it without noise.
 - **hybrid**: physics plus the paper's network, trained on source flight (source), then on N target trajectories
 - **no-physics**: the paper's network alone
 - **safe hybrid**: a hybrid whose network sees neither p_x, p_y nor yaw, but by default how near each rotor is to the
-  ground (--safe-inputs); adds a force, one more along the thrust and a torque (--safe-outputs), a linear part of it
-  past its hidden layer (--safe-linear); and whose output bias, which is what a steady force is, moves at a rate of its
-  own in adaptation (--safe-offset)
+  ground (--safe-inputs); adds a force and a torque, a linear part of them past its hidden layer (--safe-linear); a
+  smaller one, which all rotors share, adds to the thrust of each (--safe-outputs); and the output bias, which is what a
+  steady force is, moves at a rate of its own in adaptation (--safe-offset)
 - **safe, nine numbers**: the safe hybrid of the source, its network left as it is; least squares fits Ix, Iy, k and a
   constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation flights
 - **true vehicle, mean wind**: the simulator's own equations and the wind's mean; no bound, for an observer follows the

@@ -11,6 +11,7 @@ from hybrid_jax.models import portable
 from hybrid_jax.normalisation import AffineNorm, Bias
 from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, nominal, rigid_body
+from hybrid_jax.rotors import RotorThrust
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
@@ -137,7 +138,9 @@ def folded(field: AbstractVectorField) -> AbstractVectorField:
         ValueError: as `common`.
     """
     match field:
-        case View() | LinearPath():
+        case Hybrid():
+            return Hybrid(folded(field.physics), folded(field.residual))
+        case View() | LinearPath() | RotorThrust():
             return eqx.tree_at(lambda around: around.field, field, folded(field.field))
         case ResidualNetwork(norm=AffineNorm() as norm):
             weight, bias = norm.fold(field.weight_in)

@@ -25,7 +25,7 @@ from hybrid_jax.vector_field import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
-FORCED = {"wrench": "accelerations", "thrust": "thrust"}  # what f_d as a force and a torque is called in `restricted`
+FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # what f_d as a force and a torque is called in `restricted`
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
 
 
@@ -164,7 +164,7 @@ def _with_offset(plan: Plan, field: AbstractVectorField, config: Config) -> Plan
     each = jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), plan.rates, learned)
 
     def rate(path, old, part):
-        if jax.tree_util.keystr(path[-1:], simple=True) != "bias_out":
+        if jax.tree_util.keystr(path[-1:], simple=True) != "bias_out" or part.shape[-1] < FORCES:  # of a rotor's thrust
             return old
         others = part.shape[-1] - FORCES
         return np.concatenate([np.full(others, old), np.full(FORCES, offset)]).astype(np.float32)

@@ -18,7 +18,7 @@ UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "pro
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
-ResidualOutputs = Literal["all", "accelerations", "wrench", "thrust"]
+ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
 Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
@@ -157,7 +157,7 @@ class Config(Run):
     altitude and what the body feels, no yaw."""
     residual_outputs: ResidualOutputs = "all"
     """What f_d adds to: all 13 derivatives; v̇ and ω̇ alone; to these as a force and a torque, so that Ix and Iy turn
-    what it says of ω̇ as well; or, besides, to the thrust, which turns with the vehicle."""
+    what it says of ω̇ as well; or, besides, to the thrust of each rotor, by one network that all rotors share."""
     residual_linear: bool = False
     """A linear map goes past f_d's hidden layer, and both begin at zero."""
     guess: tuple[float, float] = (0.8, 1.25)

@@ -4,7 +4,7 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 
 - state, rotation, vehicle, trajectories: what flies, and its windows.
 - vector_field, rigid_body, multirotor, disturbance, baselines: ẋ = f(x, u).
-- residual, normalisation, normalised_layer, features: the network in it.
+- residual, normalisation, normalised_layer, rotors, features: the network in it.
 - rollout, loss, metrics, channels, objective, preparation, training, schedule: one training run as a pure function.
 - least_squares, uncertainty, linear_adaptation, expert_augmentation: other ways to adapt, and how sure θ_p is.
 - hosts, lanes, sweep: every seed, size and rate a lane of one compiled program, on all devices of all hosts.

@@ -13,13 +13,23 @@ from collections.abc import Callable
 from functools import partial
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.residual import InputScaling, LinearPath, residual_network, silenced
+from hybrid_jax.rotors import RotorThrust, nearness
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, observe, pushed, pushforward
+from hybrid_jax.vector_field import (
+    AbstractVectorField,
+    Hybrid,
+    deploy_batch,
+    evaluate_batch,
+    observe,
+    pushed,
+    pushforward,
+)
 from hybrid_jax.vehicle import Vehicle
 
 Features = Float[Array, " n *b"]
@@ -98,17 +108,6 @@ class NearGround(View):
         return inside
 
 
-def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
-    """R / h of each rotor, h at least R / 2: nothing is flown below.
-
-    Args:
-        altitude: of the body [m].
-        up: the direction of the world's up in the body.
-    """
-    heights = jnp.stack([altitude + x * up[0] + y * up[1] for x, y in vehicle.rotor_positions])
-    return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)
-
-
 class BodyFrame(View):
     """Blind to p_x, p_y and yaw: all is seen from the body, and turned into the world afterwards.
 
@@ -167,25 +166,6 @@ class Accelerations(View):
         return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
 
 
-class AlongThrust(View):
-    """The field inside returns an acceleration along the body's z axis, v̇ [world] and ω̇ (7).
-
-    What more the rotors push near the ground, or less in fast flight, acts along that axis however the vehicle tilts; a
-    network that writes it in the world would have to learn the axis as well. Outermost, for what the network sees of
-    the attitude may be too little to know it.
-    """
-
-    field: AbstractVectorField
-
-    def read(self, x):
-        return x
-
-    def write(self, x, inside):
-        acceleration = inside[1:4] + inside[0] * rotation.body_z(x[QUATERNION])
-        still = jnp.zeros((VELOCITY.start, *inside.shape[1:]), inside.dtype)
-        return jnp.concatenate([still, acceleration, inside[4:]])
-
-
 class Motion(View):
     """The field inside returns corrections of ṗ, of the body rates that turn q, and v̇ and ω̇ (12), seen from the body.
 
@@ -242,13 +222,14 @@ INPUTS: dict[str, tuple[int, Wrapper]] = {
 OUTPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
     "accelerations": (6, Accelerations),
-    "thrust": (7, AlongThrust),
+    "rotors": (6, Accelerations),
     "angular_acceleration": (3, Accelerations),
     "motion": (12, Motion),
 }
 FROM_THE_BODY = ("body", "body_motion")
+OF_ROTORS = ("near_ground", "rotors")
 # Outputs → the inputs that they go with, where these are not all.
-GO_WITH = {"motion": FROM_THE_BODY, "thrust": tuple(name for name in INPUTS if name not in FROM_THE_BODY)}
+GO_WITH = {"motion": FROM_THE_BODY}
 
 
 def restricted(
@@ -268,16 +249,17 @@ def restricted(
         inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`);
             "near_ground", that and how near the rotors are to it (see `NearGround`); "body", seen from the body (see
             `BodyFrame`); "body_motion", that without the height.
-        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "thrust", these and one along the thrust
-            (`AlongThrust`); the "angular_acceleration" ω̇ alone; "motion", v̇ and ω̇ with ṗ and body rates as well
-            (`Motion`).
+        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "rotors", these beside the thrust of each rotor by
+            a network of its own (`RotorThrust`), silent until it has learned; the "angular_acceleration" ω̇ alone;
+            "motion", v̇ and ω̇ with ṗ and body rates as well (`Motion`).
+        hidden: units of each network.
         norm: as in `residual_network`.
         linear: a linear map goes past the hidden layer (see `LinearPath`), and both are silent until they have learned.
-        vehicle: which "near_ground" needs, and nothing else.
+        vehicle: which "near_ground" and "rotors" need, and nothing else.
 
     Raises:
-        ValueError: another name, outputs that do not go with the inputs (see `GO_WITH`), or "near_ground" of an unknown
-            vehicle.
+        ValueError: another name, outputs that do not go with the inputs (see `GO_WITH`), or "near_ground" or "rotors"
+            of an unknown vehicle.
     """
     for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
         if value not in known:
@@ -285,9 +267,16 @@ def restricted(
     if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
         raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
     (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
-    if seen is NearGround and vehicle is None:
-        raise ValueError("inputs 'near_ground' needs the vehicle whose rotors feel the ground, got None")
+    if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
+        raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
     both = silenced(LinearPath(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
     seeing = partial(seen, vehicle=vehicle) if seen is NearGround else seen
-    return written(seeing(both)) if written is AlongThrust else seeing(written(both))
+    view = seeing(written(both))
+    return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
+
+
+def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
+    assert vehicle is not None
+    network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
+    return silenced(RotorThrust(network, vehicle))

@@ -18,7 +18,6 @@ from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.disturbance import ConstantDisturbance
 from hybrid_jax.features import (
     Accelerations,
-    AlongThrust,
     BodyFrame,
     BodyMotion,
     Motion,
@@ -32,6 +31,7 @@ from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.residual import InputScaling, LinearPath, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch
+from hybrid_jax.rotors import RotorThrust
 from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid, Statistics
 from hybrid_jax.vehicle import Vehicle
 
@@ -51,9 +51,9 @@ def portable(kind: Kind) -> Kind:
 
 _FIELDS = (
     *(ConstantDisturbance, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid, LinearPath, LinearResidual),
-    *(Multirotor, ResidualNetwork, RigidBody),
+    *(Multirotor, ResidualNetwork, RigidBody, RotorThrust),
 )
-_VIEWS = (Accelerations, AlongThrust, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)

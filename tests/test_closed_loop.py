@@ -65,7 +65,7 @@ MODELS = {
     "safe": hj.Hybrid(BODY, network("no_xy_yaw", "accelerations")),
     "near the ground": hj.Hybrid(BODY, network("near_ground", "accelerations", "none")),
     "linear": hj.Hybrid(FORCED, network("near_ground", "accelerations", "none", linear=True)),
-    "thrust": hj.Hybrid(FORCED, network("near_ground", "thrust", "none", linear=True)),
+    "rotors": hj.Hybrid(FORCED, network("near_ground", "rotors", "none", linear=True)),
     "linear, with batch norm": hj.Hybrid(BODY, network("no_xy_yaw", "accelerations", "batch", linear=True)),
     "forced and disturbed": hj.Hybrid(
         hj.Hybrid(FORCED, ConstantDisturbance(jnp.arange(6.0))), network("near_ground", "accelerations", linear=True)

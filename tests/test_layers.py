@@ -14,6 +14,7 @@ FLOORS = (
     "vector_field datasets summary closed_loop_rows multirotor_terms",
     "rigid_body normalisation rollout environment disturbance",
     "residual",
+    "rotors",
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation flight_claims",

@@ -34,7 +34,7 @@ class Spun(hj.AbstractVectorField):
         return jnp.sin(x) + jnp.concatenate([x[5:9] * u / 600, x[:9]])
 
 
-SAFE = hj.Hybrid(FORCED, network("near_ground", "thrust", "none", linear=True))
+SAFE = hj.Hybrid(FORCED, network("near_ground", "rotors", "none", linear=True))
 FIELDS = {
     "physics": BODY,
     "paper": hj.Hybrid(BODY, network()),
