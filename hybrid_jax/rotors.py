@@ -4,8 +4,6 @@ Near the ground a rotor pushes more, and more on the side that is nearer: a forc
 rotor, where it acts is told by the vehicle, and every rotor's flight teaches all four.
 """
 
-from functools import partial
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -40,18 +38,22 @@ class RotorThrust(AbstractVectorField):
         checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        return self.write(x, u, jax.vmap(self.field)(self.read(x)[:, None], u[:, None]))
+        return self.write(x, u, self.share(self.read(x), u))
 
     def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " 4 *b"]:
         """R / h of each rotor."""
         return nearness(x[2], rotation.body_z(rotation.conjugate(x[QUATERNION])), self.vehicle)
 
+    def share(self, near: Float[Array, " 4 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 4 *b"]:
+        """f of each rotor."""
+        return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
+
     def write(
-        self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"], share: Float[Array, " 4 1 *b"]
+        self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"], share: Float[Array, " 4 *b"]
     ) -> Float[Array, " 13 *b"]:
         """ẋ from the share of k u² that each rotor pushes more."""
         vehicle = self.vehicle
-        thrust = vehicle.thrust_coefficient * u * u * share[:, 0]
+        thrust = vehicle.thrust_coefficient * u * u * share
         torque_x, torque_y = (
             sum(arm * one for arm, one in zip(arms, thrust, strict=True))
             for arms in zip(*((y, -x) for x, y in vehicle.rotor_positions), strict=True)
@@ -81,7 +83,9 @@ def _(field, x, u):
 
 @pushforward.register
 def _(field: RotorThrust, x, u, dx, du):
+    """Each rotor asks the network for two derivatives, whatever the number of directions."""
     near, nearing = pushed(field.read, (x,), (dx,))
-    of_one = partial(pushforward, field.field)
-    share, sharing = jax.vmap(of_one)(near[:, None], u[:, None], nearing[:, None], du[:, None])
+    share, pulled = jax.vjp(field.share, near, u)
+    by_near, by_u = pulled(jnp.ones_like(share))
+    sharing = by_near[:, None] * nearing + by_u[:, None] * du
     return pushed(field.write, (x, u, share), (dx, du, sharing))

@@ -238,3 +238,12 @@ def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
         expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
         np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
+def test_a_network_of_two_inputs_is_one_of_more_that_are_zero(shape):
+    """Few inputs are summed, more go through a product of matrices."""
+    few = residual_network(1, 1, jax.random.key(0), hidden=9, norm="none", outputs=3)
+    more = eqx.tree_at(lambda network: network.weight_in, few, jnp.pad(few.weight_in, ((0, 0), (1, 0))))
+    x, u = np.random.default_rng(0).normal(size=(2, 1, *shape))
+    np.testing.assert_allclose(few(x, u), more(np.concatenate([np.ones_like(x), x]), u), rtol=1e-5, atol=1e-6)
