@@ -6,16 +6,14 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import View
 from hybrid_jax.models import portable
-from hybrid_jax.normalisation import AffineNorm, Bias
-from hybrid_jax.residual import InputScaling, LinearPath, ResidualNetwork
+from hybrid_jax.normalisation import Bias
+from hybrid_jax.residual import InputScaling, ResidualNetwork
 from hybrid_jax.rigid_body import RigidBody, nominal, rigid_body
-from hybrid_jax.rotors import RotorThrust
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid, pushed, pushforward, taken_up
+from hybrid_jax.vector_field import AbstractVectorField, Hybrid, deployed, pushed, pushforward, taken_up
 from hybrid_jax.vehicle import Vehicle
 
 NOW = 0.0  # s: forces that are known here do not change with time
@@ -31,7 +29,7 @@ class CommonField(AbstractVectorField):
         share: s, 1, or 0 for a network alone.
         body: f_p.
         steady: d.
-        residual: f_d, a network, batch normalisation folded into it, behind the views of what it reads and writes.
+        residual: f_d, `deployed`.
     """
 
     share: Scalar
@@ -85,15 +83,12 @@ Believed = CommonField | TrueField  # by a controller
 
 
 def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
-    """A rigid body, a network or their hybrid, which may have a constant disturbance, in the common form.
+    """A rigid body, its hybrid, which may have a constant disturbance, or else a field alone, in the common form.
 
     A single one, so map it over stacked ones.
 
     Args:
         hidden, scaling: of the network that a rigid body alone is given, which is silent.
-
-    Raises:
-        ValueError: a field of another kind.
     """
     share, steady = 1.0, ConstantDisturbance(jnp.zeros(STATE_SIZE - VELOCITY.start))
     match field:
@@ -105,7 +100,7 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
             residual = silent(hidden, scaling)
         case _:
             share, residual, body = 0.0, field, rigid_body(vehicle)
-    return CommonField(jnp.asarray(share), body, steady, folded(residual))
+    return CommonField(jnp.asarray(share), body, steady, deployed(residual))
 
 
 def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
@@ -129,22 +124,3 @@ def silent(hidden: int, scaling: InputScaling) -> ResidualNetwork:
         bias_out=jnp.zeros(STATE_SIZE),
         scaling=scaling,
     )
-
-
-def folded(field: AbstractVectorField) -> AbstractVectorField:
-    """The same map by a network that knows no batch: its running statistics are in its weights.
-
-    Raises:
-        ValueError: as `common`.
-    """
-    match field:
-        case Hybrid():
-            return Hybrid(folded(field.physics), folded(field.residual))
-        case View() | LinearPath() | RotorThrust():
-            return eqx.tree_at(lambda around: around.field, field, folded(field.field))
-        case ResidualNetwork(norm=AffineNorm() as norm):
-            weight, bias = norm.fold(field.weight_in)
-            return eqx.tree_at(lambda network: (network.weight_in, network.norm), field, (weight, Bias(bias)))
-        case ResidualNetwork():
-            return field
-    raise ValueError(f"a model must be a rigid body, a network or a hybrid of these, got {type(field).__name__}")

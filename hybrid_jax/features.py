@@ -25,6 +25,7 @@ from hybrid_jax.vector_field import (
     AbstractVectorField,
     Hybrid,
     deploy_batch,
+    deployed,
     evaluate_batch,
     observe,
     pushed,
@@ -190,6 +191,11 @@ def _(field: View, x, u):
 @deploy_batch.register
 def _(field: View, x, u):
     return field.write(x, deploy_batch(field.field, field.read(x), u))
+
+
+@deployed.register
+def _(field: View):
+    return eqx.tree_at(lambda view: view.field, field, deployed(field.field))
 
 
 @pushforward.register

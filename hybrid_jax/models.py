@@ -28,7 +28,7 @@ from hybrid_jax.features import (
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm
-from hybrid_jax.residual import InputScaling, LinearPath, LinearResidual, ResidualNetwork
+from hybrid_jax.residual import DeployedNetwork, InputScaling, LinearPath, LinearResidual, ResidualNetwork
 from hybrid_jax.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.rollout import checked, rollout, rollout_batch
 from hybrid_jax.rotors import RotorThrust
@@ -50,8 +50,8 @@ def portable(kind: Kind) -> Kind:
 
 
 _FIELDS = (
-    *(ConstantDisturbance, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid, LinearPath, LinearResidual),
-    *(Multirotor, ResidualNetwork, RigidBody, RotorThrust),
+    *(ConstantDisturbance, DeployedNetwork, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid),
+    *(LinearPath, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust),
 )
 _VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
 _PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.state import QUATERNION, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, evaluate_batch, pushed, pushforward
+from hybrid_jax.vector_field import AbstractVectorField, deploy_batch, deployed, evaluate_batch, pushed, pushforward
 from hybrid_jax.vehicle import Vehicle
 
 
@@ -79,6 +79,11 @@ def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: V
 @deploy_batch.register(RotorThrust)
 def _(field, x, u):
     return field(x, u)
+
+
+@deployed.register
+def _(field: RotorThrust):
+    return RotorThrust(deployed(field.field), field.vehicle)
 
 
 @pushforward.register

@@ -131,6 +131,25 @@ def _(field: Frozen, x, u, dx, du):
 
 
 @singledispatch
+def deployed(field: AbstractVectorField) -> AbstractVectorField:
+    """The same map as in deployment, laid out to be asked for few samples at a time, hundreds of times in a row.
+
+    The field itself, unless a faster one is registered.
+    """
+    return field
+
+
+@deployed.register
+def _(field: Hybrid):
+    return Hybrid(deployed(field.physics), deployed(field.residual))
+
+
+@deployed.register
+def _(field: Frozen):
+    return deployed(field.field)
+
+
+@singledispatch
 def observe(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
     """The field after it has seen a training batch: running statistics move, learned parameters do not."""
     return field

@@ -56,6 +56,7 @@ def network(inputs="all", outputs="all", norm="batch", linear=False):
 
 MODELS = {
     "physics": BODY,
+    "physics twice": hj.Hybrid(BODY, BODY),
     "network": network(),
     "hybrid": hj.Hybrid(BODY, network()),
     "without a norm": hj.Hybrid(BODY, network(norm="none")),
@@ -91,11 +92,6 @@ def test_the_common_form_is_the_model_itself(name):
     expected = jax.vmap(MODELS[name])(x, u)
     # Single precision, sums of some thirty terms of the size of the largest.
     np.testing.assert_allclose(jax.vmap(field)(x, u), expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max()))
-
-
-def test_what_has_no_common_form_is_refused():
-    with pytest.raises(ValueError, match="must be a rigid body, a network or a hybrid of these, got RigidBody"):
-        common(hj.Hybrid(BODY, BODY), hj.IRIS, 8, SCALING)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -10,6 +10,7 @@ from hybrid_jax import load, save
 from hybrid_jax.residual import (
     BatchNorm,
     Bias,
+    DeployedNetwork,
     InputScaling,
     LayerNorm,
     LinearPath,
@@ -17,7 +18,7 @@ from hybrid_jax.residual import (
     ResidualNetwork,
     residual_network,
 )
-from hybrid_jax.vector_field import Hybrid, Statistics, deploy_batch, evaluate_batch, observe, trainable
+from hybrid_jax.vector_field import Hybrid, Statistics, deploy_batch, deployed, evaluate_batch, observe, trainable
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
 
@@ -238,6 +239,23 @@ def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
         expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
         np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
+@pytest.mark.parametrize("sizes", [(1, 1), (3, 2)], ids=["few inputs", "more"])
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
+    """Batch normalisation by its running statistics, which are not those that it began with."""
+    rng = np.random.default_rng(0)
+    network = residual_network(
+        *sizes, jax.random.key(0), hidden=9, norm=norm, outputs=3, scaling=InputScaling(1.0, 2.0)
+    )
+    field = LinearPath(jnp.asarray(rng.normal(size=(3, sum(sizes)))), network) if linear else network
+    field = jax.tree.map(lambda leaf: leaf + rng.uniform(0.1, 1.0, leaf.shape), field)
+    x, u = (jnp.asarray(rng.normal(size=(size, *shape))) for size in sizes)
+    np.testing.assert_allclose(deployed(field)(x, u), field(x, u), rtol=1e-5, atol=1e-5)
+    assert isinstance(deployed(field), DeployedNetwork) == (norm != "layer")
 
 
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])

@@ -24,7 +24,7 @@ from hybrid_jax.control.sensitivities import advance, advanced
 from hybrid_jax.control.steadying import steadying_speeds
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
-from hybrid_jax.vector_field import AbstractVectorField
+from hybrid_jax.vector_field import AbstractVectorField, deployed
 from hybrid_jax.vehicle import Vehicle
 
 FREE = 3.0  # bound of the free numbers: tanh is within 0.5 % of its limit there, and its slope is still 1 %
@@ -165,6 +165,7 @@ class Controller:
         checks.unit_quaternions("reference", reference)
         x, reference, plan = in_common(x, reference, plan)
         x = x.at[QUATERNION].set(one_sheet(normalise(x[QUATERNION])))
+        model = deployed(model)
         free, states, cost = self._first(model, reference, x, plan)
 
         def iteration(_, point):
