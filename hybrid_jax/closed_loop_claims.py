@@ -15,6 +15,7 @@ from hybrid_jax.paired import mean_difference
 SHIFT, WIND = "parameter_shift", "external_force"
 THREE = ("hover", "figure_eight", "low_pass")
 FACTOR, SHARE, KEPT, ALIKE = 4.0, 0.9, 0.1, 1.1
+DECIMALS = 6  # of a cm; flights in single precision tell no more
 STEP_MS, LANES_MINUTES, LANES, LANE_SECONDS = 1.5, 3.0, 360, 10.0
 
 
@@ -102,7 +103,7 @@ def _judged(name: str, text: str, judge: Callable[[], tuple[bool, str]]) -> Clai
 def _smaller_in_wind(e: _Evidence) -> tuple[bool, str]:
     means = {reference: [e.mean(WIND, reference, flyer) for flyer in (e.source, e.adapted)] for reference in THREE}
     words = [
-        f"{REFERENCES[reference]}: {_cm(source)} → {_cm(adapted)} ({source / adapted:.2f} ×)"
+        f"{REFERENCES[reference]}: {' → '.join(_cm(source, adapted))} ({source / adapted:.2f} ×)"
         for reference, (source, adapted) in means.items()
     ]
     return all(source >= FACTOR * adapted for source, adapted in means.values()), "; ".join(words)
@@ -129,7 +130,7 @@ def _none_worse(e: _Evidence, before: Flyer, after: Flyer) -> tuple[bool, str]:
         apart = mean_difference([row.error for row in adapted], [row.error for row in source])
         means = [100 * float(np.mean([row.error for row in rows])) for rows in (source, adapted)]
         sure = "" if math.isnan(apart.low) or apart.low <= 0 <= apart.high else ", surely"
-        words.append(f"{REFERENCES[reference]}: {_cm(means[0])} → {_cm(means[1])}{sure}")
+        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(*means))}{sure}")
         verdicts.append(means[1] <= means[0])
     return all(verdicts), "; ".join(words)
 
@@ -154,8 +155,9 @@ def _observer_adds(e: _Evidence) -> tuple[bool, str]:
     for domain in (SHIFT, WIND):
         for reference in THREE:
             means = [e.mean(domain, reference, flyer) for flyer in (e.adapted, alone, both)]
-            shown = f"{_cm(means[0])}, {_cm(means[1])} → {_cm(means[2])}"
-            words.append(f"{domain.replace('_', ' ')}, {REFERENCES[reference]}: {shown}")
+            adapted, observed, together = _cm(*means)
+            where = f"{domain.replace('_', ' ')}, {REFERENCES[reference]}"
+            words.append(f"{where}: {adapted}, {observed} → {together}")
             verdicts.append(means[2] < min(means[:2]))
     return all(verdicts), "adapted, observer → both: " + "; ".join(words)
 
@@ -167,7 +169,7 @@ def _knows_no_place(e: _Evidence) -> tuple[bool, str]:
         raise _NotJudged("nothing was flown away from home")
     for domain, reference, distance in away:
         here, there = (e.mean(domain, reference, e.adapted, d) for d in (0.0, distance))
-        words.append(f"{domain.replace('_', ' ')}, {REFERENCES[reference]}: {_cm(here)} → {_cm(there)}")
+        words.append(f"{domain.replace('_', ' ')}, {REFERENCES[reference]}: {' → '.join(_cm(here, there))}")
         verdicts.append(there <= ALIKE * here)
     return all(verdicts), "; ".join(words)
 
@@ -195,8 +197,14 @@ def _flown(e: _Evidence, domain: str) -> list[str]:
     return flown
 
 
-def _cm(mean: float) -> str:
-    return f"{mean:.2f} cm" if math.isfinite(mean) else "∞ (a crash)"
+def _cm(*means: float) -> list[str]:
+    """In cm, by as few decimals as tell apart those that differ: two, or up to DECIMALS."""
+    apart = len(set(means))
+    for decimals in range(2, DECIMALS + 1):
+        told = [f"{mean:.{decimals}f} cm" if math.isfinite(mean) else "∞ (a crash)" for mean in means]
+        if len(set(told)) == apart:
+            break
+    return told
 
 
 _THREE = ", ".join(REFERENCES[reference] for reference in THREE)

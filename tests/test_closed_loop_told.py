@@ -117,6 +117,17 @@ def test_a_goal_fails_where_it_is_missed_and_no_other_with_it(goal, rows):
     )
 
 
+def test_a_verdict_tells_apart_the_errors_that_it_rests_on():
+    by_little = changed(ROWS, Flyer("safe", FEW), "parameter_shift", "step", position_rmse=0.020203)
+    told = {claim.id: claim for claim in claims(by_little, FEW, SPEED)}
+    assert told["R3b"].holds is False
+    assert "step: 2.0200 cm → 2.0203 cm" in told["R3b"].measured
+    assert "hover: 2.02 cm → 1.11 cm" in told["R3b"].measured
+    same = [replace(row, position_rmse=1e-9) for row in ROWS]
+    told = {claim.id: claim for claim in claims(same, FEW, SPEED)}
+    assert "hover: 0.00 cm → 0.00 cm" in told["R3b"].measured
+
+
 def test_speed_is_judged_by_what_was_measured():
     slow = verdicts(ROWS, replace(SPEED, call_ms=1.6, seconds=200.0))
     assert (slow["R7"], slow["R8"]) == (False, False)
