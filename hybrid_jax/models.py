@@ -16,15 +16,7 @@ from hybrid_jax import checks
 from hybrid_jax.archive import load_archive, save_archive
 from hybrid_jax.baselines import FrozenRates, HoldState
 from hybrid_jax.disturbance import ConstantDisturbance
-from hybrid_jax.features import (
-    Accelerations,
-    BodyFrame,
-    BodyMotion,
-    Motion,
-    NearGround,
-    Placeless,
-    TiltOnly,
-)
+from hybrid_jax.features import Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly
 from hybrid_jax.multirotor import Multirotor
 from hybrid_jax.multirotor_terms import Terms
 from hybrid_jax.normalisation import BatchNorm, Bias, LayerNorm
