@@ -16,6 +16,7 @@ SHIFT, WIND = "parameter_shift", "external_force"
 THREE = ("hover", "figure_eight", "low_pass")
 FACTOR, SHARE, KEPT, ALIKE = 4.0, 0.9, 0.1, 1.1
 DECIMALS = 6  # of a cm; flights in single precision tell no more
+RESOLUTION = float(np.spacing(np.float32(1.0)))  # m; of positions between 1 and 2 m, where most is flown
 STEP_MS, LANES_MINUTES, LANES, LANE_SECONDS = 1.5, 3.0, 360, 10.0
 
 
@@ -130,8 +131,9 @@ def _none_worse(e: _Evidence, before: Flyer, after: Flyer) -> tuple[bool, str]:
         apart = mean_difference([row.error for row in adapted], [row.error for row in source])
         means = [100 * float(np.mean([row.error for row in rows])) for rows in (source, adapted)]
         sure = "" if math.isnan(apart.low) or apart.low <= 0 <= apart.high else ", surely"
-        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(*means))}{sure}")
-        verdicts.append(means[1] <= means[0])
+        remark = ", equal" if _equal(*means) else sure
+        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(*means))}{remark}")
+        verdicts.append(means[1] <= means[0] or _equal(*means))
     return all(verdicts), "; ".join(words)
 
 
@@ -157,8 +159,10 @@ def _observer_adds(e: _Evidence) -> tuple[bool, str]:
             means = [e.mean(domain, reference, flyer) for flyer in (e.adapted, alone, both)]
             adapted, observed, together = _cm(*means)
             where = f"{domain.replace('_', ' ')}, {REFERENCES[reference]}"
-            words.append(f"{where}: {adapted}, {observed} → {together}")
-            verdicts.append(means[2] < min(means[:2]))
+            best = min(means[:2])
+            tie = _equal(means[2], best)
+            words.append(f"{where}: {adapted}, {observed} → {together}{', equal' if tie else ''}")
+            verdicts.append(means[2] < best and not tie)
     return all(verdicts), "adapted, observer → both: " + "; ".join(words)
 
 
@@ -197,6 +201,11 @@ def _flown(e: _Evidence, domain: str) -> list[str]:
     return flown
 
 
+def _equal(one: float, other: float) -> bool:
+    """Whether two errors [cm] differ by no more than rounding."""
+    return abs(one - other) <= 100 * RESOLUTION
+
+
 def _cm(*means: float) -> list[str]:
     """In cm, by as few decimals as tell apart those that differ: two, or up to DECIMALS."""
     apart = len(set(means))
@@ -208,6 +217,7 @@ def _cm(*means: float) -> list[str]:
 
 
 _THREE = ", ".join(REFERENCES[reference] for reference in THREE)
+_EQUAL = f"equal: within {1e6 * RESOLUTION:.2f} µm, the rounding of single precision"
 _RULES: Sequence[tuple[int, str, Callable[[_Evidence], tuple[bool, str]]]] = (
     (
         1,
@@ -225,7 +235,7 @@ _RULES: Sequence[tuple[int, str, Callable[[_Evidence], tuple[bool, str]]]] = (
     (
         3,
         "under the parameter shift the mean RMSE after adaptation with the smallest N is not above that of the source "
-        "model on any reference (surely: the 95 % interval of the paired difference excludes 0).",
+        f"model on any reference (surely: the 95 % interval of the paired difference excludes 0; {_EQUAL}).",
         lambda e: _none_worse(e, e.source, e.adapted),
     ),
     (
@@ -238,7 +248,7 @@ _RULES: Sequence[tuple[int, str, Callable[[_Evidence], tuple[bool, str]]]] = (
     (
         5,
         "adaptation with the smallest N and observer together have a smaller mean RMSE than either alone (the observer "
-        f"on the source model), under both shifts and on each of {_THREE}.",
+        f"on the source model), under both shifts and on each of {_THREE} ({_EQUAL}).",
         _observer_adds,
     ),
     (
@@ -251,7 +261,7 @@ _RULES: Sequence[tuple[int, str, Callable[[_Evidence], tuple[bool, str]]]] = (
         9,
         "with the observer before and after, under the parameter shift, the mean RMSE after adaptation with the "
         "smallest N is not above that of the source model on any reference (surely: the 95 % interval of the paired "
-        "difference excludes 0).",
+        f"difference excludes 0; {_EQUAL}).",
         lambda e: _none_worse(e, *e.observed),
     ),
 )

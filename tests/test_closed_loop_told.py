@@ -128,6 +128,25 @@ def test_a_verdict_tells_apart_the_errors_that_it_rests_on():
     assert "hover: 0.00 cm → 0.00 cm" in told["R3b"].measured
 
 
+def test_errors_that_differ_by_rounding_are_equal():
+    """Neither worse nor better: that of single precision at an altitude between 1 and 2 m is 0.12 µm."""
+    after, both = Flyer("safe", FEW), Flyer("safe", FEW, observer=True)
+
+    def judged(by: float):
+        level = changed(ROWS, Flyer("safe"), "parameter_shift", position_rmse=0.011)
+        level = changed(level, after, "parameter_shift", position_rmse=0.011 + by)
+        level = changed(level, both, "parameter_shift", position_rmse=0.011)
+        return {claim.id: claim for claim in claims(level, FEW, SPEED)}
+
+    told = judged(1.1e-7)
+    assert told["R3b"].holds is True
+    assert "hover: 1.10000 cm → 1.10001 cm, equal" in told["R3b"].measured
+    assert told["R5b"].holds is False
+    assert "1.10000 cm, equal" in told["R5b"].measured
+    told = judged(1.3e-7)
+    assert (told["R3b"].holds, told["R5b"].holds) == (False, True)
+
+
 def test_speed_is_judged_by_what_was_measured():
     slow = verdicts(ROWS, replace(SPEED, call_ms=1.6, seconds=200.0))
     assert (slow["R7"], slow["R8"]) == (False, False)
