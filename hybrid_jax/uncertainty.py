@@ -83,25 +83,54 @@ def physics_covariance(
 def _physics_covariance(
     field, windows: Trajectories, kind: Kind, solver, chunk: int, error: Counted | None
 ) -> Float[Array, "p p"]:
-    theta, rebuild = parametrise(field)
-    n, p = len(windows), theta.size
+    gram, score, square = normal_equations(field, windows, solver, chunk, error)
+    n, p = score.shape
+    bread = inverse(jnp.sum(gram, axis=0))
+    if kind == "homoscedastic":
+        return jnp.sum(square) / (n * windows.x[0].size - p) * bread
+    half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
+    return n / (n - p) * half.T @ half
 
-    def one(window: Trajectories):
+
+class NormalEquations(NamedTuple):
+    """What each window adds to those of θ_p, J that of its residual r.
+
+    Attributes:
+        gram: JᵀJ.
+        score: Jᵀr.
+        square: rᵀr.
+    """
+
+    gram: Float[Array, "n p p"]
+    score: Float[Array, "n p"]
+    square: Float[Array, " n"]
+
+
+def normal_equations(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    solver: diffrax.AbstractSolver | None = None,
+    chunk: int = 250,
+    error: Counted | None = None,
+) -> NormalEquations:
+    """Those of each window at a field's θ_p, with the slope and curvature of what an error counts, if not its square.
+
+    Args:
+        chunk: windows that are held in memory at a time.
+    """
+    theta, rebuild = parametrise(field)
+
+    def one(window: Trajectories) -> NormalEquations:
         def missed(theta):
             r = residual(rebuild(theta), window, solver)
             return r, r
 
         jacobian, r = jax.jacfwd(missed, has_aux=True)(theta)
         bent, slope = (jacobian, r) if error is None else _counted(error, jacobian, r)
-        effect, r = jacobian.reshape(-1, p), r.ravel()
-        return effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r
+        effect, r = jacobian.reshape(-1, theta.size), r.ravel()
+        return NormalEquations(effect.T @ bent.reshape(-1, theta.size), effect.T @ slope.ravel(), r @ r)
 
-    gram, score, square = jax.lax.map(one, windows, batch_size=min(chunk, n))
-    bread = _inverse(jnp.sum(gram, axis=0))
-    if kind == "homoscedastic":
-        return jnp.sum(square) / (n * windows.x[0].size - p) * bread
-    half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
-    return n / (n - p) * half.T @ half
+    return jax.lax.map(one, windows, batch_size=min(chunk, len(windows)))
 
 
 def _counted(
@@ -170,7 +199,7 @@ def _square(covariance: Float[Array, "p p"], p: int) -> Float[Array, "p p"]:
     return checks.floating("covariance", array)
 
 
-def _inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
+def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     """Of a positive definite matrix, scaled to a unit diagonal first: parameters may be of very different effect."""
     scale = jnp.sqrt(jnp.diagonal(matrix))
     scales = scale[:, None] * scale

@@ -18,7 +18,7 @@ FLOORS = (
     "features multirotor baselines",
     "loss metrics models claims least_squares vehicle_description flight_scores",
     "objective report_tables figures uncertainty linear_adaptation flight_claims",
-    "preparation expert_augmentation channels",
+    "preparation expert_augmentation channels disturbance_fit",
     "training",
     "sweep schedule error_panels report_page flight_figures standings closed_loop_tables flight_tables",
     "report comparison_figures ablations closed_loop_claims closed_loop_figures recorded_flight_figures",
