@@ -3,6 +3,7 @@
 python -m experiments.closed_loop --help
 """
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -11,22 +12,24 @@ from rich.console import Console
 from experiments import command
 from experiments.call_times import on_one_core
 from experiments.closed_loop_ablation import Option, networks, unnormalised, variants
-from experiments.closed_loop_lanes import Airspace, Block
+from experiments.closed_loop_lanes import Airspace, Block, Flights
 from experiments.closed_loop_report import Outcome, write
 from experiments.common_field import Believed
-from experiments.flyers import Trained, fleet, nine_numbers, train, unchanged_fleet
+from experiments.flyers import Trained, disturbed_seeds, fleet, nine_numbers, train, unchanged_fleet
 from experiments.protocol import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
+from experiments.solved import constant_disturbance, needed_disturbance
 from hybrid_jax import checks, hosts
 from hybrid_jax.closed_loop_rows import Flyer
 from hybrid_jax.control import Controller
-from hybrid_jax.lanes import count, lane
+from hybrid_jax.lanes import lane
 from hybrid_jax.rigid_body import rigid_body
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
+DISTURBANCES = {"needed": needed_disturbance, "always": constant_disturbance}
 Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
 Crew = dict[Flyer, Believed]
 ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
@@ -67,6 +70,8 @@ class ClosedLoopConfig(Config):
     """Its cap on epochs, if --max-epochs is more."""
     safe_offset: float | None = 0.3
     """In its adaptation, the rate of its output bias [m/s² or rad/s² a step]; see --rates.offset."""
+    safe_disturbance: Literal["needed", "always"] = "needed"
+    """The constant disturbance of its nine numbers: where left-out windows are predicted better with it, or always."""
     ablation: tuple[Option, ...] = get_args(Option)
     """What to undo of the safe network. networks: what it reads and writes. offset: the rate of its output bias.
     statistics: batch statistics of the target. quaternion: renormalised in each step of a prediction."""
@@ -132,16 +137,9 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
     few, many = min(config.sizes), max(config.sizes)
     crews = {domain.name: fleet(domain, IRIS, trained, few, many, config) for domain in DOMAINS}
     crews[SOURCE.name] = unchanged_fleet(IRIS, trained, config)
-    capacity = max(sum(map(count, crew.values())) for crew in crews.values())
-
-    def airspace(controller: Controller) -> Airspace:
-        folder = config.cache / "closed_loop"
-        return Airspace(controller, config.seconds, config.bandwidth, capacity, folder, console, config.fresh)
-
-    usual = airspace(Controller(IRIS))
-    fly_models(config, usual, crews, outcome)
+    fly_models(config, crews, console, outcome)
     if config.ablation:
-        fly_ablation(config, usual, airspace(Controller(IRIS, unit_quaternion=False)), console, outcome)
+        fly_ablation(config, console, outcome)
     if hosts.first():
         outcome.speeds = speeds(config, trained)
         write(NAME, config, outcome, Console())
@@ -175,25 +173,24 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
     wanted = shared(config, sizes=sizes, pool=config.pooled(), rates=safe_rates(config), **network)
     own = limited(wanted, config.safe_source, config.safe_epochs)
     trained["safe"] = _train("safe", "hybrid", own, console, outcome)
-    trained["nine"], stages = nine_numbers(trained["safe"].source, min(sizes), own, console, DOMAINS)
+    trained["nine"], stages = nine_numbers(
+        trained["safe"].source, min(sizes), DISTURBANCES[config.safe_disturbance], own, console, DOMAINS
+    )
+    outcome.notes += [f"nine numbers: {note}" for note in disturbed_seeds(trained["nine"])]
     outcome.seconds |= {f"nine numbers, {stage}": seconds for stage, seconds in stages.seconds.items()}
     return trained
 
 
-def fly_models(config: ClosedLoopConfig, space: Airspace, crews: dict[str, Crew], outcome: Outcome) -> None:
+def fly_models(config: ClosedLoopConfig, crews: dict[str, Crew], console: Console, outcome: Outcome) -> None:
     """Every model along every reference, before and after the changes; after them away from home as well."""
-    for domain in (SOURCE, *DOMAINS):
-        crew = crews[domain.name]
-        outcome.home += [space.fly(Block(domain, reference, 0.0, crew)) for reference in config.references]
-    for domain in DOMAINS:
-        crew = crews[domain.name]
-        alone = {flyer: model for flyer, model in crew.items() if not flyer.observer}
-        outcome.away += [space.fly(Block(domain, name, config.away, alone)) for name in config.flown_away]
+    alone = {name: {who: model for who, model in crew.items() if not who.observer} for name, crew in crews.items()}
+    home = blocks((SOURCE, *DOMAINS), crews, [(name, 0.0) for name in config.references])
+    away = blocks(DOMAINS, alone, [(name, config.away) for name in config.flown_away])
+    flights = flown(config, Controller(IRIS), [*home, *away], console)
+    outcome.home, outcome.away = flights[: len(home)], flights[len(home) :]
 
 
-def fly_ablation(
-    config: ClosedLoopConfig, usual: Airspace, drifting: Airspace, console: Console, outcome: Outcome
-) -> None:
+def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> None:
     """Train the ablation's networks and fly them, one change at a time."""
     few = shared(config, sizes=(min(config.sizes),), pool=config.pooled(), rates=offset_rates(config))
     small = limited(few, config.ablation_source, config.ablation_epochs)
@@ -201,12 +198,26 @@ def fly_ablation(
     outcome.seconds |= seconds
     outcome.notes += notes
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    for domain in DOMAINS:
-        crew = variants(config.ablation, domain, IRIS, trained, small)
-        outcome.ablation += [usual.fly(Block(domain, *place, crew)) for place in places]
-        if "quaternion" in config.ablation:
-            crew = unnormalised(domain, IRIS, trained, small)
-            outcome.ablation += [drifting.fly(Block(domain, *place, crew)) for place in places]
+    crews = {domain.name: variants(config.ablation, domain, IRIS, trained, small) for domain in DOMAINS}
+    outcome.ablation += flown(config, Controller(IRIS), blocks(DOMAINS, crews, places), console)
+    if "quaternion" in config.ablation:
+        crews = {domain.name: unnormalised(domain, IRIS, trained, small) for domain in DOMAINS}
+        drifting = Controller(IRIS, unit_quaternion=False)
+        outcome.ablation += flown(config, drifting, blocks(DOMAINS, crews, places), console)
+
+
+def blocks(
+    domains: Sequence[Domain], crews: Mapping[str, Mapping[Flyer, Believed]], places: Sequence[tuple[str, float]]
+) -> list[Block]:
+    """The crew of each domain, each of them along each reference, so far [m] from home."""
+    return [Block(domain, *place, crews[domain.name]) for domain in domains for place in places]
+
+
+def flown(config: ClosedLoopConfig, controller: Controller, blocks: list[Block], console: Console) -> list[Flights]:
+    """The flights of blocks, all lanes by one program."""
+    folder = config.cache / "closed_loop"
+    space = Airspace(controller, config.seconds, config.bandwidth, blocks, folder, console, config.fresh)
+    return [space.fly(block) for block in blocks]
 
 
 def shared(config: ClosedLoopConfig, **changes: Any) -> Config:

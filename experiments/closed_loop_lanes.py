@@ -1,8 +1,8 @@
-"""Every closed-loop flight as a lane of a compiled program, flown block by block; finished blocks are kept."""
+"""Every closed-loop flight as a lane of one compiled program, flown block by block; finished blocks are kept."""
 
 import time
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,8 @@ from hybrid_jax.control.promises import excess, least_promise, promises
 from hybrid_jax.control.references import Path as Reference
 from hybrid_jax.datasets import versions
 from hybrid_jax.files import aside
-from hybrid_jax.lanes import LaneMap, count, lane
+from hybrid_jax.lane_groups import LaneGroups
+from hybrid_jax.lanes import LaneMap, count
 from hybrid_jax.models import describe
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, Domain
 from hybrid_jax.sim.forces import Parameters, Wrench
@@ -32,7 +33,7 @@ from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.state import POSITION, STATE_SIZE
 
 FORMAT = "hybrid_jax closed loop 1"
-RECIPE = 5  # raise it when the same lanes no longer fly the same
+RECIPE = 6  # raise it when the same lanes no longer fly the same
 MADE_BY = ("jax", "hybrid_jax")
 FORCES = EXTERNAL_FORCE.forces  # all that act in any domain
 WIDTH = {"cpu": 4}  # lanes side by side; see docs/control.md
@@ -99,37 +100,26 @@ class Block:
         away = f" {self.distance:g} m away" if self.distance else ""
         return f"{self.domain.name} {self.reference}{away}"
 
-    def parts(self) -> list["Block"]:
-        """Blocks of fields of one kind: what one program flies."""
-        kinds = dict.fromkeys(map(kind_of, self.flyers.values()))
-        chosen = [{who: field for who, field in self.flyers.items() if kind_of(field) == kind} for kind in kinds]
-        return [replace(self, flyers=flyers) for flyers in chosen]
-
     def keys(self) -> list[tuple[Flyer, int]]:
-        """Who flies each lane, and its seed: part after part."""
-        flyers = (pair for part in self.parts() for pair in part.flyers.items())
-        return [(flyer, seed) for flyer, field in flyers for seed in range(count(field))]
+        """Who flies each lane, and its seed."""
+        return [(flyer, seed) for flyer, field in self.flyers.items() for seed in range(count(field))]
 
-    def lanes(self, bandwidth: float) -> Lane:
-        """Its lanes, stacked, of fields of one kind; bandwidth of the observers [rad/s]."""
-        keys = self.keys()
+    def lanes(self, bandwidth: float) -> list[Lane]:
+        """Those of each flyer, stacked; bandwidth of the observers [rad/s]."""
+        return [self._lanes(field, bandwidth * flyer.observer) for flyer, field in self.flyers.items()]
 
+    def _lanes(self, field: Believed, bandwidth: float) -> Lane:
         def repeated(value):
-            return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], len(keys), axis=0), value)
+            return jax.tree.map(lambda leaf: np.repeat(np.asarray(leaf)[None], count(field), axis=0), value)
 
         return Lane(
-            model=jax.tree.map(lambda *leaves: np.concatenate(leaves), *self.flyers.values()),
+            model=field,
             vehicle=repeated(self.domain.parameters()),
             shares=repeated(np.array([force in self.domain.forces for force in FORCES], np.float32)),
             path=repeated(np.int32(list(PATHS).index(self.reference))),
             home=repeated(np.array([self.distance, self.distance, 0.0], np.float32) / np.float32(np.sqrt(2))),
-            bandwidth=jnp.array([bandwidth * flyer.observer for flyer, _ in keys]),
+            bandwidth=repeated(np.float32(bandwidth)),
         )
-
-
-def kind_of(fields: Believed) -> tuple:
-    """What stacked fields must have in common to be stacked with others."""
-    return jax.tree.structure(fields), *(leaf.shape[1:] for leaf in jax.tree.leaves(fields))
 
 
 @dataclass(frozen=True)
@@ -151,9 +141,7 @@ class Flights:
 
     def rows(self) -> list[FlightRow]:
         """A row for each flight, in the order of the block's flyers."""
-        order = list(self.block.flyers)
-        rows = [self._row(i, *key) for i, key in enumerate(self.block.keys())]
-        return sorted(rows, key=lambda row: order.index(row.flyer))
+        return [self._row(i, *key) for i, key in enumerate(self.block.keys())]
 
     def states(self, flyer: Flyer, seed: int = 0) -> np.ndarray:
         """The states of one flight, every 0.05 s from the start on."""
@@ -170,12 +158,12 @@ class Flights:
 
 
 class Airspace:
-    """Flies blocks with one controller, all fields of a kind by the same program.
+    """Flies blocks with one controller, all lanes of all of them by one compiled program.
 
     Args:
         seconds: length of a flight.
         bandwidth: of the disturbance observers [rad/s].
-        capacity: lanes of the largest block.
+        blocks: that will be flown.
         folder: where finished blocks are kept.
         fresh: move aside what other versions have flown, and fly it anew.
     """
@@ -185,19 +173,22 @@ class Airspace:
         controller: Controller,
         seconds: float,
         bandwidth: float,
-        capacity: int,
+        blocks: Sequence[Block],
         folder: Path,
         console: Console,
         fresh: bool = False,
     ):
-        self._controller, self._bandwidth, self._capacity = controller, bandwidth, capacity
+        self._controller, self._bandwidth = controller, bandwidth
         self._folder, self._console, self._fresh = folder, console, fresh
         references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
         starts = references[:, 0].copy()
         thrown = list(PATHS).index("upset")
         starts[thrown] = upset(jnp.asarray(references[thrown, 0]))
         self._shared = (references, starts)
-        self._maps: dict[tuple, LaneMap] = {}  # by their width and the kind of field
+        even = -(-max(len(block.keys()) for block in blocks) // jax.device_count())
+        width = WIDTH.get(jax.default_backend(), even)
+        self._groups = LaneGroups([block.lanes(bandwidth) for block in blocks], width)
+        self._run = LaneMap(self._groups.mapped(partial(simulate, controller)), 1, room=self._groups.room)
 
     def fly(self, block: Block) -> Flights:
         """The flights of a block, found in the cache or flown now.
@@ -205,27 +196,20 @@ class Airspace:
         Raises:
             ValueError: what is kept of the block is damaged; names the file.
         """
-        abouts, arrays, found = zip(*map(self._part, block.parts()), strict=True)
-        together = {name: np.concatenate([part[name] for part in arrays]) for name in arrays[0]}
-        spent = {name: sum(about[name] for about in abouts) for name in ("seconds", "processor_seconds")}
-        words = "as found in the cache" if all(found) else clock(spent["seconds"])
-        self._console.print(f"{block.name}: {len(block.keys())} flights, {words}", highlight=False, soft_wrap=True)
-        return Flights(block, together, **spent, devices=abouts[0]["devices"])
-
-    def _part(self, block: Block) -> tuple[dict[str, Any], Arrays, bool]:
-        """Flights of fields of one kind, what is known of them, and whether they were in the cache."""
         lanes = block.lanes(self._bandwidth)
         path = self._folder / f"{block.name.replace(' ', '-')}-{self._identity(lanes)[:16]}.npz"
         about, arrays = hosts.from_first(lambda: self._found(path))
-        if about is not None:
-            return about, arrays, True
-        about, arrays = self._flown(lanes)
-        if hosts.first():
-            save_archive(path, FORMAT, about, arrays)
-        return about, arrays, False
+        words = "as found in the cache"
+        if about is None:
+            about, arrays = self._flown(lanes)
+            words = clock(about["seconds"])
+            if hosts.first():
+                save_archive(path, FORMAT, about, arrays)
+        self._console.print(f"{block.name}: {len(block.keys())} flights, {words}", highlight=False, soft_wrap=True)
+        return Flights(block, arrays, about["seconds"], about["processor_seconds"], about["devices"])
 
-    def _identity(self, lanes: Lane) -> str:
-        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), describe(lanes.model)]
+    def _identity(self, lanes: list[Lane]) -> str:
+        fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(self._controller), *(describe(each.model) for each in lanes)]
         return digest(fixed, named_leaves({"lanes": lanes, "shared": self._shared}))
 
     def _found(self, path: Path):
@@ -237,18 +221,14 @@ class Airspace:
             return None, {}
         return about, arrays
 
-    def _flown(self, lanes: Lane):
-        total = count(lanes)
-        # A lone lane, that of the truth, would wait for as many as are padded to.
-        alone = total == 1
-        padded = lane(lanes, np.resize(np.arange(total), 1 if alone else max(total, self._capacity)))
-        width = 1 if alone else WIDTH.get(jax.default_backend(), 0)
-        run = self._maps.setdefault((width, kind_of(lanes.model)), LaneMap(partial(simulate, self._controller), width))
-        costs = np.ones(count(padded))
-        run(padded, self._shared, costs, [])  # compiles, flies nothing
+    def _flown(self, lanes: list[Lane]):
+        groups, where = self._groups.grouped(lanes)
+        costs = self._groups.costs(groups)
+        self._run(groups, self._shared, costs, [])  # compiles, flies nothing
         began, worked = time.perf_counter(), time.process_time()
-        arrays = run(padded, self._shared, costs, range(total))
+        found = self._run(groups, self._shared, costs, range(len(costs)))
         spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
+        arrays = {name: array[where[:, 0], where[:, 1]] for name, array in found.items()}
         return {**spent, "devices": jax.device_count(), "versions": versions(*MADE_BY)}, arrays
 
 

@@ -12,7 +12,7 @@ from rich.console import Console
 from experiments.common_field import Believed, CommonField, common, true_field
 from experiments.conditions import input_scaling
 from experiments.protocol import Config
-from experiments.solved import constant_disturbance, solved
+from experiments.solved import Solve, solved
 from experiments.stages import Stages, stages_of
 from experiments.study import adapted, flown, places, pretrained, source_splits, target_splits
 from hybrid_jax.closed_loop_rows import SOURCES, Flyer
@@ -56,16 +56,28 @@ def train(
 
 
 def nine_numbers(
-    source: AbstractVectorField, few: int, config: Config, console: Console, domains: Sequence[Domain]
+    source: AbstractVectorField, few: int, solve: Solve, config: Config, console: Console, domains: Sequence[Domain]
 ) -> tuple[Trained, Stages]:
-    """Hybrids of the source, of which θ_p and a constant disturbance are fitted to each domain by least squares."""
+    """Hybrids of the source, of which θ_p and a constant disturbance are fitted to each domain by least squares.
+
+    Args:
+        solve: `needed_disturbance` or `constant_disturbance`.
+    """
     stages, own = stages_of(config, console), replace(config, sizes=(few,))
 
     def of(domain: Domain) -> AbstractVectorField:
         target = flown(domain, target_splits(config), config, stages)
-        return solved(f"least squares {domain.name}", constant_disturbance, source, own, stages, target).fields
+        return solved(f"least squares {domain.name}", solve, source, own, stages, target).fields
 
     return Trained(source, {(domain.name, few): of(domain) for domain in domains}), stages
+
+
+def disturbed_seeds(nine: Trained) -> list[str]:
+    """How many seeds of each domain have a constant disturbance, in words."""
+    fields: dict[tuple[str, int], Any] = {**nine.adapted}
+    pushes = {domain: field.physics.residual.acceleration for (domain, _), field in fields.items()}
+    counts = {domain: np.any(np.asarray(push) != 0, axis=1) for domain, push in pushes.items()}
+    return [f"{domain}: {found.sum()} of {len(found)} seeds have a disturbance." for domain, found in counts.items()]
 
 
 def fleet(

@@ -15,8 +15,9 @@ from experiments.protocol import Config
 from experiments.stages import Stages
 from hybrid_jax.datasets import Dataset
 from hybrid_jax.disturbance import with_disturbance
+from hybrid_jax.disturbance_fit import fit_disturbance
 from hybrid_jax.lanes import stack
-from hybrid_jax.least_squares import fit_physics
+from hybrid_jax.least_squares import PhysicsFit, fit_physics
 from hybrid_jax.metrics import deployed_mse
 from hybrid_jax.objective import Settings
 from hybrid_jax.runtime import SOONER
@@ -79,14 +80,22 @@ class _Lane:
 
 def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):
     """θ_p by least squares, everything else as it is."""
-    found = fit_physics(field, train, shared.solver)
-    status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
-    return found.field, found.steps, status
+    return _told(fit_physics(field, train, shared.solver))
 
 
 def constant_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
     """θ_p and a constant disturbance by least squares: nine numbers."""
     return least_squares(with_disturbance(field), train, validation, shared)
+
+
+def needed_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
+    """The same, but a disturbance of zero where the windows need none."""
+    return _told(fit_disturbance(field, train, shared.solver).fit)
+
+
+def _told(found: PhysicsFit):
+    status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
+    return found.field, found.steps, status
 
 
 def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:

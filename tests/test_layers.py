@@ -11,7 +11,7 @@ FLOORS = (
     "state rotation files hosts runtime normalised_layer",
     "checks",
     "vehicle archive lanes trajectories rows paired flight_rows",
-    "vector_field datasets summary closed_loop_rows multirotor_terms",
+    "vector_field lane_groups datasets summary closed_loop_rows multirotor_terms",
     "rigid_body normalisation rollout environment disturbance",
     "residual",
     "rotors",
