@@ -47,7 +47,9 @@ is known to it without noise.
   smaller one, which all rotors share, adds to the thrust of each (--safe-outputs); and the output bias, which is what a
   steady force is, moves at a rate of its own in adaptation (--safe-offset)
 - **safe, nine numbers**: the safe hybrid of the source, its network left as it is; least squares fits Ix, Iy, k and a
-  constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation flights
+  constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation flights;
+  by default the disturbance stays at zero where these, each left out in turn, are predicted no better with it
+  (--safe-disturbance)
 - **true vehicle, mean wind**: the simulator's own equations and the wind's mean; no bound, for an observer follows the
   sine as well
 - **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors

@@ -5,6 +5,8 @@ Six numbers hold that, and together with θ_p least squares finds them from seco
 taught by plenty of flight would forget some of it:
 
     fit_physics(with_disturbance(hybrid), windows).field
+
+Whether there is such a push the windows tell as well: see `disturbance_fit.fit_disturbance`.
 """
 
 import equinox as eqx
