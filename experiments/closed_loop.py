@@ -183,9 +183,8 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
 
 def fly_models(config: ClosedLoopConfig, crews: dict[str, Crew], console: Console, outcome: Outcome) -> None:
     """Every model along every reference, before and after the changes; after them away from home as well."""
-    alone = {name: {who: model for who, model in crew.items() if not who.observer} for name, crew in crews.items()}
     home = blocks((SOURCE, *DOMAINS), crews, [(name, 0.0) for name in config.references])
-    away = blocks(DOMAINS, alone, [(name, config.away) for name in config.flown_away])
+    away = blocks(DOMAINS, crews, [(name, config.away) for name in config.flown_away])
     flights = flown(config, Controller(IRIS), [*home, *away], console)
     outcome.home, outcome.away = flights[: len(home)], flights[len(home) :]
 

@@ -48,7 +48,9 @@ def networks(
 def variants(
     options: Sequence[Option], domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], config: Config
 ) -> dict[Flyer, CommonField]:
-    """What flies with the usual controller: each network, and with the statistics of the source."""
+    """What flies with the usual controller: each network, with the statistics of the source, and not adapted at all,
+    but with an observer.
+    """
     (few,) = config.sizes
     fields: dict[Flyer, Any] = {flyer(name, few): found.adapted[domain.name, few] for name, found in trained.items()}
     if "statistics" in options and config.norm == "batch":
@@ -56,6 +58,9 @@ def variants(
             field = trained[name].adapted[domain.name, few]
             wrong = with_statistics_of(trained[name].source, field)
             fields[flyer(with_change(name, "batch statistics of the source"), few)] = wrong
+    for name in COMPARED:
+        unadapted = flyer(with_change(name, "not adapted, + observer"), 0)
+        fields[replace(unadapted, observer=True)] = trained[name].source
     return {who: in_common(field, vehicle, config) for who, field in fields.items()}
 
 

@@ -88,7 +88,7 @@ def ablation_tables(rows: Sequence[FlightRow]) -> list[Table]:
         ]
         header = [REFERENCES[reference] + (f", {away:g} m away" if away else "") for _, reference, away in places]
         if places:
-            n = ", ".join(dict.fromkeys(f"N = {flyer.n_train}" for flyer in flyers))
+            n = ", ".join(dict.fromkeys(f"N = {flyer.n_train}" for flyer in flyers if flyer.n_train))
             made.append(Table(f"What makes a network safe: RMSE [cm], {NAMES[domain]}, {n}", ("", *header), lines))
     return made
 

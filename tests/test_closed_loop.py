@@ -209,7 +209,12 @@ def test_the_report_keeps_its_contract(folder):
     rows = [FlightRow(**row) for row in report["rows"]]
     # Nominal, oracle; 20 of physics, no-physics, nine numbers; source and 20 of two hybrids; and six with observers.
     # On the unchanged vehicle nominal, oracle, two sources, and three with observers.
-    assert len(rows) == 2 * (2 * 15 + 1 * 9) + 2 * 7
+    assert len(rows) == 2 * (2 + 1) * 15 + 2 * 7
+    # An observer on what was not adapted flies wherever anything flies.
+    everywhere = [(row["domain"], row["reference"], row["distance"]) for row in report["rows"] + report["ablation"]]
+    observed = [row for row in report["rows"] + report["ablation"] if row["observer"] and not row["n_train"]]
+    assert {(row["domain"], row["reference"], row["distance"]) for row in observed} == set(everywhere)
+    assert any(row["variant"] for row in observed)
     assert {row.distance for row in rows} == {0.0, 60.0}
     assert {row.n_train for row in rows if row.domain == "source"} == {0}
     assert {row["variant"] for row in report["ablation"]} > {"safe, batch statistics of the source"}
