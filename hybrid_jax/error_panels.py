@@ -69,11 +69,13 @@ def add_legend(figure: Figure, failed: bool) -> None:
 
 
 def tick_errors(axis: Axis, low: float, high: float) -> None:
-    """Numbers at 1, 2, 5 of a decade; at round steps where a log axis is shorter, at decades where it is longer."""
+    """Numbers at 1, 2, 5 of a decade; at more of it or at round steps where a log axis is shorter, at decades where it
+    is longer.
+    """
     decades = math.log10(high / low)
     room = 2.2 if low > LONG else 1.5  # decades
-    locator = LogLocator(subs=(1.0, 2.0, 5.0) if decades < room else (1.0,))
-    axis.set_major_locator(MaxNLocator(5) if decades < 0.8 else locator)
+    subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
+    axis.set_major_locator(MaxNLocator(5) if decades < 0.5 else LogLocator(subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axis.set_minor_formatter(NullFormatter())
 
@@ -102,7 +104,8 @@ def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: _Limit
         style = {"linewidth": 2.2, "linestyle": "-" if finite.all() else (0, (1.2, 0.6))}
         axes.plot([mean] * 2, [y - HALF, y + HALF], color=tint, **style)
     above, below, failed = (int(np.sum(which)) for which in (finite & (values > high), values < low, ~finite))
-    words = [f"{above} of {len(values)} beyond, mean {mean:.2g}"] if above else []
+    shown = f"{mean:.0f}" if 100 <= mean < 10_000 else f"{mean:.2g}"
+    words = [f"{above} of {len(values)} beyond, mean {shown}"] if above else []
     words += [f"{failed} of {len(values)} not finite"] if failed else []
     if words:
         _mark_edge(axes, "x" if failed == len(values) else ">", (high, y), ";\n".join(words), tint)

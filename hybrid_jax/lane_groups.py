@@ -5,8 +5,10 @@ only, and a lane that is padded to the shape of another, or computes what only a
 group that is mapped as one lane is a scalar, so `jax.lax.switch` takes one branch and computes nothing else.
 """
 
+from collections import Counter
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import partial, reduce
+from operator import or_
 
 import equinox as eqx
 import jax
@@ -47,23 +49,26 @@ class LaneGroups:
 
     def __init__(self, calls: Sequence[Sequence[PyTree]], width: int):
         tallies = [_tally(stacks) for stacks in calls]
-        most = {kind: max(tally.get(kind, 0) for tally in tallies) for tally in tallies for kind in tally}
-        self._widths = {kind: min(width, number) for kind, number in most.items()}
+        most = reduce(or_, tallies)
+        self._widths = {own: min(width, n) for own, n in most.items()}
         self._width = max(self._widths.values())
-        self.room = max(sum(-(-n // self._widths[kind]) for kind, n in tally.items()) for tally in tallies)
+        self.room = max(sum(-(-n // self._widths[own]) for own, n in tally.items()) for tally in tallies)
         examples = {kind(lanes): lanes for stacks in calls for lanes in stacks}
-        self._blank = tuple(jax.tree.map(np.zeros_like, self._taken(examples[kind], [0])) for kind in self._widths)
+        self._blank = tuple(jax.tree.map(np.zeros_like, self._taken(examples[own], [0])) for own in self._widths)
 
     def grouped(self, stacks: Sequence[PyTree]) -> tuple[Group, Int[np.ndarray, "n 2"]]:
-        """The groups of a call, stacked, and where each lane, in the order of the stacks, is: group and place in it."""
-        offsets = np.cumsum([0, *map(count, stacks)])
-        groups, where = [], np.zeros((offsets[-1], 2), int)
-        for number, (own, width) in enumerate(self._widths.items()):
-            alike = [i for i, lanes in enumerate(stacks) if kind(lanes) == own]
-            if not alike:
-                continue
-            lanes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(stacks[i] for i in alike))
-            places = np.concatenate([np.arange(offsets[i], offsets[i + 1]) for i in alike])
+        """The groups of a call, stacked, and where each lane, in the order of the stacks, is: group and place in it.
+
+        Raises:
+            ValueError: lanes of a kind that no call was said to have.
+        """
+        kinds = list(map(self._number, stacks))
+        of_lane = np.repeat(kinds, list(map(count, stacks)))
+        groups, where = [], np.zeros((len(of_lane), 2), int)
+        for number in sorted(set(kinds)):
+            alike = [lanes for lanes, other in zip(stacks, kinds, strict=True) if other == number]
+            lanes = jax.tree.map(lambda *leaves: np.concatenate(leaves), *alike)
+            places, width = np.flatnonzero(of_lane == number), self._widths[kind(lanes)]
             for first in range(0, len(places), width):
                 chosen = np.arange(first, min(first + width, len(places)))
                 where[places[chosen], 0], where[places[chosen], 1] = len(groups), chosen - first
@@ -90,6 +95,12 @@ class LaneGroups:
 
         return of_group
 
+    def _number(self, lanes: PyTree) -> int:
+        """Which kind they are of."""
+        if kind(lanes) not in self._widths:
+            raise ValueError("stacks must be of the kinds of the calls that were given, got lanes of another one")
+        return list(self._widths).index(kind(lanes))
+
     def _group(self, number: int, lanes: PyTree) -> Group:
         members = (lanes if i == number else blank for i, blank in enumerate(self._blank))
         return Group(jnp.asarray(number), tuple(members))
@@ -102,7 +113,6 @@ class LaneGroups:
         return jnp.pad(leaf, [(0, self._width - len(leaf)), *[(0, 0)] * (leaf.ndim - 1)])
 
 
-def _tally(stacks: Sequence[PyTree]) -> dict[tuple, int]:
+def _tally(stacks: Sequence[PyTree]) -> Counter[tuple]:
     """How many lanes there are of each kind."""
-    kinds = list(map(kind, stacks))
-    return {own: sum(count(lanes) for lanes, k in zip(stacks, kinds, strict=True) if k == own) for own in kinds}
+    return sum((Counter({kind(lanes): count(lanes)}) for lanes in stacks), Counter())

@@ -68,3 +68,8 @@ def test_only_the_branch_of_its_kind_runs():
     jax.block_until_ready(jax.jit(groups.mapped(function))(lane(grouped, 2)))
     jax.effects_barrier()
     assert ran == [()]
+
+
+def test_a_kind_that_was_not_announced_is_refused():
+    with pytest.raises(ValueError, match="stacks must be of the kinds of the calls"):
+        LaneGroups(CALLS[2:], 4).grouped([scalars(1)])
