@@ -183,8 +183,8 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
 
 def fly_models(config: ClosedLoopConfig, crews: dict[str, Crew], console: Console, outcome: Outcome) -> None:
     """Every model along every reference, before and after the changes; after them away from home as well."""
-    home = blocks((SOURCE, *DOMAINS), crews, [(name, 0.0) for name in config.references])
-    away = blocks(DOMAINS, crews, [(name, config.away) for name in config.flown_away])
+    home = blocks_of((SOURCE, *DOMAINS), crews, [(name, 0.0) for name in config.references])
+    away = blocks_of(DOMAINS, crews, [(name, config.away) for name in config.flown_away])
     flights = flown(config, Controller(IRIS), [*home, *away], console)
     outcome.home, outcome.away = flights[: len(home)], flights[len(home) :]
 
@@ -198,14 +198,14 @@ def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -
     outcome.notes += notes
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
     crews = {domain.name: variants(config.ablation, domain, IRIS, trained, small) for domain in DOMAINS}
-    outcome.ablation += flown(config, Controller(IRIS), blocks(DOMAINS, crews, places), console)
+    outcome.ablation += flown(config, Controller(IRIS), blocks_of(DOMAINS, crews, places), console)
     if "quaternion" in config.ablation:
         crews = {domain.name: unnormalised(domain, IRIS, trained, small) for domain in DOMAINS}
         drifting = Controller(IRIS, unit_quaternion=False)
-        outcome.ablation += flown(config, drifting, blocks(DOMAINS, crews, places), console)
+        outcome.ablation += flown(config, drifting, blocks_of(DOMAINS, crews, places), console)
 
 
-def blocks(
+def blocks_of(
     domains: Sequence[Domain], crews: Mapping[str, Mapping[Flyer, Believed]], places: Sequence[tuple[str, float]]
 ) -> list[Block]:
     """The crew of each domain, each of them along each reference, so far [m] from home."""
