@@ -12,8 +12,8 @@ import tyro
 from rich.console import Console
 
 from benchmarks.timing import Ratio, ratio_table
-from experiments.command import BAD_INPUT, check_folder
-from hybrid_jax.files import json_text, read_json, write_whole
+from experiments.runner.command import BAD_INPUT, check_folder
+from hybrid_jax.io.files import json_text, read_json, write_whole
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
 PEERS = "training_peers", "environment_peers"

@@ -25,14 +25,14 @@ from rich.table import Table
 
 from benchmarks.subjects import make_windows, protocol
 from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run
-from experiments.conditions import pretraining, settings
-from experiments.protocol import Model
-from hybrid_jax import training
-from hybrid_jax.lanes import LaneMap, lane
-from hybrid_jax.residual import residual_network
-from hybrid_jax.training import gradient_step
+from experiments.paper.conditions import pretraining, settings
+from experiments.paper.config import Model
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.sweep.lanes import LaneMap, lane
+from hybrid_jax.training import fitting
+from hybrid_jax.training.fitting import gradient_step
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import Hybrid
 from hybrid_jax.vehicle import IRIS
 
 BATCH = 100
@@ -79,7 +79,7 @@ def epoch_of(model: Model, seeds: int, windows: int) -> Case:
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return training.run(state, plan, train, validation, chosen, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, chosen, state.epoch + 1)
 
     mapped, lanes = LaneMap(epoch), pretraining(model, IRIS, config)
     shared = many_windows(windows), many_windows(VALIDATION)
@@ -98,7 +98,7 @@ def step_of(model: Model, steps: int, hidden: int) -> Case:
     state, plan = (lane(stacked, 0) for stacked in pretraining(model, IRIS, config))
     network = state.field.residual if model == "hybrid" else state.field
     wide = residual_network(13, 4, jax.random.key(0), hidden=hidden, scaling=network.scaling)
-    start = training.start(Hybrid(state.field.physics, wide) if model == "hybrid" else wide, jax.random.key(1))
+    start = fitting.start(Hybrid(state.field.physics, wide) if model == "hybrid" else wide, jax.random.key(1))
     arguments = start.field, start.adam, plan, make_windows(BATCH, steps)
     call, _, needed = compiled_with_memory(partial(gradient_step, settings=settings(config)), *arguments)
     return call, needed

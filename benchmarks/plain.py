@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks.subjects import DT
-from hybrid_jax.normalisation import BatchNorm
-from hybrid_jax.residual import ResidualNetwork
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid, Statistics, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, Statistics, trainable
+from hybrid_jax.networks.mlp import ResidualNetwork
+from hybrid_jax.networks.normalisation import BatchNorm
 
 SAMPLES = "samples"  # the axis over a minibatch
 

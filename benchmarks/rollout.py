@@ -20,9 +20,9 @@ from rich.table import Table
 from benchmarks.plain import rk4
 from benchmarks.subjects import DT, make_windows, untrained
 from benchmarks.timing import Findings, Ratio, agree, compiled, in_turns, run
-from hybrid_jax.rollout import RK4, rollout, rollout_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import RK4, rollout, rollout_batch
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField
 
 REACH = 1.05  # times the hand-written scan
 # Float32 rounds at 6e-8, and each of up to 100 steps of ten operations may round otherwise; gradients add up windows.

@@ -70,7 +70,7 @@ def take_part(order: str) -> None:
         os.sched_setaffinity(0, {max(os.sched_getaffinity(0))})
     import jax
 
-    from hybrid_jax import hosts
+    from hybrid_jax.sweep import hosts
 
     configure(Path(part["cache"]))
     jax.config.update("jax_num_cpu_devices", place.devices)
@@ -89,8 +89,8 @@ def timed_epochs(place: Place, preset: Preset) -> tuple[float, float]:
     from dataclasses import replace
 
     from benchmarks.subjects import make_windows, protocol
-    from experiments.conditions import pretraining, settings
-    from hybrid_jax.sweep import sweep
+    from experiments.paper.conditions import pretraining, settings
+    from hybrid_jax.sweep.training import sweep
     from hybrid_jax.vehicle import IRIS
 
     lanes = preset.lanes * place.processes * place.devices

@@ -5,13 +5,13 @@ from dataclasses import replace
 import jax
 import numpy as np
 
-from experiments.conditions import fresh_fields
-from experiments.protocol import PAPER, AdaptationConfig, Model
-from hybrid_jax.lanes import lane
-from hybrid_jax.rigid_body import rigid_body
-from hybrid_jax.rollout import rollout_batch
+from experiments.paper.conditions import fresh_fields
+from experiments.paper.config import PAPER, AdaptationConfig, Model
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import IRIS
 
 DT = 0.01  # s

@@ -3,8 +3,8 @@
 Lanes are models of the paper's protocol that train as in `hybrid_jax.sweep`. Measured is the cost of one epoch of one
 lane, for chunks of several widths, for one lane up to all, on one device and on all. Copies to and from the devices are
 part of it, and a chunk that is not full costs as much as a full one. The best width for all lanes on all devices is
-what `hybrid_jax.lanes.WIDTH` should say. Then the same few lanes train alone, and among others that have stopped. The
-results of all programs are compared before anything is timed.
+what `hybrid_jax.sweep.lanes.WIDTH` should say. Then the same few lanes train alone, and among others that have
+stopped. The results of all programs are compared before anything is timed.
 
 On a CPU one device is not one core: its larger operations spread over all cores that the process may use. For the cost
 on one core set it with taskset.
@@ -21,11 +21,11 @@ from rich.table import Table
 
 from benchmarks.subjects import make_windows, protocol
 from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch
-from experiments.conditions import pretraining, settings
-from experiments.protocol import Model
-from hybrid_jax import training
-from hybrid_jax.lanes import WIDTH, LaneMap, lane
-from hybrid_jax.training import FitState
+from experiments.paper.conditions import pretraining, settings
+from experiments.paper.config import Model
+from hybrid_jax.sweep.lanes import WIDTH, LaneMap, lane
+from hybrid_jax.training import fitting
+from hybrid_jax.training.fitting import FitState
 from hybrid_jax.vehicle import IRIS
 
 # Losses after some steps of Adam, which divides by small numbers, in float32 with sums in another order.
@@ -70,7 +70,7 @@ def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Progra
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return training.run(state, plan, train, validation, chosen, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, chosen, state.epoch + 1)
 
     mapped = LaneMap(epoch, width, jax.local_devices()[:devices])
     start = lane(pretraining(preset.model, IRIS, config), np.arange(lanes))
@@ -183,7 +183,7 @@ def measure(preset: Preset) -> Findings:
     stopped = measure_stopped(preset, programs[jax.local_device_count(), default_width(preset)])
     best = best_width(rows)
     choice = {"backend": jax.default_backend(), "best_width": best, "default_width": default_width(preset)}
-    table = Table("backend", "best width", "hybrid_jax.lanes.WIDTH", title="all lanes on all devices")
+    table = Table("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH", title="all lanes on all devices")
     table.add_row(*map(str, choice.values()))
     idle = Ratio("a stopped lane / an active one", stopped["stopped_share"], at_most=STOPPED)
     ratios = [*ratios_of(preset, times, choice["default_width"], best), idle]

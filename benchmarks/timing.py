@@ -22,10 +22,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from experiments.command import BAD_INPUT, check_folder
-from hybrid_jax.environment import environment
-from hybrid_jax.figures import save_figure
-from hybrid_jax.files import json_text, write_whole
+from experiments.paper.figures import save_figure
+from experiments.reporting.environment import environment
+from experiments.runner.command import BAD_INPUT, check_folder
+from hybrid_jax.io.files import json_text, write_whole
 from hybrid_jax.runtime import PROGRAMS, configure, cores
 
 Call = Callable[[], Any]

@@ -16,12 +16,12 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from hybrid_jax.normalisation import BatchNorm
-from hybrid_jax.residual import ResidualNetwork
-from hybrid_jax.rigid_body import LEARNED, nominal
-from hybrid_jax.rigid_body import RigidBody as OurRigidBody
+from hybrid_jax.dynamics.base import Hybrid as OurHybrid
+from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
+from hybrid_jax.dynamics.rigid_body import RigidBody as OurRigidBody
+from hybrid_jax.networks.mlp import ResidualNetwork
+from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import Hybrid as OurHybrid
 
 
 class RigidBody(nn.Module):
@@ -66,7 +66,7 @@ def quaternion_derivative(q: torch.Tensor, omega: torch.Tensor) -> torch.Tensor:
 
 
 class Network(nn.Module):
-    """f_d as in `hybrid_jax.residual`: linear, batch normalisation, ReLU, linear.
+    """f_d as in `hybrid_jax.networks.mlp`: linear, batch normalisation, ReLU, linear.
 
     Not `BatchNorm1d`, which would move its running statistics at each of the four stages of a step.
     """

@@ -36,12 +36,12 @@ from benchmarks.peers import installed, keep_to_one_core, skipped
 from benchmarks.subjects import make_windows, protocol
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run, stopwatch
 from benchmarks.training_step import AGREEMENT
-from experiments.conditions import pretraining, settings
-from experiments.protocol import Config
-from hybrid_jax.lanes import lane
-from hybrid_jax.rigid_body import LEARNED
-from hybrid_jax.rollout import RK4
-from hybrid_jax.training import gradient_step
+from experiments.paper.conditions import pretraining, settings
+from experiments.paper.config import Config
+from hybrid_jax.dynamics.rigid_body import LEARNED
+from hybrid_jax.integrate import RK4
+from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.training.fitting import gradient_step
 from hybrid_jax.vehicle import IRIS
 
 OURS, TORCHDIFFEQ, BY_HAND, COMPILED = "ours", "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"

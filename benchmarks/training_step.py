@@ -24,11 +24,11 @@ from benchmarks import plain
 from benchmarks.operations import count_operations
 from benchmarks.subjects import make_windows, protocol
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run
-from experiments.conditions import pretraining, settings
-from experiments.protocol import Model
-from hybrid_jax.lanes import lane
-from hybrid_jax.training import gradient_step
-from hybrid_jax.vector_field import trainable
+from experiments.paper.conditions import pretraining, settings
+from experiments.paper.config import Model
+from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.training.fitting import gradient_step
 from hybrid_jax.vehicle import IRIS
 
 PRODUCT = "matrix product"  # beside the names of models

@@ -10,27 +10,27 @@ from typing import Any, Literal, get_args
 import numpy as np
 from rich.console import Console
 
-from experiments import command
-from experiments.conditions import settings
 from experiments.external_force import sine_floor
-from experiments.protocol import QUICK, SMOKE, Config, Kind, distinct, preset_like
-from experiments.results import Lanes, rows_of, trained
-from experiments.stages import Stages, stages_of
-from experiments.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
-from hybrid_jax import hosts
-from hybrid_jax.ablations import Trial, by_choice, figure, records, tables, to_csv
-from hybrid_jax.environment import environment
-from hybrid_jax.figures import save_figure
-from hybrid_jax.files import json_text, json_value, write_whole
-from hybrid_jax.loss import REGULARISERS
-from hybrid_jax.report import print_tables
-from hybrid_jax.report_page import sections
-from hybrid_jax.rigid_body import nominal
-from hybrid_jax.rows import Row, with_rho
+from experiments.paper.ablations import Trial, by_choice, figure, records, tables, to_csv
+from experiments.paper.conditions import settings
+from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
+from experiments.paper.figures import save_figure
+from experiments.paper.results import Lanes, rows_of, trained
+from experiments.paper.rows import Row, with_rho
+from experiments.paper.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
+from experiments.reporting.environment import environment
+from experiments.reporting.report import print_tables
+from experiments.reporting.report_page import sections
+from experiments.runner import command
+from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.dynamics.rigid_body import nominal
+from hybrid_jax.io.files import json_text, json_value, write_whole
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
-from hybrid_jax.sweep import evaluate
-from hybrid_jax.training import FitState
+from hybrid_jax.sweep import hosts
+from hybrid_jax.sweep.training import evaluate
+from hybrid_jax.training.fitting import FitState
+from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.vehicle import IRIS
 
 NAME = "ablation"

@@ -10,12 +10,13 @@ from typing import Any, get_args
 import numpy as np
 from rich.console import Console
 
-from experiments import command
-from experiments.conditions import augmentation, settings
 from experiments.coverage import Config as CoverageConfig
 from experiments.coverage import CoverageRow, coverage
 from experiments.external_force import sine_floor
-from experiments.protocol import (
+from experiments.paper.claims import COMPARISON, claims
+from experiments.paper.comparison_figures import standings
+from experiments.paper.conditions import augmentation, settings
+from experiments.paper.config import (
     FROM_ZERO,
     QUICK,
     SMOKE,
@@ -27,24 +28,24 @@ from experiments.protocol import (
     factors,
     preset_like,
 )
-from experiments.results import Lanes, rows_of, save_models
-from experiments.rivals import METHODS, PAST, Case, Method, source_only
-from experiments.stages import Stages, stages_of
-from experiments.study import adaptation_splits, flown, pretrained, source_splits
-from hybrid_jax import checks, hosts
-from hybrid_jax.claims import COMPARISON, claims
-from hybrid_jax.comparison_figures import standings
-from hybrid_jax.datasets import Dataset
-from hybrid_jax.environment import environment
-from hybrid_jax.expert_augmentation import Augmentation
-from hybrid_jax.figures import save_figure
-from hybrid_jax.report import FLOOR, Report, print_report, write_report
-from hybrid_jax.rigid_body import LEARNED, nominal
-from hybrid_jax.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.figures import save_figure
+from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
+from experiments.paper.results import Lanes, rows_of, save_models
+from experiments.paper.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
+from experiments.reporting.environment import environment
+from experiments.reporting.report import FLOOR, Report, print_report, write_report
+from experiments.runner import command
+from experiments.runner.stages import Stages, stages_of
+from hybrid_jax import validation
+from hybrid_jax.adaptation.expert_augmentation import Augmentation
+from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
+from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.record import SplitSpec
-from hybrid_jax.training import FitState
+from hybrid_jax.sweep import hosts
+from hybrid_jax.training.fitting import FitState
 from hybrid_jax.trajectories import split
 from hybrid_jax.vehicle import IRIS
 
@@ -54,11 +55,11 @@ GIVEN_NETWORK = (
     "can trade with each other, which the interval does not."
 )
 ENCODING_RULES = {
-    "hidden": checks.count,
-    "rate": checks.not_negative,
-    "weight": checks.not_negative,
+    "hidden": validation.count,
+    "rate": validation.not_negative,
+    "weight": validation.not_negative,
     "stopping": FROM_ZERO,
-    "max_epochs": checks.count,
+    "max_epochs": validation.count,
 }
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
@@ -80,7 +81,7 @@ class ComparisonConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
-        checks.count("--repeats", self.repeats)
+        validation.count("--repeats", self.repeats)
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)

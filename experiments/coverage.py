@@ -20,18 +20,18 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
 from rich.table import Table
 
-from experiments.command import BAD_INPUT, INTERRUPTED, check_folder
-from experiments.progress import PartLine
-from experiments.sensors import Noise, measure
-from hybrid_jax import checks, rotation
-from hybrid_jax.files import json_text, write_whole
-from hybrid_jax.least_squares import fit_physics
-from hybrid_jax.rigid_body import LEARNED, RigidBody, nominal, rigid_body
-from hybrid_jax.rollout import rollout_batch
+from experiments.paper.sensors import Noise, measure
+from experiments.runner.command import BAD_INPUT, INTERRUPTED, check_folder
+from experiments.runner.progress import PartLine
+from hybrid_jax import rotation, validation
+from hybrid_jax.adaptation.least_squares import fit_physics
+from hybrid_jax.adaptation.uncertainty import Kind, intervals, physics_covariance
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.io.files import json_text, write_whole
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.uncertainty import Kind, intervals, physics_covariance
-from hybrid_jax.vector_field import AbstractVectorField
 from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
@@ -168,7 +168,7 @@ def check(config: Config) -> None:
     for name in ("repeats", "steps", "batch"):
         if getattr(config, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(config, name)}")
-    checks.count("--seed", config.seed, 0)
+    validation.count("--seed", config.seed, 0)
     if not 0 < config.level < 1:
         raise ValueError(f"--level must be between 0 and 1, got {config.level}")
     if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):

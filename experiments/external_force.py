@@ -6,14 +6,14 @@ python -m experiments.external_force --help
 import numpy as np
 from rich.console import Console
 
-from experiments import command
-from experiments.outcome import write_outcome
-from experiments.protocol import AdaptationConfig
-from experiments.study import EVERY, study
-from hybrid_jax import hosts
+from experiments.paper.config import AdaptationConfig
+from experiments.paper.outcome import write_outcome
+from experiments.paper.study import EVERY, study
+from experiments.runner import command
 from hybrid_jax.sim.domain import EXTERNAL_FORCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
+from hybrid_jax.sweep import hosts
 from hybrid_jax.vehicle import IRIS
 
 NAME, TITLE = "external_force", "External force"

@@ -13,7 +13,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 from rich.table import Table
 
-from hybrid_jax.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
+from hybrid_jax.io.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
 from hybrid_jax.sim.render import picture

@@ -5,12 +5,12 @@ python -m experiments.param_shift --help
 
 from rich.console import Console
 
-from experiments import command
-from experiments.outcome import write_outcome
-from experiments.protocol import AdaptationConfig
-from experiments.study import study
-from hybrid_jax import hosts
+from experiments.paper.config import AdaptationConfig
+from experiments.paper.outcome import write_outcome
+from experiments.paper.study import study
+from experiments.runner import command
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
+from hybrid_jax.sweep import hosts
 from hybrid_jax.vehicle import IRIS
 
 NAME, TITLE = "param_shift", "Parameter shift"

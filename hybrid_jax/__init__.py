@@ -17,14 +17,14 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 """
 
 from hybrid_jax import runtime
-from hybrid_jax.models import Model, load, save
-from hybrid_jax.objective import Settings
-from hybrid_jax.residual import residual_network
-from hybrid_jax.rigid_body import RigidBody, rigid_body
-from hybrid_jax.rollout import RK4, rollout, rollout_batch
-from hybrid_jax.training import fit
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
+from hybrid_jax.integrate import RK4, rollout, rollout_batch
+from hybrid_jax.io.models import Model, load, save
+from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.training.fitting import fit
+from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField, Hybrid
 from hybrid_jax.vehicle import IRIS, Vehicle, load_vehicle
 
 __all__ = [

@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks
-from hybrid_jax.rollout import rollout_batch
+from hybrid_jax import validation
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check
-from hybrid_jax.vector_field import AbstractVectorField
 
 CHUNK = 1000  # windows that are predicted at a time
 
@@ -38,8 +38,8 @@ def deployed_mse(
         ValueError: windows that `trajectories.check` or the field refuses, or an `every` beyond their horizon.
     """
     check(windows, "windows")
-    checks.count("chunk", chunk)
-    checks.count("every", every)
+    validation.count("chunk", chunk)
+    validation.count("every", every)
     if every > windows.horizon:
         raise ValueError(f"every={every} is more than the {windows.horizon} intervals of the windows")
 
@@ -67,6 +67,6 @@ def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"])
     Raises:
         ValueError: a source_mse that is known, and zero or negative: against it nothing is a gain.
     """
-    if not checks.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
+    if not validation.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
         raise ValueError(f"source_mse must be positive, got {source_mse}")
     return (source_mse - adapted_mse) / source_mse

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.models import portable
-from hybrid_jax.rollout import rollout_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.io.models import portable
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vector_field import AbstractVectorField
 
 GRAVITY = 9.81
 LENGTH, DAMPING = 0.5, 0.8  # of the true pendulum: [m], [1/s]

@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 
 import hybrid_jax
-from experiments.flight_protocol import RealFlightConfig
-from experiments.simulated_logs import csv_of
+from experiments.real_flight.config import RealFlightConfig
+from experiments.real_flight.simulated_logs import csv_of
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.rollout import rollout_batch
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.vehicle import IRIS
 
 DT, SAMPLES = 0.01, 90

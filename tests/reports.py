@@ -6,18 +6,10 @@ from dataclasses import replace
 import numpy as np
 from hypothesis import strategies as st
 
-from hybrid_jax.claims import claims
-from hybrid_jax.environment import environment
-from hybrid_jax.report import Report
-from hybrid_jax.rows import (
-    DOMAINS,
-    MODELS,
-    MODES,
-    STATUSES,
-    THETA,
-    Row,
-    with_rho,
-)
+from experiments.paper.claims import claims
+from experiments.paper.rows import DOMAINS, MODELS, MODES, STATUSES, THETA, Row, with_rho
+from experiments.reporting.environment import environment
+from experiments.reporting.report import Report
 
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": 8.5e-6}
 SIZES = (100, 500, 1000)

@@ -70,7 +70,7 @@ def told(folder: Path, module: str) -> Run:
 def unbegun(name: str, *arguments: str) -> Run:
     """What an experiment says, in this process, whose options end it before it sets anything up."""
     module, out, err = f"experiments.{name}", io.StringIO(), io.StringIO()
-    begun = mock.patch("experiments.command.configure", side_effect=AssertionError("the command has begun"))
+    begun = mock.patch("experiments.runner.command.configure", side_effect=AssertionError("the command has begun"))
     said = mock.patch.object(sys, "argv", [module, *arguments])
     with begun, said, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:

@@ -1,4 +1,4 @@
-"""Imports point down only, and the simulator and learning never meet below the experiments."""
+"""Imports point down only: between packages of the library, between its modules, and from the programs to the library."""
 
 import ast
 from graphlib import TopologicalSorter
@@ -7,31 +7,15 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[1]
-FLOORS = (
-    "state rotation files hosts runtime normalised_layer",
-    "checks",
-    "vehicle archive lanes trajectories rows paired flight_rows",
-    "vector_field lane_groups datasets summary closed_loop_rows multirotor_terms",
-    "rigid_body normalisation rollout environment disturbance",
-    "residual",
-    "rotors",
-    "features multirotor baselines",
-    "loss metrics models claims least_squares vehicle_description flight_scores",
-    "objective report_tables figures uncertainty linear_adaptation flight_claims",
-    "preparation expert_augmentation channels disturbance_fit",
-    "training",
-    "sweep schedule error_panels report_page flight_figures standings closed_loop_tables flight_tables",
-    "report comparison_figures ablations closed_loop_claims closed_loop_figures recorded_flight_figures",
-    "closed_loop_paths",
+# Modules and packages of the library, from the bottom: each may import what stands before it.
+ORDER = (
+    *("state", "rotation", "runtime", "validation", "vehicle", "trajectories"),
+    *("dynamics", "integrate", "networks", "metrics", "io", "training", "adaptation", "sweep"),
+    *("sim", "flights", "control", "export"),
 )
-FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
-# What each sub-package may import of the core: none of them learns or reports, and none knows another.
-NEEDS = {
-    "sim": {"state", "rotation", "files", "runtime", "checks", "vehicle", "trajectories", "datasets"},
-    "flights": {"state", "vehicle", "trajectories"},
-    "control": {"state", "rotation", "checks", "vehicle", "vector_field", "rollout", "disturbance"},  # any field
-    "export": {"state", "checks", "archive", "vector_field", "rollout"},  # likewise
-}
+# These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.
+SERVICES = {"sim", "flights", "control", "export"}
+LEARNING = {"networks", "training", "adaptation", "sweep"}
 
 
 def imported(path):
@@ -47,44 +31,47 @@ def imported(path):
 
 
 def modules(package):
-    """Dotted name → imported modules, for every module of a package."""
-    files = sorted((ROOT / package).rglob("*.py"))
+    """Dotted name → imported modules, for every module of a package but those that only export."""
+    files = sorted(path for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py")
     return {".".join(path.relative_to(ROOT).with_suffix("").parts): imported(path) for path in files}
 
 
-LIBRARY = {name: needs for name, needs in modules("hybrid_jax").items() if not name.endswith("__init__")}
-CORE = {name.split(".")[1]: needs for name, needs in LIBRARY.items() if name.count(".") == 1}
-INSIDE = {name: needs for name, needs in LIBRARY.items() if name.count(".") == 2}
+LIBRARY = modules("hybrid_jax")
 
 
-def test_every_module_has_a_floor():
-    assert set(CORE) == set(FLOOR)
+def room(name):
+    return name.split(".")[1]
 
 
-@pytest.mark.parametrize("name", sorted(CORE))
+def test_every_package_has_its_place():
+    assert {room(name) for name in LIBRARY} == set(ORDER)
+
+
+@pytest.mark.parametrize("name", sorted(LIBRARY))
 def test_imports_point_down(name):
-    for needed in CORE[name]:
-        assert needed.startswith("hybrid_jax.")
-        assert needed.split(".")[1] not in NEEDS
-        assert FLOOR[needed.split(".")[1]] < FLOOR[name], f"{name} imports {needed}"
+    for needed in LIBRARY[name]:
+        assert needed.startswith("hybrid_jax."), f"{name} imports {needed}"
+        assert ORDER.index(room(needed)) <= ORDER.index(room(name)), f"{name} imports {needed}"
 
 
-@pytest.mark.parametrize("name", sorted(INSIDE))
-def test_a_sub_package_knows_little_of_the_core_and_nothing_of_another(name):
-    package = name.split(".")[1]
-    for needed in INSIDE[name]:
-        assert needed.startswith("hybrid_jax.")
-        assert needed.split(".")[1] in NEEDS[package] | {package}, f"{name} imports {needed}"
+@pytest.mark.parametrize("name", sorted(name for name in LIBRARY if room(name) in SERVICES))
+def test_a_service_knows_no_learning_and_no_other_service(name):
+    rooms = {room(needed) for needed in LIBRARY[name]} - {room(name)}
+    assert not rooms & (SERVICES | LEARNING), f"{name} imports {rooms}"
+
+
+@pytest.mark.parametrize("name", sorted(modules("benchmarks")))
+def test_benchmarks_need_the_library_alone(name):
+    assert all(needed.startswith(("hybrid_jax.", "benchmarks.")) for needed in modules("benchmarks")[name])
 
 
 def test_there_is_no_cycle():
-    everything = {**modules("hybrid_jax"), **modules("experiments"), **modules("benchmarks")}
+    everything = {**LIBRARY, **modules("experiments"), **modules("benchmarks")}
     list(TopologicalSorter(everything).static_order())
 
 
 def test_the_test_sees_imports():
     """A parser that finds nothing would let everything pass."""
-    assert "hybrid_jax.vector_field" in CORE["rigid_body"]
-    assert "hybrid_jax.rotation" in CORE["rigid_body"]
-    assert "hybrid_jax.sim.model" in INSIDE["hybrid_jax.sim.render"]
-    assert "hybrid_jax.training" in modules("experiments")["experiments.conditions"]
+    assert "hybrid_jax.dynamics.base" in LIBRARY["hybrid_jax.dynamics.rigid_body"]
+    assert "hybrid_jax.sim.model" in LIBRARY["hybrid_jax.sim.render"]
+    assert "hybrid_jax.training.fitting" in modules("experiments")["experiments.paper.conditions"]

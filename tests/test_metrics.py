@@ -7,7 +7,7 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax import metrics
-from hybrid_jax.rollout import SOLVERS, rollout_batch
+from hybrid_jax.integrate import SOLVERS, rollout_batch
 
 
 def test_a_perfect_model_has_no_error():

@@ -15,10 +15,10 @@ from benchmarks.peers import installed
 from benchmarks.rigid_body_by_hand import derivative
 from benchmarks.subjects import make_flights, untrained
 from benchmarks.training_peers import BY_HAND, COMPILED, PRESETS, RIVALS, TORCHDIFFEQ, ThreeEighths
-from hybrid_jax.rigid_body import rigid_body
-from hybrid_jax.rollout import RK4, rollout
-from hybrid_jax.vector_field import Hybrid as OurHybrid
-from hybrid_jax.vector_field import evaluate_batch
+from hybrid_jax.dynamics.base import Hybrid as OurHybrid
+from hybrid_jax.dynamics.base import evaluate_batch
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.integrate import RK4, rollout
 from hybrid_jax.vehicle import IRIS
 
 

@@ -21,13 +21,13 @@ from pendulum import pendulum, swings
 from surface import cases, is_finite, outcome, spoiled
 
 import hybrid_jax as hj
-from hybrid_jax.archive import named_leaves, save_archive
-from hybrid_jax.datasets import FORMAT as DATASET
-from hybrid_jax.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.export import Program, export_field, load_program
 from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
-from hybrid_jax.models import FORMAT as MODEL
-from hybrid_jax.models import portable
+from hybrid_jax.io.archive import named_leaves, save_archive
+from hybrid_jax.io.datasets import FORMAT as DATASET
+from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.io.models import FORMAT as MODEL
+from hybrid_jax.io.models import portable
 
 KEY = jax.random.key(0)
 MIXED = hj.Hybrid(pendulum(), hj.residual_network(2, 1, KEY, hidden=4))

@@ -16,16 +16,17 @@ from pendulum import pendulum, swings
 from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
 
 import hybrid_jax as hj
-from hybrid_jax import linear_adaptation, metrics, uncertainty
+from hybrid_jax import metrics
+from hybrid_jax.adaptation import ridge, uncertainty
+from hybrid_jax.adaptation.least_squares import fit_physics
+from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
-from hybrid_jax.least_squares import fit_physics
-from hybrid_jax.loss import residual_norm
-from hybrid_jax.multirotor import multirotor
-from hybrid_jax.residual import InputScaling
+from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import fly
 from hybrid_jax.sim.record import SplitSpec
-from hybrid_jax.training import DIVERGED
+from hybrid_jax.training.fitting import DIVERGED
+from hybrid_jax.training.loss import residual_norm
 from hybrid_jax.trajectories import check, concatenate, split, windows_of
 
 KEY = jax.random.key(0)
@@ -140,9 +141,9 @@ def test_rates_that_do_not_go_with_the_field_are_refused(rates):
 OF_WINDOWS = {
     "fit_physics": lambda w, n: fit_physics(SWING, w, max_steps=n).field,
     "covariance": lambda w, n: uncertainty.physics_covariance(SWING, w, chunk=n),
-    "linear": lambda w, n: linear_adaptation.linear_residual(SWING, w, n),
-    "last layer": lambda w, n: linear_adaptation.last_layer(MIXED, w, n),
-    "adapted": lambda w, n: linear_adaptation.adapted(linear_adaptation.last_layer, MIXED, w, WINDOWS, (1.0, n)),
+    "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
+    "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),
+    "adapted": lambda w, n: ridge.adapted(ridge.last_layer, MIXED, w, WINDOWS, (1.0, n)),
     "mse": lambda w, n: metrics.deployed_mse(SWING, w, n),
     "split": lambda w, n: split(check(w), n),
     "windows_of": lambda w, n: check(windows_of(w.u[0], w.u[0, :-1], w.dt, steps=n)),

@@ -29,7 +29,7 @@ def test_the_library_example_recovers_the_pendulums_length(tmp_path):
 
 def test_the_names_that_it_gives_are_there():
     names = set(re.findall(r"`(hybrid_jax(?:\.\w+)+)[`(]", README))
-    assert {"hybrid_jax.runtime.configure", "hybrid_jax.disturbance"} <= names
+    assert {"hybrid_jax.runtime.configure", "hybrid_jax.dynamics.disturbance"} <= names
     assert "runtime" in hybrid_jax.__all__
     for name in names:
         found = hybrid_jax

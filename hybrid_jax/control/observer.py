@@ -11,9 +11,9 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.control.attitude import one_sheet
 from hybrid_jax.control.sensitivities import advance
-from hybrid_jax.disturbance import disturbed
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
-from hybrid_jax.vector_field import AbstractVectorField
 
 Disturbance = Float[Array, "6"]
 

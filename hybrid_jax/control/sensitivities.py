@@ -10,10 +10,10 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.rollout import RK4
+from hybrid_jax.dynamics.base import AbstractVectorField, pushed, pushforward
+from hybrid_jax.integrate import RK4
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION, Input, State
-from hybrid_jax.vector_field import AbstractVectorField, pushed, pushforward
 
 
 def advanced(

@@ -21,12 +21,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks
-from hybrid_jax.archive import load_archive, save_archive
+from hybrid_jax import validation
+from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch
 from hybrid_jax.export.step import one_step
-from hybrid_jax.rollout import Derivative, check_field
+from hybrid_jax.integrate import Derivative, check_field
+from hybrid_jax.io.archive import load_archive, save_archive
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
-from hybrid_jax.vector_field import AbstractVectorField, deploy_batch
 
 FORMAT = "hybrid_jax program 1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -63,7 +63,7 @@ class Program:
         Raises:
             ValueError: other shapes, or a number that is not finite.
         """
-        x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
+        x, u = (validation.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
         batch = x.shape[:1] if self.batched else ()
         if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
             form = "x (b, {}) and u (b, {})" if self.batched else "x ({},) and u ({},)"
@@ -115,7 +115,7 @@ def export_step(
         ValueError: dt that is not positive; as `export_field`.
         ImportError, OSError: as `export_field`.
     """
-    checks.positive("dt", dt, "a positive number of seconds")
+    validation.positive("dt", dt, "a positive number of seconds")
     _export(path, field, float(dt), state_size, input_size, batched, platforms, about)
 
 
@@ -133,19 +133,21 @@ def load_program(path: str | Path) -> Program:
         _check_calls(exported)
         dt, about = metadata["dt"], dict(metadata["about"])
         if dt is not None:
-            checks.positive("dt", dt)
+            validation.positive("dt", dt)
         batched, state_size, input_size = _sizes(exported)
     except Exception as error:  # of forged bytes, JAX's parser raises whatever it meets
-        raise ValueError(f"{path}: not a program of a field or a step: {checks.one_line(error)}") from error
+        raise ValueError(f"{path}: not a program of a field or a step: {validation.one_line(error)}") from error
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
 
 
 def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, about) -> None:
     _need_flatbuffers()
-    checks.count("state_size", state_size)
-    checks.count("input_size", input_size, least=0)
+    validation.count("state_size", state_size)
+    validation.count("input_size", input_size, least=0)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
-        raise ValueError(f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.shown(platforms)}")
+        raise ValueError(
+            f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {validation.shown(platforms)}"
+        )
     with jax.enable_x64(False), _nowhere():
         single = jax.tree.map(
             lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_inexact_array(leaf) else leaf, field

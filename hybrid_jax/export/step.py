@@ -3,7 +3,7 @@
 import diffrax
 from jaxtyping import Array, Float
 
-from hybrid_jax.rollout import RK4, Derivative
+from hybrid_jax.integrate import RK4, Derivative
 
 
 def one_step(

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from hybrid_jax import checks
+from hybrid_jax import validation
 from hybrid_jax.runtime import SOONEST
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import Domain
@@ -48,11 +48,11 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
     Raises:
         ValueError: no flights, no time or no key.
     """
-    checks.count("flights", flights)
-    checks.positive("seconds", seconds)
-    checks.key("key", key)
+    validation.count("flights", flights)
+    validation.positive("seconds", seconds)
+    validation.key("key", key)
     steps = round(seconds / DT)
-    checks.count(f"intervals of {DT} s in seconds={seconds}", steps)
+    validation.count(f"intervals of {DT} s in seconds={seconds}", steps)
     cpu = jax.devices("cpu")[0]
     with jax.enable_x64(True), jax.default_device(cpu):
         truth = domain.quadrotor()

@@ -20,7 +20,7 @@ from hybrid_jax.control import (
     sample,
     upset,
 )
-from hybrid_jax.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)

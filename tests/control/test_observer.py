@@ -7,8 +7,8 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance, observer
-from hybrid_jax.disturbance import disturbed
-from hybrid_jax.residual import InputScaling
+from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.networks.mlp import InputScaling
 
 DT = 0.01
 TRUE = jnp.array([0.0, -4 / 1.5, 0.5, 0.3, -0.2, 0.1])

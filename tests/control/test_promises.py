@@ -9,7 +9,7 @@ import hybrid_jax as hj
 from hybrid_jax.control import Controller, advance, fly, hover, realised, sample
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.control.promises import Promises, excess, least_promise, promises
-from hybrid_jax.disturbance import disturbed
+from hybrid_jax.dynamics.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)

@@ -8,11 +8,11 @@ import pytest
 import hybrid_jax as hj
 from hybrid_jax.control import advance
 from hybrid_jax.control.sensitivities import advanced
-from hybrid_jax.disturbance import disturbed
-from hybrid_jax.features import restricted
-from hybrid_jax.residual import InputScaling, LinearResidual
-from hybrid_jax.rigid_body import ForcedBody
-from hybrid_jax.vector_field import Frozen
+from hybrid_jax.dynamics.base import Frozen
+from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.rigid_body import ForcedBody
+from hybrid_jax.networks.mlp import InputScaling, LinearResidual
+from hybrid_jax.networks.views import restricted
 
 DT = 0.05
 BODY = hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)

@@ -6,14 +6,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.baselines import FrozenRates, HoldState
-from hybrid_jax.features import GO_WITH, INPUTS, OUTPUTS, restricted
-from hybrid_jax.multirotor import multirotor
-from hybrid_jax.multirotor_terms import SHAPES, Terms
-from hybrid_jax.residual import NORMS, InputScaling, LinearResidual, residual_network
-from hybrid_jax.rigid_body import ForcedBody, RigidBody, guess
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid
+from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, guess
+from hybrid_jax.dynamics.terms import SHAPES, Terms
+from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
+from hybrid_jax.networks.views import GO_WITH, INPUTS, OUTPUTS, restricted
 from hybrid_jax.state import QUATERNION, VELOCITY
-from hybrid_jax.vector_field import AbstractVectorField, Frozen, Hybrid
 from hybrid_jax.vehicle import IRIS
 
 KEY = jax.random.key(0)

@@ -8,7 +8,7 @@ from fields import BODY, FIELDS, KEY, PER_ROTOR, double, samples
 
 from hybrid_jax import Hybrid, residual_network
 from hybrid_jax.export import casadi_function, casadi_step
-from hybrid_jax.rollout import rollout
+from hybrid_jax.integrate import rollout
 
 ca = pytest.importorskip("casadi")
 ROUND_OFF = 1e-12  # of the largest entry: a few hundred operations of 1e-16 each

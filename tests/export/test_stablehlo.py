@@ -8,9 +8,9 @@ import pytest
 from fields import BODY, FIELDS, KEY, samples
 
 from hybrid_jax import residual_network, rollout_batch, save
-from hybrid_jax.archive import save_archive
 from hybrid_jax.export import export_field, export_step, load_program
 from hybrid_jax.export.stablehlo import FORMAT
+from hybrid_jax.io.archive import save_archive
 
 KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
 HYBRID = FIELDS["hybrid, norm batch"]

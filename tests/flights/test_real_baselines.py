@@ -7,11 +7,11 @@ import jax
 import numpy as np
 import pytest
 
-from hybrid_jax.baselines import FrozenRates, HoldState
-from hybrid_jax.flight_scores import flight_errors, rmse_at
+from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.flights.cleaning import windows
 from hybrid_jax.flights.flight_csv import read_csv
-from hybrid_jax.multirotor import multirotor
+from hybrid_jax.flights.scores import flight_errors, rmse_at
 from hybrid_jax.trajectories import concatenate
 from hybrid_jax.vehicle import load_vehicle
 

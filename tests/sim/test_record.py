@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from experiments import make_flights
-from hybrid_jax.datasets import content_hash, load_dataset
+from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import record as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import Flights, fly, gone_wrong

@@ -1,0 +1,186 @@
+"""What each lane of a sweep starts from and is asked to do: models by seed, plans by size (paper, App. A)."""
+
+from dataclasses import replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import Int, PRNGKeyArray
+
+from experiments.paper.config import Config, Encoding, Stopping, column
+from hybrid_jax.adaptation.expert_augmentation import expert_augmented
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, guess, guess_off
+from hybrid_jax.integrate import SOLVERS
+from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.networks.views import restricted
+from hybrid_jax.runtime import SOONEST
+from hybrid_jax.sweep.lanes import count, lane, stack
+from hybrid_jax.training import fitting
+from hybrid_jax.training.fitting import FitState, Plan, make_plan
+from hybrid_jax.training.loss import REGULARISERS
+from hybrid_jax.training.objective import Settings
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import Vehicle
+
+FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
+FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # what f_d as a force and a torque is called in `restricted`
+PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
+
+
+def settings(config: Config) -> Settings:
+    """What all lanes of the experiment share."""
+    return Settings(config.batch_size, REGULARISERS.get(config.regulariser), SOLVERS[config.solver])
+
+
+def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
+    """The untrained models of all seeds, stacked. A seed gives the hybrid and its rivals the same parts."""
+
+    return jax.device_get(_fresh_fields(model, vehicle, config, np.arange(config.seeds)))
+
+
+# Equinox hands the options on to jax.jit, but does not declare them.
+@eqx.filter_jit(compiler_options=SOONEST)  # pyright: ignore[reportCallIssue]
+def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
+    def build(seed):
+        physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
+        network = _network(vehicle, config, _key(seed, NETWORK))
+        return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
+
+    return eqx.filter_vmap(build)(seeds)
+
+
+def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, Plan]:
+    """One lane a seed, on all source trajectories."""
+    return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
+
+
+def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, Plan]:
+    """Pre-training that goes on from the seeds' fields, with all its rates times a factor."""
+    rate, rule = _pretraining_rule(model, config)
+    everything = np.arange(config.source_train)
+    plan = _plan(model, config, rate, rule, everything, config.source_train)
+    plan = replace(plan, rates=jax.tree.map(lambda rate: factor * rate, plan.rates))
+    starts = _starts(fields, np.arange(config.seeds), PRETRAINING)
+    return starts, stack([plan] * config.seeds)
+
+
+def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, Plan]:
+    """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
+    subsets = [drawn(seed, config) for seed in range(config.seeds)]
+    one = lane(fields, 0)
+    plans = [
+        _with_offset(_plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size), one, config)
+        for size in config.sizes
+        for subset in subsets
+    ]
+    seeds = np.tile(np.arange(config.seeds), len(config.sizes))
+    return _starts(lane(fields, seeds), seeds, ADAPTATION), stack(plans)
+
+
+def augmentation(
+    experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
+) -> tuple[FitState, Plan]:
+    """One lane a seed: the encoder of Expert Augmentation, on source flights as flown and as the expert flies them.
+
+    Args:
+        experts: the pre-trained hybrids of all seeds.
+        past: the heads of the source windows, which the encoder will read.
+    """
+
+    def build(expert, seed):
+        key = _key(seed, ENCODER)
+        return expert_augmented(expert, past, key, box=encoding.box, hidden=encoding.hidden)
+
+    seeds, size = np.arange(config.seeds), 2 * config.source_train
+    learners = jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(experts, seeds))
+    rule, cap = encoding.stopping, min(encoding.max_epochs, config.max_epochs)
+    plan = make_plan(encoding.rate, np.arange(size), size, rule.minimum, rule.patience, cap, encoding.weight)
+    return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
+
+
+def drawn(seed: int, config: Config) -> np.ndarray:
+    """The order in which a seed takes its target trajectories from the pool."""
+    return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
+
+
+def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
+    """How a network sees rotor speeds."""
+    # Around hover, in tenths of it: then they are of the size of the other inputs.
+    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+    return {"hover": hover, "raw": InputScaling()}[config.inputs]
+
+
+def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
+    if config.guess_off is None:
+        body = guess(vehicle, key, low=config.guess[0], high=config.guess[1])
+    else:
+        body = guess_off(vehicle, key, config.guess_off)
+    return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs in FORCED else body
+
+
+def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
+    return restricted(
+        key,
+        inputs=config.residual_inputs,
+        outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
+        hidden=config.hidden,
+        norm=config.norm,
+        scaling=input_scaling(vehicle, config),
+        linear=config.residual_linear,
+        vehicle=vehicle,
+    )
+
+
+def _pretraining_rule(model: str, config: Config) -> tuple[float, Stopping]:
+    patience = config.patience
+    no_physics = model == "no_physics"
+    return config.rates.pretraining, patience.no_physics_pretraining if no_physics else patience.hybrid_pretraining
+
+
+def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[float, Stopping]:
+    """The rate of θ_d and the stopping rule of a size."""
+    rates, patience, i = config.rates, config.patience, column(size)
+    if model == "no_physics":
+        rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
+        return rate, patience.no_physics
+    return rates.hybrid[i], Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
+
+
+def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.ndarray, size: int) -> Plan:
+    physics: Any = config.rates.physics
+    network: Any = rate
+    rates = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
+    return make_plan(rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight)
+
+
+def _with_offset(plan: Plan, field: AbstractVectorField, config: Config) -> Plan:
+    """The plan with a rate of its own for v̇ and ω̇ in the output bias of the field's network, if one is asked for."""
+    offset = config.rates.offset
+    if offset is None:
+        return plan
+    learned = eqx.filter(field, trainable(field))
+    each = jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), plan.rates, learned)
+
+    def rate(path, old, part):
+        if jax.tree_util.keystr(path[-1:], simple=True) != "bias_out" or part.shape[-1] < FORCES:  # of a rotor's thrust
+            return old
+        others = part.shape[-1] - FORCES
+        return np.concatenate([np.full(others, old), np.full(FORCES, offset)]).astype(np.float32)
+
+    return replace(plan, rates=jax.tree_util.tree_map_with_path(rate, each, learned))
+
+
+def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> FitState:
+    assert count(fields) == len(seeds)
+    return jax.device_get(_begun(fields, seeds, purpose))
+
+
+@eqx.filter_jit
+def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: int) -> FitState:
+    return eqx.filter_vmap(lambda field, seed: fitting.start(field, _key(seed, purpose)))(fields, seeds)
+
+
+def _key(seed, purpose: int) -> PRNGKeyArray:
+    return jax.random.fold_in(jax.random.key(seed), purpose)

@@ -1,0 +1,290 @@
+"""The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
+
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from functools import partial
+from pathlib import Path
+from typing import Any, Literal, TypeVar, get_args
+
+import platformdirs
+
+from hybrid_jax import validation
+from hybrid_jax.training.loss import REGULARISERS
+
+TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
+# Options that change no result: where files lie, how often state is saved, on what machines it runs.
+UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
+Kind = TypeVar("Kind", bound="Config")
+Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
+ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
+ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
+RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
+assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
+Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
+FROM_ZERO: Rule = partial(validation.count, least=0)
+RULES: Mapping[str, Rule] = (
+    dict.fromkeys(("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"), validation.count)
+    | dict.fromkeys(("data_seed", "patience"), FROM_ZERO)
+    | dict.fromkeys(("noise", "regulariser_weight", "rates"), validation.not_negative)
+    | {"guess_off": validation.positive}
+)
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Adam's learning rates; a tuple has one for each of the sizes 100, 300, 500, 700, 1000."""
+
+    physics: float = 1e-2
+    """θ_p, in pre-training and fine-tuning."""
+    pretraining: float = 1e-4
+    """θ_d, both models."""
+    decay: tuple[float, ...] = ()
+    """Pre-training goes on from its best model with all its rates times each of these in turn; by default it ends."""
+    hybrid: tuple[float, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
+    """θ_d of the hybrid, fine-tuned and target-only."""
+    no_physics: tuple[float, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
+    """The network without physics, fine-tuned (the scan of the paper is damaged in the first four)."""
+    no_physics_target_only: float = 1e-4
+    """The network without physics, from a fresh start."""
+    offset: float | None = None
+    """v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default as the rest of
+    θ_d. A steady force is there alone, and at 1e-3 takes thousands of steps, in which the rest learns by heart."""
+
+
+@dataclass(frozen=True)
+class Stopping:
+    """At least `minimum` epochs, then stop after `patience` epochs without a better validation loss."""
+
+    minimum: int
+    patience: int
+
+
+@dataclass(frozen=True)
+class Patience:
+    """Early stopping; a tuple has one entry for each of the sizes 100, 300, 500, 700, 1000."""
+
+    hybrid_pretraining: Stopping = Stopping(100, 20)
+    no_physics_pretraining: Stopping = Stopping(300, 50)
+    hybrid_minimum: tuple[int, ...] = (100, 300, 300, 300, 100)
+    hybrid_patience: tuple[int, ...] = (20, 50, 50, 50, 20)
+    no_physics: Stopping = Stopping(250, 50)
+
+
+@dataclass(frozen=True)
+class Encoding:
+    """How Expert Augmentation learns to read θ_p off the past; the paper says no more than that it does."""
+
+    box: tuple[float, float] = (0.5, 2.0)
+    """θ_p of augmented flights: the source model's times a factor in this range, even in its logarithm."""
+    hidden: int = 128
+    """Units in each of the encoder's two hidden layers."""
+    rate: float = 1e-3
+    """Adam's learning rate."""
+    weight: float = 1.0
+    """Of the mean squared error of log θ̂_p beside the error of the prediction."""
+    stopping: Stopping = Stopping(100, 60)
+    """Early stopping, by the error of the prediction on source and augmented validation flights."""
+    max_epochs: int = 400
+    """Cap on the encoder's epochs."""
+
+
+@dataclass(frozen=True)
+class Run:
+    """Results are written to --out; flights and finished stages are kept in --cache and reused by any run that needs
+    the same ones.
+    """
+
+    preset: Literal["paper", "quick", "smoke"] = "paper"
+    """paper: the full protocol. quick: two seeds, two sizes, about three minutes. smoke: does everything work."""
+    out: Path = Path("runs")
+    """Folder for the report, the figures and the models; a folder of the experiment's name is made in it."""
+    cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
+    """Folder for flights, finished stages and compiled programs."""
+    fresh: bool = False
+    """Start anew: what a run has left in --out, and sweeps that were begun, are moved aside; nothing is deleted."""
+    saving: float = 0.02
+    """Share of a sweep's time that saving its state may take; what a kill can cost grows as this shrinks."""
+    seeds: int = 10
+    """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
+    distributed: bool = False
+    """Be one of several processes, on one machine or many, that share the lanes: start the same command for each.
+    Process 0 writes. Who is who says the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU) or the next three options."""
+    coordinator: str | None = None
+    """With --distributed: host:port of process 0, a port that is free there and that all can reach."""
+    processes: int | None = None
+    """With --distributed: how many there are."""
+    process_id: int | None = None
+    """With --distributed: which of them this is, from 0."""
+
+    def __post_init__(self):
+        if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
+            raise ValueError("--coordinator, --processes and --process-id need --distributed")
+        if self.seeds < 1:
+            raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
+        if not 0 < self.saving <= 1:
+            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
+
+    def described(self) -> dict[str, Any]:
+        """All that fixes the results: where files lie, how often state is saved and where it runs do not."""
+        return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
+
+
+@dataclass(frozen=True)
+class Config(Run):
+    """What all experiments in simulation share. Without options this is the paper's full protocol."""
+
+    sizes: tuple[int, ...] = TABLE_SIZES
+    """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
+    pool: int | None = None
+    """Target trajectories from which a seed draws its N; by default as many as the largest N."""
+    source_train: int = 10_000
+    """Source trajectories for pre-training."""
+    validation: int = 1000
+    """Validation trajectories, in the source and in the target."""
+    test: int = 1000
+    """Target test trajectories."""
+    data_seed: int = 0
+    """Seed of all flights."""
+    hidden: int = 64
+    """Hidden units of f_d."""
+    inputs: Literal["hover", "raw"] = "hover"
+    """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
+    norm: Literal["batch", "layer", "none"] = "batch"
+    """Normalisation of f_d's hidden layer."""
+    residual_inputs: ResidualInputs = "all"
+    """What f_d sees of the state: all; all but p_x, p_y; no yaw either; that and how near the ground each rotor is; or
+    altitude and what the body feels, no yaw."""
+    residual_outputs: ResidualOutputs = "all"
+    """What f_d adds to: all 13 derivatives; v̇ and ω̇ alone; to these as a force and a torque, so that Ix and Iy turn
+    what it says of ω̇ as well; or, besides, to the thrust of each rotor, by one network that all rotors share."""
+    residual_linear: bool = False
+    """A linear map goes past f_d's hidden layer, and both begin at zero."""
+    guess: tuple[float, float] = (0.8, 1.25)
+    """θ_p starts at nominal times a random factor in this range."""
+    guess_off: float | None = None
+    """Instead: at nominal times or over 1 + this, each of θ_p at random."""
+    noise: float = 0.0
+    """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
+    regulariser: RegulariserName = "trajectory_correlation"
+    """What keeps f_d from overwriting f_p."""
+    regulariser_weight: float = 1e-3
+    """λ."""
+    solver: Literal["rk4", "heun", "midpoint", "tsit5", "dopri5"] = "rk4"
+    """Integrator, one step for each input interval of 0.01 s."""
+    batch_size: int = 100
+    """Trajectories in a minibatch."""
+    max_epochs: int = 2000
+    """Cap; a run that hits it is marked in the report."""
+    rates: Rates = Rates()
+    patience: Patience = Patience()
+
+    def __post_init__(self):
+        Run.__post_init__(self)
+        check_numbers("--", self, RULES)
+        check_numbers("--rates.", self.rates, dict.fromkeys(("offset", "decay"), validation.positive))
+        factors("--guess", self.guess)
+        if not self.sizes or min(self.sizes) < self.batch_size:
+            raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
+        if self.norm == "batch" and self.batch_size < 2 and self.has_networks():
+            raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
+        if self.source_train < self.batch_size:
+            raise ValueError(f"--source-train must be at least --batch-size {self.batch_size}, got {self.source_train}")
+        if len(set(self.sizes)) < len(self.sizes):
+            raise ValueError(f"--sizes must be different, got {self.sizes}")
+        if self.pool is not None and self.pool < max(self.sizes):
+            raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
+        for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
+            group, entry = name.split(".")
+            if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
+                raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
+
+    def has_networks(self) -> bool:
+        """Whether anything that is trained holds f_d."""
+        return True
+
+    def pooled(self) -> int:
+        """The number of target trajectories from which a seed draws."""
+        return max(self.sizes) if self.pool is None else self.pool
+
+
+@dataclass(frozen=True)
+class AdaptationConfig(Config):
+    """Pre-train on source flight, adapt to the target with N short trajectories, test; all lanes are one sweep."""
+
+    models: tuple[Model, ...] = get_args(Model)
+    """Which models to compare. constant_disturbance: the source's hybrid, of which θ_p and a constant disturbance are
+    fitted by least squares."""
+    source_flights: Path | None = None
+    """A file of `python -m experiments.make_flights --domain source` to use; by default flights are made and cached."""
+    target_flights: Path | None = None
+    """The same for the target, with the splits train, validation and test."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--models", self.models)
+        if "no_physics" in self.models and self.residual_outputs != "all":
+            raise ValueError(
+                f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives, leave it out"
+            )
+
+    def has_networks(self) -> bool:
+        return set(self.models) != {"physics_only"}
+
+
+def distinct(option: str, names: Sequence[str]) -> None:
+    """Check an option that lists names.
+
+    Raises:
+        ValueError: no names, or one twice.
+    """
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
+
+def check_numbers(prefix: str, options: Any, rules: Mapping[str, Rule]) -> None:
+    """Check options, each by its rule: a number, a tuple of numbers, a group of either, or None for what is not given.
+
+    Raises:
+        ValueError: the first number that its rule refuses, by the name on the command line, which begins with prefix.
+    """
+    for name, rule in rules.items():
+        option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
+        if is_dataclass(value):
+            check_numbers(f"{option}.", value, dict.fromkeys((each.name for each in fields(value)), rule))
+        elif value is not None:
+            for number in value if isinstance(value, tuple) else (value,):
+                rule(option, number)
+
+
+def factors(option: str, value: tuple[float, float]) -> None:
+    """Check an option that is a range of factors.
+
+    Raises:
+        ValueError: not two finite numbers above 0, the lower one first.
+    """
+    if not 0 < value[0] < value[1] < math.inf:
+        raise ValueError(f"{option} must be two factors, low < high, above 0, got {value}")
+
+
+def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
+    """A configuration of a kind with what it shares with another one, but for its own sizes and the changes."""
+    shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
+    return kind(**shared | changes)
+
+
+def column(size: int) -> int:
+    """The column of the paper's table that is nearest to a size, by ratio."""
+    return min(range(len(TABLE_SIZES)), key=lambda i: max(size / TABLE_SIZES[i], TABLE_SIZES[i] / size))
+
+
+PAPER = AdaptationConfig()
+QUICK = replace(
+    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=("hybrid", "no_physics", "constant_disturbance"),
+    source_train=3000, validation=300, test=300, max_epochs=400,
+)  # fmt: skip
+SMOKE = replace(
+    PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=10, batch_size=20, max_epochs=3,
+    hidden=8,
+)  # fmt: skip
+PRESETS = {"paper": PAPER, "quick": QUICK, "smoke": SMOKE}

@@ -1,0 +1,140 @@
+"""Figures of flights: predicted paths over the ground (Figs. 2 and 4) and an example of the data (Fig. 7)."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from experiments.paper.figures import COLOURS, STYLE, colour
+from experiments.paper.rows import NAMES
+from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+
+NARROWEST = 0.2  # m, half the width of a view: a hovering vehicle is not magnified beyond it
+MARGIN = 1.6  # half the width of a view over the truth's own reach
+
+States = Float[np.ndarray, "t+1 13"]
+
+
+@mpl.rc_context(STYLE)
+def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], title: str) -> Figure:
+    """Figs. 2 and 4: one test flight in the horizontal plane, a panel for each N, every model against the truth.
+
+    The view is set by the truth alone; a prediction that leaves it is cut and said to leave.
+
+    Args:
+        truth: states from the start on.
+        predicted: N → model → its states from the same start; any number of them, also ones that are not finite.
+
+    Raises:
+        ValueError: no prediction, or states of another shape.
+    """
+    if not predicted:
+        raise ValueError("predicted must not be empty: there is nothing to draw")
+    truth = _states("truth", truth)
+    figure = Figure(figsize=(3.1 * max(len(predicted), 2), 4.1), layout="constrained")
+    panels = figure.subplots(1, len(predicted), sharey=True, squeeze=False)[0]
+    for axes, (n, models) in zip(panels, sorted(predicted.items()), strict=True):
+        _draw_paths(axes, truth, {name: _states(f"predicted[{n}][{name!r}]", x) for name, x in models.items()})
+        axes.set(title=f"N = {n} trajectories", xlabel="x [m]")
+    panels[0].set_ylabel("y [m]")
+    figure.suptitle(title, fontsize=12)
+    pairs = [pair for axes in panels for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
+    entries = {label: handle for handle, label in pairs}
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def example_flight(
+    states: States, inputs: Float[np.ndarray, "t 4"], dt: float, title: str = "An example flight of the data"
+) -> Figure:
+    """Fig. 7: the path in space, and altitude, speed, tilt and rotor speeds over time.
+
+    Args:
+        inputs: rotor speeds [rad/s], each held for dt [s].
+
+    Raises:
+        ValueError: states or inputs of another shape, or dt not positive.
+    """
+    states, inputs = _states("states", states), np.asarray(inputs, float)
+    shape = (len(states) - 1, INPUT_SIZE)
+    if inputs.shape != shape or not dt > 0:
+        raise ValueError(f"inputs must have the shape {shape} and dt be positive, got {inputs.shape} and {dt}")
+    time = dt * np.arange(len(states))
+    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    grid = figure.add_gridspec(4, 2, width_ratios=(1.15, 1))
+    _draw_space(figure.add_subplot(grid[:, 0], projection="3d"), states)
+    first = figure.add_subplot(grid[0, 1])
+    panels = [first, *(figure.add_subplot(grid[row, 1], sharex=first) for row in range(1, 4))]
+    speed = np.linalg.norm(states[:, VELOCITY], axis=1)
+    named = (("altitude\n[m]", states[:, POSITION][:, 2]), ("speed\n[m/s]", speed), ("tilt\n[°]", tilt(states)))
+    for axes, (label, values) in zip(panels, named, strict=False):
+        axes.plot(time, values, color=COLOURS["hybrid"])
+        axes.set_ylabel(label)
+        axes.tick_params(labelbottom=False)
+    _draw_rotors(panels[-1], time, inputs)
+    figure.align_ylabels(panels)
+    figure.suptitle(title, fontsize=12)
+    return figure
+
+
+def tilt(states: States) -> Float[np.ndarray, " t+1"]:
+    """The angle between body z and world z [°], from the unit quaternions (w, x, y, z)."""
+    quaternions = states[:, QUATERNION]
+    return np.degrees(2 * np.arctan2(np.hypot(*quaternions[:, 1:3].T), np.hypot(*quaternions[:, [0, 3]].T)))
+
+
+def _states(name: str, states: Any) -> States:
+    states = np.asarray(states, float)
+    if states.ndim != 2 or states.shape[1] != STATE_SIZE or len(states) < 2:
+        raise ValueError(f"{name} must have the shape (t + 1, {STATE_SIZE}) with t of at least 1, got {states.shape}")
+    return states
+
+
+def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
+    start, path = truth[0, :2], truth[:, :2]
+    centre = (path.min(axis=0) + path.max(axis=0)) / 2
+    half = max(NARROWEST, MARGIN * np.ptp(path, axis=0).max() / 2)
+    for name, states in models.items():
+        # A path ends where it first is not finite, or so far off that drawing it would overflow.
+        near = np.all(np.abs(states[:, :2] - centre) < 1e3 * half, axis=1)
+        drawn = states[: len(near) if near.all() else int(np.argmin(near)), :2]
+        label, tint = NAMES.get(name, name), colour(name)
+        axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=label)
+        _say_if_it_leaves(axes, states[:, :2], centre, half, label, tint)
+    axes.plot(*path.T, color="black", linestyle="--", linewidth=1.5, label="truth", zorder=4)
+    axes.plot(*start, marker="o", color="black", markerfacecolor="white", linestyle="", label="start", zorder=5)
+    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
+
+
+def _say_if_it_leaves(axes: Axes, path: np.ndarray, centre: np.ndarray, half: float, label: str, colour: str) -> None:
+    if np.all(np.abs(path - centre) <= half):
+        return
+    with np.errstate(over="ignore"):
+        off = np.linalg.norm(path - centre, axis=1).max()
+    words = f"{label} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{label} ends: not finite"
+    y = 0.02 + 0.12 * len(axes.texts)
+    axes.text(0.03, y, words, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
+
+
+def _draw_space(axes: Any, states: States) -> None:
+    x, y, z = states[:, POSITION].T
+    axes.plot(x, y, z, color=COLOURS["hybrid"])
+    axes.plot(x, y, np.zeros_like(z), color="0.7", linewidth=1)
+    axes.plot(x[:1], y[:1], z[:1], "o", color="black", markerfacecolor="white")
+    axes.text(x[0], y[0], z[0], "  start")
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title="Path (grey: its shadow on the ground)")
+    axes.set_zlim(bottom=0)
+    axes.locator_params(nbins=5)
+    axes.set_box_aspect(None, zoom=0.8)  # room for the label of z
+
+
+def _draw_rotors(axes: Axes, time: np.ndarray, inputs: np.ndarray) -> None:
+    for index, (name, tint) in enumerate(zip(INPUT_NAMES, COLOURS.values(), strict=False)):
+        axes.stairs(inputs[:, index], time, baseline=None, color=tint, label=name, linewidth=1)
+    axes.set(xlabel="time [s]", ylabel="rotors\n[rad/s]")
+    axes.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=7, columnspacing=1, handlelength=1, frameon=True)

@@ -1,0 +1,196 @@
+"""The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rich.console import Console
+
+from experiments.make_flights import chosen_flights, flights
+from experiments.paper.conditions import adaptation, annealing, fresh_fields, pretraining, settings
+from experiments.paper.config import AdaptationConfig, Config
+from experiments.paper.results import Lanes, rows_of, solution, trained
+from experiments.paper.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.sensors import measured
+from experiments.paper.solved import Solve, constant_disturbance, solved
+from experiments.runner.precompile import Ahead, blank
+from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.io.archive import Arrays
+from hybrid_jax.io.datasets import ARRAYS, Dataset
+from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sweep import hosts
+from hybrid_jax.sweep.training import Room, compile_evaluation, compile_sweep, evaluate
+from hybrid_jax.training.fitting import FitState
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import Vehicle
+
+EVERY = 10  # test flights are compared with the truth every 0.1 s
+SOLVED: Mapping[str, Solve] = {"constant_disturbance": constant_disturbance}  # models that are not trained
+
+
+@dataclass(frozen=True)
+class Study:
+    """What an experiment found: the flights, every trained lane, the rows, seconds by stage, and notes on these."""
+
+    source: Dataset
+    target: Dataset
+    lanes: list[Lanes]
+    rows: list[Row]
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+
+def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
+    """Run the protocol on a target domain; finished stages come from the cache.
+
+    Args:
+        vehicle: what the engineer knows of the vehicle; its nominal θ_p is where the models start from.
+    """
+    stages = stages_of(config, console)
+
+    def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
+        if file is not None:
+            return measured(from_first(lambda: chosen_flights(file, of, splits)), config.noise, config.data_seed)
+        return flown(of, splits, config, stages)
+
+    lanes: list[Lanes] = []
+    learned: dict[str, FitState] = {}
+    sources = dict.fromkeys(source_of(model) for model in config.models)
+    unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
+    with Ahead({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
+        source = get(config.source_flights, SOURCE, source_splits(config))
+        target = get(config.target_flights, domain, target_splits(config))
+        for model in config.models:
+            start = source_of(model)
+            if start not in learned:
+                programs.wait_for(start)
+                learned[start] = pretrained(start, vehicle, config, stages, source)
+                lanes.append(_tested(start, "source_only", learned[start], config, stages, target))
+            lanes += _adapted_lanes(model, learned[start].best, vehicle, config, stages, target)
+    rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
+    return Study(source, target, lanes, rows, stages.seconds, stages.notes())
+
+
+def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
+    """A model after pre-training on source flight, one lane a seed."""
+    shared = settings(config), source, room(config)
+    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
+    for factor in config.rates.decay:
+        lanes = annealing(model, found.best, factor, config)
+        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, *shared)
+    return found
+
+
+def adapted(
+    model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
+) -> FitState:
+    """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
+    lanes = adaptation(model, mode, fields, config)
+    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, room(config))
+
+
+def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
+    """The flights of a domain, from the cache or the simulator, as sensors of the configured noise see them."""
+    found = stages.timed(
+        f"flights {domain.name}",
+        lambda: from_first(lambda: flights(domain, splits, config.data_seed, config.cache)),
+    )
+    return measured(found, config.noise, config.data_seed)
+
+
+def from_first(read: Callable[[], Dataset]) -> Dataset:
+    """The dataset that `read` gives on process 0: the others need no file, and all learn from the same bits."""
+
+    def parts() -> tuple[Any, Arrays]:
+        found = read()
+        arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
+        return [
+            dict(found.metadata),
+            {name: windows.dt for name, windows in found.splits.items()},
+            found.origin,
+        ], arrays
+
+    (metadata, steps, origin), arrays = hosts.from_first(parts)
+    splits = {name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=dt) for name, dt in steps.items()}
+    return Dataset(splits, metadata, origin)
+
+
+def source_splits(config: Config) -> dict[str, SplitSpec]:
+    """What is flown in the source."""
+    return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
+
+
+def target_splits(config: Config) -> dict[str, SplitSpec]:
+    """What is flown in the target; the train split is the pool from which every seed draws."""
+    return adaptation_splits(config) | {"test": SplitSpec(config.test, 100)}
+
+
+def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
+    """What is flown in the target to adapt to."""
+    return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
+
+
+def room(config: Config) -> Room:
+    """Of all programs of a model: pre-training has fewer lanes, adaptation fewer windows, and both share one."""
+    return Room(config.seeds * len(config.sizes), max(config.source_train, config.pooled()))
+
+
+def source_of(model: str) -> str:
+    """The model whose pre-training an adaptation starts from."""
+    return SOURCE_OF.get(model, model)
+
+
+def _adapted_lanes(
+    model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
+) -> list[Lanes]:
+    """The lanes of a model after learning from the target: trained on, and anew, or solved."""
+    if model in SOLVED:
+        return [_solved(model, source, config, stages, target)]
+    starts = {"fine_tuned": source, "target_only": fresh_fields(model, vehicle, config)}
+    finals = {mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()}
+    return [_tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
+
+
+def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
+    """Compile all that training and testing a model will run: of windows and models, a program knows shapes alone."""
+    shared, fresh = settings(config), fresh_fields(model, vehicle, config)
+    source, target = (
+        {name: blank(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
+    )
+    before = pretraining(model, vehicle, config)
+    after = adaptation(model, "target_only", fresh, config)
+    for (states, plans), windows in ((before, source), (after, target)):
+        compile_sweep(states, plans, windows["train"], windows["validation"], shared, room(config))
+        compile_evaluation(states.best, target["test"], EVERY, shared, room(config))
+
+
+def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
+    errors = _errors(f"test {mode} {model}", final.best, config, stages, target)
+    return trained(model, mode, *places((0,) if mode == "source_only" else config.sizes, config), final, errors)
+
+
+def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
+    name = f"fine_tuned {model}"
+    found = solved(f"{name} {domain_name(target)}", SOLVED[model], source, config, stages, target)
+    errors = _errors(f"test {name}", found.fields, config, stages, target)
+    return solution(model, *places(config.sizes, config), found, errors)
+
+
+def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> np.ndarray:
+    """L^T_MSE of stacked fields on the test flights."""
+    return stages.timed(stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config), room(config)))
+
+
+def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:
+    """The size and the seed of each lane, in the order in which `conditions` makes them."""
+    return [n for n in sizes for _ in range(config.seeds)], [*range(config.seeds)] * len(sizes)
+
+
+def domain_name(dataset: Dataset) -> str:
+    """Where a dataset was flown."""
+    return str(dataset.config["domain"])

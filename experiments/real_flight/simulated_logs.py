@@ -1,0 +1,60 @@
+"""Logs of simulated flights in the library's own CSV format, to try what real logs go through."""
+
+import gzip
+import io
+from dataclasses import asdict
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from hybrid_jax.flights.log import COLUMNS
+from hybrid_jax.io.files import write_whole
+from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.flight import DT, fly, gone_wrong
+from hybrid_jax.vehicle import IRIS, Vehicle
+
+FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}
+SECONDS = 8.0
+
+
+def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
+    """Fly before and after a change of the inertia; write vehicle.toml and a folder of logs for each.
+
+    Returns:
+        The vehicle file, and the folders by name: source and target.
+    """
+    vehicle = folder / "vehicle.toml"
+    write_whole(vehicle, vehicle_toml(IRIS))
+    for name, (domain, count) in FLIGHTS.items():
+        for index, content in enumerate(_flights(domain, count, seed)):
+            write_whole(folder / name / f"flight_{index:02d}.csv.gz", content)
+    return vehicle, {name: folder / name for name in FLIGHTS}
+
+
+def vehicle_toml(vehicle: Vehicle) -> str:
+    """A vehicle file with the constants of a vehicle."""
+
+    def text(value) -> str:
+        if isinstance(value, tuple):
+            return f"[{', '.join(map(text, value))}]"
+        return f'"{value}"' if isinstance(value, str) else repr(value)
+
+    return "[vehicle]\n" + "".join(f"{name} = {text(value)}\n" for name, value in asdict(vehicle).items())
+
+
+def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:
+    """A log as flight-log CSV, gzip, the same bytes for the same numbers."""
+    text = io.StringIO()
+    np.savetxt(text, np.column_stack([t, x, u]), "%.9g", ",", header=",".join(COLUMNS), comments="")
+    return gzip.compress(text.getvalue().encode(), mtime=0)
+
+
+def _flights(domain: Domain, count: int, seed: int) -> list[bytes]:
+    # A flight that goes wrong is left out, so more are flown; they come by the chunk in any case.
+    found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
+    sound = np.flatnonzero(~gone_wrong(found.states))[:count]
+    states, inputs = np.asarray(found.states), np.asarray(found.inputs)
+    times = DT * np.arange(states.shape[1])
+    # The last inputs are held on: a log says of each sample what the rotors do next.
+    return [csv_of(times, states[i], inputs[i][[*range(len(times) - 1), -1]]) for i in sound]

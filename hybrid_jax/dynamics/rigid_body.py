@@ -1,0 +1,186 @@
+"""f_p: the Newton–Euler equations of a quadrotor with unknown Ix, Iy and k (paper, Eq. 10)."""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from hybrid_jax import rotation, validation
+from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, evaluate_batch, taken_up
+from hybrid_jax.rotation import Rows
+from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.vehicle import Vehicle
+
+LEARNED = ("Ix", "Iy", "k")
+
+
+class AbstractRigidBody(AbstractVectorField):
+    """A field whose state of 13 is that of state.py and whose parameters have physical units."""
+
+    @abstractmethod
+    def theta(self) -> dict[str, Array]:
+        """The learned parameters in SI units, by name; each entry grows with the parameter that holds it."""
+
+
+class RigidBody(AbstractRigidBody):
+    """A rigid body carried by four rotors, with no drag, ground effect or wind.
+
+    θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
+    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+
+    Attributes:
+        log_ratios: log(Ix / nominal), log(Iy / nominal), log(k / nominal).
+        vehicle: the known constants and the nominal values.
+
+    Raises:
+        ValueError: other parameters than Ix, Iy, k, or no vehicle.
+    """
+
+    log_ratios: dict[str, Float[Array, ""]]
+    vehicle: Vehicle = eqx.field(static=True)
+
+    def __check_init__(self):
+        if not isinstance(self.log_ratios, dict) or set(self.log_ratios) != set(LEARNED):
+            raise ValueError(f"log_ratios must hold {', '.join(LEARNED)}, got {validation.shown(self.log_ratios)}")
+        if not isinstance(self.vehicle, Vehicle):
+            raise ValueError(f"vehicle must be a Vehicle, got {validation.shown(self.vehicle)}")
+
+    def theta(self) -> dict[str, Float[Array, ""]]:
+        """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
+        return {name: value * jnp.exp(self.log_ratios[name]) for name, value in nominal(self.vehicle).items()}
+
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+        return self.of_rows(tuple(x), tuple(u))
+
+    def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+        """ẋ from the entries of x and u one by one, so that nothing is put together to be taken apart again."""
+        q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
+        theta = self.theta()
+        thrust, torque = _wrench(self.vehicle, theta["k"], u)
+        gravity = jnp.reshape(jnp.array([0.0, 0.0, -self.vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
+        acceleration = (thrust / self.vehicle.mass) * rotation.body_z(q) + gravity
+        inertia = (theta["Ix"], theta["Iy"], self.vehicle.inertia[2])
+        return jnp.concatenate(
+            [jnp.stack(v), rotation.derivative(q, omega), acceleration, euler(inertia, torque, omega)]
+        )
+
+
+class ForcedBody(RigidBody):
+    """A rigid body to which a residual is a force and a torque, not accelerations.
+
+    What the residual says of v̇ and ω̇ holds at the nominal inertia; at another, ω̇ is nominal / I times that. So what was
+    learned of the air and the ground stays true of a vehicle whose inertia changes. The mass is known.
+    """
+
+    def yielding(self) -> Float[Array, " 13"]:
+        """By what ẋ of a residual is multiplied: ones, but nominal / I for ω̇ about x and y."""
+        easier = [jnp.exp(-self.log_ratios[name]) for name in ("Ix", "Iy")]
+        return jnp.ones(STATE_SIZE, jnp.result_type(*easier)).at[BODY_RATES.start : -1].set(jnp.stack(easier))
+
+
+@taken_up.register
+def _(field: ForcedBody, x, more):
+    return jnp.reshape(field.yielding(), (-1,) + (1,) * (more.ndim - 1)) * more
+
+
+def rigid_body(vehicle: Vehicle) -> RigidBody:
+    """The rigid body at the vehicle's nominal θ_p."""
+    return RigidBody({name: jnp.zeros(()) for name in LEARNED}, vehicle)
+
+
+def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
+    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm.
+
+    Raises:
+        ValueError: not 0 < low <= high.
+    """
+    if not 0 < low <= high < np.inf:
+        raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
+    factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
+    return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
+
+
+def guess_off(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
+    """The rigid body with each of θ_p at nominal times or over 1 + off, at random."""
+    signs = jax.random.rademacher(key, (len(LEARNED),), float)
+    return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
+
+
+def moves_a_rigid_body(field) -> bool:
+    """Whether a rigid body is anywhere in a field, so that a state of 13 is that of state.py."""
+    parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
+    return any(isinstance(part, AbstractRigidBody) for part in parts)
+
+
+def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
+    """Refuse starts of a rigid body whose quaternion is no rotation; of another field's nothing is known.
+
+    Raises:
+        ValueError: the place of the first and its norm.
+    """
+    if x0.shape[-1:] == (STATE_SIZE,) and moves_a_rigid_body(field):
+        validation.unit_quaternions("x0", x0)
+
+
+def nominal(vehicle: Vehicle) -> dict[str, float]:
+    """The vehicle's own Ix, Iy [kg m²] and k [N/(rad/s)²]."""
+    return {"Ix": vehicle.inertia[0], "Iy": vehicle.inertia[1], "k": vehicle.thrust_coefficient}
+
+
+def _wrench(vehicle: Vehicle, k: Float[Array, ""], u: Rows):
+    """Total thrust [N] and body torque [N m] of the rotors: thrust × arm, and the reaction torque c_m u²."""
+    squares = [speed * speed for speed in u]
+
+    def total(weights):
+        return sum(weight * square for weight, square in zip(weights, squares, strict=True))
+
+    x, y = zip(*vehicle.rotor_positions, strict=True)
+    torque = k * total(y), -k * total(x), vehicle.torque_coefficient * total(vehicle.spin)
+    return k * sum(squares), torque
+
+
+def euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
+    """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
+    (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
+    return jnp.stack(
+        [(tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz]
+    )
+
+
+@deploy_batch.register
+def _(field: RigidBody, x, u):
+    return field(x, u)
+
+
+@evaluate_batch.register
+def _(field: RigidBody, x, u):
+    return _columns(field, x, u)
+
+
+@jax.custom_vjp
+def _columns(field: RigidBody, x: Float[Array, "13 b"], u: Float[Array, "4 b"]) -> Float[Array, "13 b"]:
+    """The field on a minibatch.
+
+    Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over
+    the minibatch once for each place where it stands. Here x and u are kept, and each parameter is summed once.
+    """
+    return field(x, u)
+
+
+def _columns_forward(field, x, u):
+    return field(x, u), (field, x, u)
+
+
+def _columns_backward(saved, d_derivative: Float[Array, "13 b"]):
+    field, x, u = saved
+    own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), field)  # one for each column
+    d_field, d_x, d_u = jax.vjp(RigidBody.of_rows, own, tuple(x), tuple(u))[1](d_derivative)
+    leaves, structure = jax.tree.flatten(d_field)
+    sums = jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype)
+    return jax.tree.unflatten(structure, tuple(sums)), jnp.stack(d_x), jnp.stack(d_u)
+
+
+_columns.defvjp(_columns_forward, _columns_backward)

@@ -1,0 +1,115 @@
+"""What is nominal of a multirotor beyond a rigid body, and the names, shapes and units of what a field may learn."""
+
+import math
+from dataclasses import dataclass
+
+from hybrid_jax import validation
+from hybrid_jax.vehicle import Vehicle
+
+SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
+POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
+SIGNED = {
+    "torque_gain": (3,),
+    "centre_of_mass": (2,),
+    "drag": (3,),
+    "cable_pull": (2,),
+    "aerodynamic_moment": (3, 3),
+    "rate_damping": (3,),
+    "velocity_gain": (3,),
+    "velocity_lag": (),
+}
+SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
+
+
+Three = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Nominal values of what a rigid body leaves out; by default there is none of it. Body frame, SI units.
+
+    Attributes:
+        torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
+        centre_of_mass: (x, y) in the frame of the rotors' positions [m].
+        drag: D [N s/m].
+        cable_pull: C, one over how far below the centre of mass a cable pulls, along x and along y [1/m].
+        aerodynamic_moment: A, one row for each of the three moments [N s].
+        rate_damping: B [N m s].
+        velocity_gain: S, of the position's derivative over the velocity in a log.
+        velocity_lag: λ, by which a log's velocity follows what pushes the vehicle across its thrust [s].
+        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
+
+    Raises:
+        ValueError: a term of another shape, or that is not finite.
+    """
+
+    torque_gain: Three = (1.0, 1.0, 1.0)
+    centre_of_mass: tuple[float, float] = (0.0, 0.0)
+    drag: Three = (0.0, 0.0, 0.0)
+    cable_pull: tuple[float, float] = (0.0, 0.0)
+    aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    rate_damping: Three = (0.0, 0.0, 0.0)
+    velocity_gain: Three = (1.0, 1.0, 1.0)
+    velocity_lag: float = 0.0
+    motor_time_constant: float = 0.0
+
+    def __post_init__(self):
+        for name, shape in SIGNED.items():
+            object.__setattr__(self, name, _floats(name, getattr(self, name), shape))
+        validation.not_negative("motor_time_constant", self.motor_time_constant)
+
+
+def check_names(learn) -> None:
+    """Refuse names of what cannot be learned, or not at once.
+
+    Raises:
+        ValueError: the first such name, and which ones there are.
+    """
+    for name in learn:
+        if name not in tuple(SHAPES):
+            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {validation.shown(name)}")
+    if len(set(learn)) != len(tuple(learn)):
+        raise ValueError(f"learn names something twice: {', '.join(learn)}")
+    if {"k", "k_rotors"} <= set(learn):
+        raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
+
+
+def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
+    """The nominal value of everything in `SHAPES`, number by number; SI units."""
+    ix, iy, iz = ((moment,) for moment in vehicle.inertia)
+    k = vehicle.thrust_coefficient
+    own = {"Ix": ix, "Iy": iy, "Iz": iz, "k": (k,), "k_rotors": (k,) * 4}
+    own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
+    return own | {name: _flat(getattr(terms, name)) for name in SIGNED}
+
+
+def units_of(vehicle: Vehicle) -> dict[str, float]:
+    """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
+    weight = vehicle.mass * vehicle.gravity
+    arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / 4
+    return {
+        "torque_gain": 1.0,
+        "centre_of_mass": arm,
+        "drag": weight / SPEED,
+        "cable_pull": 1 / arm,
+        "aerodynamic_moment": weight * arm / SPEED,
+        "rate_damping": weight * arm / RATE,
+        "velocity_gain": 1.0,
+        "velocity_lag": 1.0,
+    }
+
+
+def _flat(value) -> tuple[float, ...]:
+    return tuple(number for row in value for number in _flat(row)) if isinstance(value, tuple) else (value,)
+
+
+def _floats(name: str, value, shape: tuple[int, ...]):
+    """Python's own floats, alone or in nested tuples, which can be hashed and written to files."""
+    if not shape:
+        validation.number(name, value)
+        return float(value)
+    if not isinstance(value, tuple) or len(value) != shape[0]:
+        raise ValueError(
+            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {validation.shown(value)}"
+        )
+    return tuple(_floats(name, part, shape[1:]) for part in value)

@@ -1,0 +1,204 @@
+"""Trajectories of a vector field under inputs that are held over each interval, by any diffrax solver.
+
+One long solve that looks its input up by time is silently wrong: a stage at the end of a step reads the next input.
+So an interval is a step of its own, with its input as `args`, and a `scan` goes over the intervals.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import validation
+from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, evaluate_batch
+
+Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
+
+
+# A program is traced once for all stages of a step, not once for each; the compiler puts it in line again.
+_evaluate, _deploy = eqx.filter_jit(evaluate_batch), eqx.filter_jit(deploy_batch)
+
+
+class RK4(diffrax.AbstractSolver):
+    """The classical fourth-order Runge–Kutta method (Kutta 1901), which diffrax does not ship; fixed steps only."""
+
+    term_structure: ClassVar = diffrax.AbstractTerm
+    interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def order(self, terms):
+        return 4
+
+    def init(self, terms, t0, t1, y0, args):
+        return None
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        half, middle = (t1 - t0) / 2, (t0 + t1) / 2
+        k1 = terms.vf(t0, y0, args)
+        k2 = terms.vf(middle, y0 + half * k1, args)
+        k3 = terms.vf(middle, y0 + half * k2, args)
+        k4 = terms.vf(t1, y0 + 2 * half * k3, args)
+        y1 = y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+    def func(self, terms, t0, y0, args):
+        return terms.vf(t0, y0, args)
+
+
+def integrate(
+    derivative: Derivative,
+    x0: Float[Array, " d *b"],
+    u: Float[Array, "t m *b"],
+    dt: float,
+    solver: diffrax.AbstractSolver,
+    substeps: int = 1,
+) -> Float[Array, "t d *b"]:
+    """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
+    solver = _bounded(solver)
+    term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    begin, end = 0.0, dt / substeps
+    if isinstance(solver, diffrax.AbstractImplicitSolver):
+        begin, end = jnp.asarray(begin), jnp.asarray(end)  # its root finder accepts no plain numbers
+
+    def interval(x, held):
+        # The solver starts afresh in each interval: the input jumped, so nothing may be reused from the last one.
+        started = x, solver.init(term, begin, end, x, held)
+
+        def step(carry, _):
+            x, _, _, state, _ = solver.step(term, begin, end, carry[0], held, carry[1], made_jump=False)
+            return (x, state), None
+
+        # Training takes one step: that program has no loop in it. Many, written out, would take minutes to compile.
+        (x, _), _ = step(started, None) if substeps == 1 else jax.lax.scan(step, started, length=substeps)
+        return x, x
+
+    return jax.lax.scan(interval, x0, u)[1]
+
+
+def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
+    """The solver with its stages in a loop of bounded length.
+
+    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`,
+    which is where the lanes of a sweep run.
+    """
+    if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
+        return dataclasses.replace(solver, scan_kind="bounded")
+    return solver
+
+
+def rollout(
+    field: AbstractVectorField,
+    x0: Float[Array | np.ndarray, " d"],
+    u: Float[Array | np.ndarray, "t m"],
+    dt: float,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+) -> Float[Array, "t d"]:
+    """The trajectory of a field as deployed: x[i] is the state (i + 1) dt [s] after x0; u[i] is held until then.
+
+    One that diverges goes on as infinity or NaN, here as in compiled code; `Model.predict` raises.
+
+    Raises:
+        ValueError: an argument of the wrong shape or type, or, where its numbers are known, one that is not finite; dt
+            or substeps that are not positive; or a field that cannot take x0 and u, or returns no ẋ of the shape of x0.
+    """
+    x0, u, solver = checked(field, x0, u, dt, solver, substeps)
+    return integrate(field, x0, u, dt, solver, substeps)
+
+
+def rollout_batch(
+    field: AbstractVectorField,
+    x0: Float[Array | np.ndarray, "n d"],
+    u: Float[Array | np.ndarray, "n t m"],
+    dt: float,
+    solver: diffrax.AbstractSolver | None = None,
+    substeps: int = 1,
+) -> Float[Array, "n t d"]:
+    """`rollout` of each of n windows.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
+    if isinstance(solver, diffrax.AbstractImplicitSolver):  # all windows at once would be one large system to it
+        return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
+    columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
+    states = integrate(lambda x, held: _deploy(field, x, held), columns, held, dt, solver, substeps)
+    return jnp.moveaxis(states, -1, 0)
+
+
+def checked(
+    field, x0, u, dt, solver, substeps: int = 1, *, windows: bool = False
+) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], diffrax.AbstractSolver]:
+    """x0 in the precision of ẋ, u, and the solver or the default one.
+
+    Raises:
+        ValueError: as `rollout`.
+    """
+    x0, u = validation.floating("x0", x0), validation.floating("u", u)
+    expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
+    if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
+        raise ValueError(f"{expected} expected, got shapes {x0.shape} and {u.shape}")
+    validation.positive("dt", dt, "a positive number of seconds")
+    validation.count("substeps", substeps)
+    solver = RK4() if solver is None else solver
+    if not isinstance(solver, diffrax.AbstractSolver):
+        # An import, as `hybrid_jax.rollout.SOLVERS` would be looked for in the function of that name.
+        raise ValueError(
+            f"solver must be one of diffrax or `from hybrid_jax.rollout import SOLVERS`, got {validation.shown(solver)}"
+        )
+    slope = check_field(
+        field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
+    )
+    return x0.astype(jnp.result_type(x0.dtype, slope.dtype)), u, solver
+
+
+def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
+    """Shape and type of ẋ = field(x, u), for a state and an input of which nothing else is known.
+
+    Raises:
+        ValueError: the field cannot take them, or returns no ẋ of the shape of x.
+    """
+    name = getattr(field, "__name__", type(field).__name__)
+    given = f"a state {x.shape} and an input {u.shape}"
+    try:
+        slope = eqx.filter_eval_shape(field, x, u)
+    except Exception as error:  # the field may be anybody's code
+        said = f"{type(error).__name__}: {validation.one_line(error)}"
+        raise ValueError(f"field: {name} does not take {given}: {said}") from error
+    if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
+        found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__
+        raise ValueError(f"field: {name} must return a derivative {x.shape} for {given}, returned {found}")
+    return slope
+
+
+def rollout_minibatch(
+    field: AbstractVectorField,
+    x0: Float[Array, "d b"],
+    u: Float[Array, "t m b"],
+    dt: float,
+    solver: diffrax.AbstractSolver,
+    substeps: int = 1,
+) -> Float[Array, "t d b"]:
+    """The trajectories of a minibatch as in training, features first: each evaluation sees the whole minibatch."""
+    return integrate(lambda x, held: _evaluate(field, x, held), x0, u, dt, solver, substeps)
+
+
+def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
+    """The (state, input) pairs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
+    starts = jnp.concatenate([x0[None], x[:-1]])
+    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], -1) for a in (starts, u))
+
+
+SOLVERS: dict[str, diffrax.AbstractSolver] = {
+    "rk4": RK4(),
+    "heun": diffrax.Heun(),
+    "midpoint": diffrax.Midpoint(),
+    "tsit5": diffrax.Tsit5(),
+    "dopri5": diffrax.Dopri5(),
+}

@@ -1,0 +1,131 @@
+"""A loss in which every channel of the state counts alike, whatever its unit, and an outlier does not count for all.
+
+Without weights an error of 1 rad/s in the body rates outweighs one of 1 cm in position ten thousand times. Each channel
+is divided by its error under a simple baseline, so that 1 means: no better than that.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import validation
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.integrate import rollout_batch, rollout_minibatch
+from hybrid_jax.metrics import mean_over
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.training.loss import Minibatch
+from hybrid_jax.training.objective import Prediction, Settings
+from hybrid_jax.trajectories import Trajectories, check
+
+MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
+
+
+@dataclass(frozen=True)
+class Channel:
+    """Entries start … stop − 1 of the state, one vector, and the length of its error that counts as 1.
+
+    Raises:
+        ValueError: no entries, or a scale that is not positive.
+    """
+
+    start: int
+    stop: int
+    scale: float
+
+    def __post_init__(self):
+        validation.count("start", self.start, least=0)
+        validation.count("stop", self.stop, least=self.start + 1)
+        validation.positive("scale", self.scale)
+
+
+@dataclass(frozen=True)
+class ChannelPrediction:
+    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg; judged without the latter.
+
+    ρ(r) = r² up to `huber`, and 2 huber r − huber² beyond (Huber 1964, doubled); of the length of a channel's error, so
+    that no direction is preferred. Without `huber` it is r² throughout.
+
+    Raises:
+        ValueError: no channels, or a threshold that is not positive.
+    """
+
+    channels: tuple[Channel, ...]
+    huber: float | None = None
+
+    def __post_init__(self):
+        if not isinstance(self.channels, tuple) or not self.channels:
+            raise ValueError(f"channels must be a tuple of some Channel, got {validation.shown(self.channels)}")
+        if self.huber is not None:
+            validation.positive("huber", self.huber)
+
+    def prepare(self, windows: Trajectories, name: str) -> Trajectories:
+        widest = max(channel.stop for channel in self.channels)
+        if check(windows, name).x.shape[-1] < widest:
+            raise ValueError(f"{name}: states of at least {widest} numbers expected, got {windows.x.shape[-1]}")
+        return windows
+
+    def batch(self, picked: Trajectories, settings: Settings) -> Minibatch:
+        return Prediction().batch(picked, settings)
+
+    def loss(self, field: AbstractVectorField, batch: Minibatch, settings: Settings, weight: Float[Array, ""]):
+        predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
+        value = jnp.mean(self.error(jnp.moveaxis(predicted - batch.x, 1, -1)))
+        if settings.regulariser is not None and isinstance(field, Hybrid):
+            value = value + weight * settings.regulariser(field, batch, predicted)
+        return value, predicted
+
+    def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
+        return Prediction().observe(field, batch, seen)
+
+    def validate(self, field: AbstractVectorField, data: Trajectories, settings: Settings) -> Float[Array, ""]:
+        def errors(windows: Trajectories) -> Float[Array, " n"]:
+            predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, settings.solver)
+            return jnp.mean(self.error(predicted - jnp.asarray(windows.x)), axis=-1)
+
+        return mean_over(data, errors)
+
+    def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
+        """The sum over channels of what one error counts."""
+
+        def one(channel: Channel):
+            square = jnp.sum(jnp.square(difference[..., channel.start : channel.stop] / channel.scale), axis=-1)
+            return square if self.huber is None else _huber(square, self.huber)
+
+        return sum(map(one, self.channels[1:]), one(self.channels[0]))
+
+
+def channels_from(
+    baseline: AbstractVectorField,
+    windows: Trajectories,
+    parts: Mapping[str, slice] | None = None,
+) -> tuple[Channel, ...]:
+    """Channels scaled by what a baseline, such as one of baselines.py, gets wrong by the end of the windows (RMS).
+
+    Args:
+        parts: the entries of each channel; by default a multirotor's.
+
+    Raises:
+        ValueError: windows that are malformed, or a channel in which the baseline makes no error.
+    """
+    check(windows, "windows")
+    predicted = eqx.filter_jit(rollout_batch)(baseline, windows.x0, windows.u, windows.dt)
+    difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
+
+    def channel(name: str, part: slice) -> Channel:
+        scale = float(np.sqrt(np.mean(np.sum(np.square(difference[:, part]), axis=-1))))
+        if not 0 < scale < np.inf:
+            raise ValueError(f"baseline: its error in {name} is {scale}, of no use as a measure")
+        return Channel(part.start, part.stop, scale)
+
+    return tuple(channel(name, part) for name, part in (MULTIROTOR if parts is None else parts).items())
+
+
+def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
+    """ρ(r) from r². Where r² is used, the root is of something else: its slope at zero is infinite."""
+    far = square > threshold**2
+    length = jnp.sqrt(jnp.where(far, square, 1.0))
+    return jnp.where(far, 2 * threshold * length - threshold**2, square)

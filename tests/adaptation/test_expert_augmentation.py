@@ -1,0 +1,107 @@
+"""Laws of Expert Augmentation, on a pendulum whose length an encoder reads off the past."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import LENGTH, pendulum, swings
+
+from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
+from hybrid_jax.adaptation.expert_augmentation import REAL, Augmentation, expert_augmented, prediction_mse
+from hybrid_jax.integrate import rollout
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.trajectories import split
+
+PAST = 6
+OBJECTIVE = Augmentation(PAST, seed=3)
+SETTINGS = Settings(100, objective=OBJECTIVE)
+KEY = jax.random.key(0)
+
+
+def flights(count, seed, length=LENGTH):
+    """Windows of an undamped pendulum: the past, then as many intervals to predict."""
+    return swings(count, steps=2 * PAST, seed=seed, damping=0.0, length=length)
+
+
+WINDOWS = flights(1000, seed=0)
+
+
+def expert(box=(0.5, 2.0), hidden=32):
+    """An untrained network that says nothing beside the right length: the source model could not be better."""
+    network = residual_network(2, 1, KEY, hidden=4)
+    silent = eqx.tree_at(lambda net: (net.weight_out, net.bias_out), network, (jnp.zeros((2, 4)), jnp.zeros(2)))
+    return expert_augmented(Hybrid(pendulum(), silent), split(WINDOWS, PAST)[0], KEY, box=box, hidden=hidden)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    rules = {"min_epochs": 60, "patience": 20, "max_epochs": 60, "regulariser_weight": 1.0}
+    validation = flights(100, seed=1)
+    return fit(expert(), WINDOWS, validation, KEY, rates=3e-3, settings=SETTINGS, **rules).best
+
+
+def lengths(field, windows):
+    """The lengths that an encoder reads off the heads of windows [m]."""
+    return np.exp(np.asarray(jax.vmap(field.estimate)(split(windows, PAST)[0])))[:, 0]
+
+
+def test_the_length_is_recovered_on_augmented_flights(trained):
+    data = OBJECTIVE.prepare(flights(200, seed=2), "test")[200:]
+    flown, theta = jax.vmap(lambda one: OBJECTIVE.flown(trained, one, SETTINGS))(data)
+    off = np.log(lengths(trained, flown)) - np.asarray(theta)[:, 0]
+    # Lengths are drawn from ±69 %, 40 % rms; a swing through rest says little, so the bound is on the median.
+    assert np.median(np.abs(off)) < 0.08
+    assert np.abs(np.mean(off)) < 0.08
+
+
+@pytest.mark.parametrize("factor", [0.7, 1.4])
+def test_what_is_read_moves_to_a_changed_vehicle_and_predicts_it(trained, factor):
+    target = flights(200, seed=4, length=factor * LENGTH)
+    assert np.median(lengths(trained, target)) == pytest.approx(factor * LENGTH, rel=0.1)
+    alone = deployed_mse(trained.expert.field, split(target, PAST)[1])
+    assert prediction_mse(trained, target, PAST) < 0.5 * alone
+
+
+def test_a_box_of_one_point_leaves_the_source_model():
+    point = expert(box=(1.0, 1.0))
+    past, future = split(WINDOWS, PAST)
+    predicted = jax.vmap(point.predict)(past, future.u)
+    alone = jax.vmap(lambda x0, u: rollout(point.expert.field, x0, u, WINDOWS.dt))(future.x0, future.u)
+    np.testing.assert_array_equal(predicted, alone)
+
+
+@pytest.mark.parametrize("size", [1.0, 1e6])
+def test_no_past_leads_out_of_the_box(size):
+    wild = jax.tree.map(lambda leaf: size * leaf, split(WINDOWS, PAST)[0])
+    found = np.asarray(jax.vmap(expert().estimate)(wild))
+    assert (np.abs(found - np.log(LENGTH)) <= np.log(2) + 1e-6).all()
+
+
+def test_every_window_is_learned_from_as_flown_and_as_the_expert_flies_it():
+    model = expert()
+    data = OBJECTIVE.prepare(WINDOWS[:10], "train")
+    assert list(data.ticket) == [REAL] * 10 + list(range(10))
+    flown, theta = jax.vmap(lambda one: OBJECTIVE.flown(model, one, SETTINGS))(data)
+    np.testing.assert_array_equal(flown.x[:10], WINDOWS.x[:10])
+    np.testing.assert_allclose(theta[:10], np.log(LENGTH), rtol=1e-6)
+    assert len(np.unique(theta[10:])) == 10
+    np.testing.assert_array_equal(flown.u[10:], WINDOWS.u[:10])
+    other = jax.vmap(lambda theta, one: rollout(model.flying(theta), one.x0, one.u, one.dt))(theta[10:], WINDOWS[:10])
+    np.testing.assert_array_equal(flown.x[10:], other)
+
+
+def test_the_expert_stays_as_it_is_and_the_whole_survives_a_file(trained, tmp_path):
+    assert eqx.tree_equal(trained.expert, expert().expert)
+    save(tmp_path / "model.npz", trained)
+    model = load(tmp_path / "model.npz")
+    assert eqx.tree_equal(model.field, trained)
+    with pytest.raises(ValueError, match="the model is a ExpertAugmented, which needs more than x0 and u"):
+        model.predict(WINDOWS.x0, WINDOWS.u, WINDOWS.dt)
+
+
+def test_bad_input_is_refused():
+    with pytest.raises(ValueError, match=r"train: windows of 12 intervals, more than past=12 expected"):
+        Augmentation(12).prepare(WINDOWS, "train")
+    with pytest.raises(ValueError, match=r"box must be two factors, 0 < low <= high, got \(2.0, 0.5\)"):
+        expert(box=(2.0, 0.5))

@@ -1,0 +1,157 @@
+"""Intervals of a multirotor's terms, entry by entry, and of losses that weigh channels and outliers."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from test_least_squares import Push, pushes
+
+from hybrid_jax import rotation
+from hybrid_jax.adaptation.least_squares import fit_physics, parametrise, residual
+from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
+from hybrid_jax.dynamics.rigid_body import RigidBody
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.training.channels import Channel, ChannelPrediction
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import IRIS
+
+LEARN = ("Ix", "k_rotors", "drag")
+ERRORS = np.arange(1, 9) / 100  # in the order of the leaves: Ix, drag, k_rotors
+Z = 1.959964  # of 95 %, from the normal distribution's table
+
+
+@pytest.mark.parametrize("wrap", [lambda field: field, lambda field: Hybrid(field, Push(jnp.ones(2)))])
+def test_every_entry_has_its_interval_in_si_units(wrap):
+    found = intervals(wrap(multirotor(IRIS, LEARN)), np.diag(ERRORS**2))
+    drag, rotors = ([f"{name}[{i}]" for i in range(count)] for name, count in (("drag", 3), ("k_rotors", 4)))
+    assert set(found) == {"Ix", *drag, *rotors}
+    for name, error in zip(("Ix", *rotors), ERRORS[[0, 4, 5, 6, 7]], strict=True):
+        value, low, high = found[name]  # held as a logarithm
+        np.testing.assert_allclose([high / value, value / low], np.exp(Z * error), rtol=1e-5)  # float32
+    for name, error in zip(drag, ERRORS[1:4], strict=True):
+        assert found[name].value == 0  # held in units of the vehicle's weight at 1 m/s
+        np.testing.assert_allclose(found[name][1:], Z * error * IRIS.mass * IRIS.gravity * np.array([-1, 1]), rtol=1e-5)
+
+
+def test_a_matrix_has_rows_and_columns():
+    found = intervals(multirotor(IRIS, ("aerodynamic_moment",)), np.eye(9) * 1e-4)
+    assert list(found) == [f"aerodynamic_moment[{i},{j}]" for i in range(3) for j in range(3)]
+
+
+def test_of_the_paper_s_parameters_they_are_those_of_the_rigid_body():
+    logs = {"Ix": jnp.asarray(0.3), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.1)}
+    covariance = np.diag([1e-4, 4e-4, 9e-4])
+    ours, theirs = (intervals(field(logs, IRIS), covariance) for field in (Multirotor, RigidBody))
+    assert list(theirs) == ["Ix", "Iy", "k"]
+    for name, interval in theirs.items():
+        np.testing.assert_allclose(ours[name], interval, rtol=1e-6)
+        value = interval.value
+        assert value == RigidBody(logs, IRIS).theta()[name]
+        np.testing.assert_allclose(interval.high * interval.low, value**2, rtol=1e-6)  # about it as a ratio
+
+
+REPEATS, NOISE = 240, 0.01  # [m], [1], [m/s], [rad/s] alike
+
+
+@pytest.fixture(scope="module")
+def inside():
+    """Of each entry by name, and of all at once: in how many of the repeats the truth is inside."""
+    start = multirotor(IRIS, LEARN)
+    truth = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size).reshape(leaf.shape)), start)
+    true = {name: interval.value for name, interval in intervals(truth, np.eye(8)).items()}
+    clean = flights(jax.random.key(0), truth)
+
+    def one(key):
+        windows = eqx.tree_at(lambda w: w.x, clean, clean.x + NOISE * jax.random.normal(key, clean.x.shape))
+        field = descended(truth, windows)
+        around = intervals(field, physics_covariance(field, windows))
+        return {name: (ends.low <= true[name]) & (true[name] <= ends.high) for name, ends in around.items()}
+
+    def repeats(keys):
+        return jax.lax.map(one, keys, batch_size=24)
+
+    return {
+        name: int(hits.sum()) for name, hits in jax.jit(repeats)(jax.random.split(jax.random.key(1), REPEATS)).items()
+    }
+
+
+def descended(field, windows, steps=3):
+    """Least squares by Gauss and Newton's steps from near the minimum: `fit_physics` takes long to compile."""
+    theta, rebuild = parametrise(field)
+
+    def errors(theta):
+        r = jax.vmap(lambda window: residual(rebuild(theta), window))(windows).ravel()
+        return r, r
+
+    def step(theta, _):
+        jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
+        return theta - jnp.linalg.solve(jacobian.T @ jacobian, jacobian.T @ r), None
+
+    return rebuild(jax.lax.scan(step, theta, length=steps)[0])
+
+
+def flights(key, truth, count=60, steps=2, dt=0.04):
+    """Windows from random states in motion under rotor speeds that change."""
+    of_state, of_input = jax.random.split(key)
+    x0 = 2 * jax.random.normal(of_state, (count, 13))
+    q = rotation.normalise(x0[:, 3:7] * 0.2 + jnp.array([1.0, 0, 0, 0]))
+    x0 = x0.at[:, 3:7].set(q)
+    u = IRIS.hover_speed * (1 + 0.2 * jax.random.normal(of_input, (count, steps, 4)))
+    return Trajectories(x0, u, rollout_batch(truth, x0, u, dt), dt)
+
+
+def test_they_cover_the_truth_of_vectors_as_often_as_they_say(inside):
+    assert len(inside) == 8
+    deviation = np.sqrt(REPEATS * 0.95 * 0.05)
+    for name, hits in inside.items():
+        # Four standard deviations of the binomial law, and the 1 % that 60 windows for 8 parameters cost a sandwich.
+        assert 0.94 * REPEATS - 4 * deviation < hits <= REPEATS, name
+    # All together, as if independent, which they nearly are: within four again, from either side.
+    assert abs(sum(inside.values()) - 8 * 0.945 * REPEATS) < 4 * np.sqrt(8) * deviation
+
+
+def weighed(windows, design, gains, scales, huber):
+    """H⁻¹ M H⁻¹ of a linear problem in double precision, by derivatives of the whole loss."""
+    n, _, p = design.shape
+    with jax.enable_x64(True):
+        shapes, truth = np.asarray(design).reshape(n, -1, 2, p), jnp.asarray(windows.x, float).reshape(n, -1, 2)
+
+        def counted(gains):  # (n,)
+            r = jnp.abs(truth - jnp.asarray(shapes) @ gains) / jnp.asarray(scales)
+            one = r**2 if huber is None else jnp.where(r > huber, 2 * huber * r - huber**2, r**2)
+            return one.sum(axis=(1, 2))
+
+        gains = jnp.asarray(np.asarray(gains, float))
+        scores = np.asarray(jax.jacfwd(counted)(gains))
+        bread = np.linalg.inv(np.asarray(jax.hessian(lambda gains: counted(gains).sum())(gains)))
+    return n / (n - p) * bread @ (scores.T @ scores) @ bread
+
+
+@pytest.mark.parametrize("huber", [None, 0.8])
+def test_a_loss_of_channels_has_its_own_covariance(huber):
+    """In channels of one entry each a linear problem's loss is bent by the data alone, so the formula is exact."""
+    windows, design = pushes(40, 0.1)
+    objective = ChannelPrediction((Channel(0, 1, 0.1), Channel(1, 2, 0.05)), huber)
+    gains = np.array([0.7, -0.4]) if huber is None else fit_physics(Push(jnp.ones(2)), windows).field.gains
+    found = physics_covariance(Push(jnp.asarray(gains)), windows, error=objective.error)
+    expected = weighed(windows, design, gains, np.array([0.1, 0.05]), huber)
+    np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * abs(expected).max())  # float32 sums
+
+
+def test_equal_scales_are_no_weights():
+    windows, _ = pushes(40, 0.1)
+    field = fit_physics(Push(jnp.ones(2)), windows).field
+    objective = ChannelPrediction((Channel(0, 2, 3.0),))
+    plain = physics_covariance(field, windows)
+    np.testing.assert_allclose(physics_covariance(field, windows, error=objective.error), plain, rtol=1e-5)
+
+
+def test_white_noise_of_one_size_goes_with_squares_alone():
+    windows, _ = pushes(40, 0.1)
+    with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
+        physics_covariance(
+            Push(jnp.ones(2)), windows, "homoscedastic", error=ChannelPrediction((Channel(0, 1, 1.0),)).error
+        )

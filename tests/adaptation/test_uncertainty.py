@@ -1,0 +1,207 @@
+"""Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
+
+import contextlib
+import io
+import json
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum, swings
+from rich.console import Console
+from test_least_squares import Brake, Push, log_lengths, pushes
+
+from experiments import coverage as command
+from experiments.coverage import Config, coverage
+from hybrid_jax.adaptation.least_squares import fit_physics
+from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance, standard_errors
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.vehicle import IRIS
+
+SWINGS = swings(40)
+COVARIANCE = jnp.diag(jnp.array([0.01, 0.02, 0.03]) ** 2)  # of log Ix, log Iy, log k
+
+
+def closed_form(windows, design, gains, kind):
+    """The covariance of a linear problem, in double precision, as the docstring writes it."""
+    n, _, p = design.shape
+    errors = np.asarray(windows.x, float).reshape(n, -1) - design @ np.asarray(gains, float)
+    bread = np.linalg.inv(np.einsum("nip,niq->pq", design, design))
+    if kind == "homoscedastic":
+        return (errors**2).sum() / (errors.size - p) * bread
+    scores = np.einsum("nip,ni->np", design, errors)
+    return n / (n - p) * bread @ (scores.T @ scores) @ bread
+
+
+@pytest.mark.parametrize("kind", ["sandwich", "homoscedastic"])
+def test_a_linear_problem_meets_its_closed_form(kind):
+    windows, design = pushes(30, 0.1)
+    offset = 0.2 * np.random.default_rng(1).normal(size=(30, 1, 2))  # an error that a whole window shares
+    windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
+    field = fit_physics(Push(jnp.ones(2)), windows).field
+    expected = closed_form(windows, design, field.gains, kind)
+    np.testing.assert_allclose(physics_covariance(field, windows, kind), expected, rtol=1e-4)  # float32 sums
+    # In pieces that do not divide the windows the sums are the same.
+    np.testing.assert_allclose(physics_covariance(field, windows, kind, chunk=7), expected, rtol=1e-4)
+
+
+def test_under_white_noise_the_two_agree():
+    windows, _ = pushes(2000, 0.1)
+    field = fit_physics(Push(jnp.ones(2)), windows).field
+    sandwich, plain = (np.diag(physics_covariance(field, windows, kind)) for kind in ("sandwich", "homoscedastic"))
+    # A variance from 2000 scores has a relative error of about √(3/2000) = 4 %; four of these.
+    np.testing.assert_allclose(sandwich, plain, rtol=0.16)
+
+
+def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
+    """Against the spread of the estimates of 4000 recordings, which for a linear problem is one matrix product."""
+    windows, design = pushes(60, 0.0)
+    rng = np.random.default_rng(2)
+    solve = np.linalg.pinv(design.reshape(-1, 2))
+    shared = np.repeat(rng.normal(size=(4000, 60, 1, 2)), 6, axis=2).reshape(4000, -1)
+    spread = (shared @ solve.T).std(axis=0)
+    seen = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(shared[0], np.float32).reshape(60, 6, 2))
+    field = fit_physics(Push(jnp.ones(2)), seen).field
+    sandwich, plain = (
+        np.sqrt(np.diag(physics_covariance(field, seen, kind))) for kind in ("sandwich", "homoscedastic")
+    )
+    # A standard deviation from 60 scores is good to √(3/60) / 2 = 11 %; three of these.
+    np.testing.assert_allclose(sandwich, spread, rtol=0.34)
+    assert (plain < 0.7 * spread).all()
+
+
+def test_a_lane_is_the_covariance_alone():
+    lengths = (0.45, 0.55, 0.6)
+    together = eqx.filter_jit(eqx.filter_vmap(lambda field: physics_covariance(field, SWINGS)))(log_lengths(*lengths))
+    alone = [physics_covariance(pendulum(length), SWINGS) for length in lengths]
+    np.testing.assert_allclose(together, alone, rtol=1e-5)  # another order of float32 sums
+
+
+def test_a_residual_is_taken_as_given():
+    bare, hybrid = (
+        physics_covariance(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0))))
+    )
+    np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
+
+
+def test_standard_errors_stand_where_the_parameters_do():
+    errors = standard_errors(Hybrid(rigid_body(IRIS), Push(jnp.ones(2))), COVARIANCE)
+    for name, error in zip(("Ix", "Iy", "k"), (0.01, 0.02, 0.03), strict=True):
+        np.testing.assert_allclose(errors.log_ratios[name], error, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("level", "z"), [(0.6827, 1.0), (0.95, 1.95996)])  # of the normal distribution's table
+def test_an_interval_is_the_value_times_and_over_a_factor(level, z):
+    for field in (rigid_body(IRIS), Hybrid(rigid_body(IRIS), Push(jnp.ones(2)))):
+        found = intervals(field, COVARIANCE, level)
+        assert list(found) == ["Ix", "Iy", "k"]
+        for name, error in zip(found, (0.01, 0.02, 0.03), strict=True):
+            value, low, high = found[name]
+            assert value == rigid_body(IRIS).theta()[name]
+            np.testing.assert_allclose([high / value, value / low], np.exp(z * error), rtol=1e-5)  # float32
+
+
+def test_what_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match=r"windows: 1 are too few for a covariance of 1 parameters, at least 2"):
+        physics_covariance(pendulum(), SWINGS[:1])
+    with pytest.raises(ValueError, match="kind must be one of sandwich, homoscedastic, got 'plain'"):
+        physics_covariance(pendulum(), SWINGS, "plain")
+    for level in (0.0, 1.0, 95, float("nan")):
+        with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
+            intervals(rigid_body(IRIS), COVARIANCE, level)
+    with pytest.raises(ValueError, match="must be a RigidBody or Multirotor, got Pendulum"):
+        intervals(pendulum(), jnp.ones((1, 1)))
+
+
+REPEATS = 100
+
+
+@pytest.fixture(scope="module")
+def said_and_written(tmp_path_factory):
+    """What the command prints and writes."""
+    folder, said = tmp_path_factory.mktemp("runs"), io.StringIO()
+    with contextlib.redirect_stdout(said):
+        command.main(["--repeats", str(REPEATS), "--out", str(folder)])
+    return said.getvalue(), json.loads((folder / "coverage" / "coverage.json").read_text())
+
+
+@pytest.fixture(scope="module")
+def rows(said_and_written):
+    """Its rows, by case, noise and parameter."""
+    return {(row["case"], row["noise_on"], row["parameter"]): row for row in said_and_written[1]["rows"]}
+
+
+@pytest.mark.parametrize("noise_on", ["targets", "all"])
+@pytest.mark.parametrize("name", ["Ix", "Iy", "k"])
+def test_intervals_cover_the_truth_of_exact_physics(noise_on, name, rows):
+    row = rows["exact physics", noise_on, name]
+    assert row["converged"] == 1
+    # 100 draws of 95 %: a standard deviation of 2.2 %, four of these down; all draws up are two and a half.
+    assert row["coverage"] > 0.95 - 4 * np.sqrt(0.95 * 0.05 / REPEATS)
+    # A half-width is 1.96 standard errors; the mean of 100 fits is within four of its own: there is no bias.
+    assert abs(row["bias"]) < 4 * row["half_width"] / 1.96 / np.sqrt(REPEATS)
+
+
+def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_not(rows):
+    """Drag pulls against the lean into the velocity, as a smaller k would."""
+    row = rows["unknown drag", "targets", "k"]
+    assert row["coverage"] < 0.5
+    # c v / m of drag against a lean of c v / (m g): c² E[v_x² + v_y²] / (m g)², with 2 m/s along each axis. The mean
+    # of 100 fits is good to 0.03 %; drag on what is vertical or beside the lean averages out.
+    np.testing.assert_allclose(row["bias"], -100 * 0.4**2 * 8 / (1.5 * 9.81) ** 2, atol=0.15)
+
+
+def test_the_command_prints_and_writes_every_case(said_and_written, rows):
+    said, written = said_and_written
+    assert written["config"]["repeats"] == REPEATS
+    assert len(rows) == 12  # two truths, noise on targets or on all, three parameters
+    assert "Does the 95 % interval contain the truth?" in said
+    for row in rows.values():
+        assert f"{100 * row['coverage']:.1f} ±" in said
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"n_train": 3}, "--n-train must be more than the 3 parameters, got 3"),
+        ({"repeats": 0}, "--repeats must be at least 1, got 0"),
+        ({"seed": -1}, "--seed must be an integer of at least 0, got -1"),
+        ({"level": 95.0}, "--level must be between 0 and 1, got 95.0"),
+        ({"noise_on": ()}, "--noise-on must be targets, all or both, got nothing"),
+        ({"noise": command.Noise(body_rates=-1.0)}, "--noise.body-rates must be a finite number of at least 0"),
+        ({"drag": float("nan")}, "--drag must be a finite number of at least 0, got nan"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(changed, said):
+    with pytest.raises(ValueError, match=said):
+        coverage(replace(Config(), **changed), Console(quiet=True))
+
+
+def test_bad_input_ends_in_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        command.main(["--level", "2", "--out", str(tmp_path)])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == "coverage: --level must be between 0 and 1, got 2.0\n"
+
+
+@pytest.mark.parametrize(("repeats", "batch"), [(100, 1), (25, 1), (25, 4), (3, 8)])
+def test_parts_of_one_size_hold_every_repeat_in_its_order(repeats, batch):
+    parts = command._parts(Config(repeats=repeats, batch=batch))
+    together = np.concatenate([jax.random.key_data(part) for part in parts])
+    assert {len(part) for part in parts} == {len(together) // len(parts)}
+    np.testing.assert_array_equal(together[:repeats], jax.random.key_data(jax.random.split(jax.random.key(0), repeats)))
+
+
+def test_an_interrupt_ends_in_one_line(tmp_path, capsys, monkeypatch):
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "_repeats", interrupted)
+    with pytest.raises(SystemExit) as stop:
+        command.main(["--out", str(tmp_path)])
+    assert stop.value.code == 130
+    assert capsys.readouterr().err == "coverage: interrupted, nothing was written\n"

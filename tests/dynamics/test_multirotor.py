@@ -1,0 +1,232 @@
+"""Laws of the multirotor's field, in double precision: what each term does, and that what is absent changes nothing."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jax.flatten_util import ravel_pytree
+
+from hybrid_jax import Hybrid, load, rigid_body, rotation, save
+from hybrid_jax.dynamics.base import Frozen, deploy_batch, evaluate_batch, trainable
+from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.dynamics.multirotor import Multirotor, carried_to, multirotor
+from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body
+from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import IRIS
+
+ALL = tuple(name for name in SHAPES if name != "k")
+KNOWN = Terms(
+    torque_gain=(0.9, 1.1, 0.8),
+    centre_of_mass=(0.01, -0.02),
+    drag=(0.3, 0.4, 0.1),
+    cable_pull=(4.0, 3.0),
+    aerodynamic_moment=((0.0, -0.02, 0.0), (0.03, 0.0, 0.01), (0.0, 0.005, 0.0)),
+    rate_damping=(0.02, 0.03, 0.01),
+    velocity_gain=(0.95, 0.9, 1.02),
+    velocity_lag=0.2,
+)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+def samples(count=6, seed=1):
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(13, count)) * 2
+    x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
+    return jnp.asarray(x), jnp.asarray(rng.uniform(400, 900, (4, count)))
+
+
+def moved(field, size=0.1, seed=2):
+    """The field with every parameter away from nominal."""
+    rng = np.random.default_rng(seed)
+    leaves, structure = jax.tree.flatten(field)
+    return jax.tree.unflatten(structure, [leaf + size * rng.normal(size=leaf.shape) for leaf in leaves])
+
+
+def one_by_one(field, x, u):
+    return jax.vmap(field, -1, -1)(x, u)
+
+
+def by_matrices(x, u, vehicle, terms, k):
+    """The same equations with matrices, each rotor's force at its place."""
+    w, *vector = x[QUATERNION]
+    a, b, c = vector
+    skew = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
+    attitude = np.eye(3) + 2 * w * skew + 2 * skew @ skew
+    velocity, rates = attitude.T @ x[VELOCITY], x[BODY_RATES]
+    force, torque = -np.diag(terms.drag) @ velocity, np.zeros(3)
+    for place, sign, speed, one in zip(vehicle.rotor_positions, vehicle.spin, u, k, strict=True):
+        lift = np.array([0, 0, one * speed**2])
+        force = force + lift
+        torque += np.cross([*(np.array(place) - terms.centre_of_mass), 0.0], lift)
+        torque[2] += sign * vehicle.torque_coefficient * speed**2
+    inertia = np.diag(vehicle.inertia)
+    torque = np.array(terms.torque_gain) * torque
+    force += np.array((*terms.cable_pull, 0.0)) * [torque[1], -torque[0], 0.0]
+    torque += np.array(terms.aerodynamic_moment) @ velocity - np.array(terms.rate_damping) * rates
+    acceleration = attitude @ force / vehicle.mass - [0, 0, vehicle.gravity]
+    unseen = terms.velocity_lag * np.array([1, 1, 0]) * force / vehicle.mass
+    moved = attitude @ (terms.velocity_gain * velocity + unseen)
+    return np.concatenate(
+        [moved, np.zeros(4), acceleration, np.linalg.solve(inertia, torque - np.cross(rates, inertia @ rates))]
+    )
+
+
+@pytest.mark.parametrize("learn", [("Ix", "Iy", "k"), ALL, ()], ids=["paper", "all", "nothing"])
+def test_at_nominal_it_is_the_rigid_body(learn):
+    x, u = samples()
+    np.testing.assert_allclose(
+        one_by_one(multirotor(IRIS, learn), x, u), one_by_one(rigid_body(IRIS), x, u), rtol=1e-14, atol=1e-13
+    )
+
+
+def test_with_the_paper_s_parameters_it_is_the_rigid_body_everywhere():
+    logs = {"Ix": jnp.asarray(0.3), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.1)}
+    ours, theirs, (x, u) = Multirotor(logs, IRIS), RigidBody(logs, IRIS), samples()
+    np.testing.assert_array_equal(one_by_one(ours, x, u), one_by_one(theirs, x, u))
+    assert ours.theta() == theirs.theta()
+
+
+def test_it_is_newton_euler_with_drag_moment_damping_gain_and_offset():
+    k = (8e-6, 9e-6, 8.5e-6, 7e-6)
+    vehicle = replace(IRIS, thrust_coefficient=8e-6)
+    field = multirotor(vehicle, ("k_rotors",), KNOWN)
+    field = eqx.tree_at(lambda field: field.deviations["k_rotors"], field, jnp.log(jnp.array(k) / 8e-6))
+    x, u = samples()
+    expected = np.stack([by_matrices(*map(np.asarray, pair), vehicle, KNOWN, k) for pair in zip(x.T, u.T, strict=True)])
+    found = one_by_one(field, x, u).at[QUATERNION].set(0.0)
+    np.testing.assert_allclose(found.T, expected, rtol=1e-11, atol=1e-11)
+
+
+@pytest.mark.parametrize("name", SIGNED)
+def test_a_known_term_is_a_learned_one_at_its_value(name):
+    """What is learned is the deviation from the nominal value, in SI units `theta`."""
+    x, u = samples()
+    value = getattr(KNOWN, name)
+    terms = Terms(**{"drag": KNOWN.drag, name: value})  # a lag without a force is none
+    known, learned = multirotor(IRIS, (), terms), multirotor(IRIS, (name,), terms)
+    np.testing.assert_allclose(learned.theta()[name], value, rtol=1e-15)
+    np.testing.assert_allclose(one_by_one(learned, x, u), one_by_one(known, x, u), rtol=1e-13, atol=1e-12)
+    assert (one_by_one(moved(learned), x, u) != one_by_one(known, x, u)).any()
+
+
+@pytest.mark.parametrize("learn", [("Ix", "Iy", "k"), ALL, ("drag",), ()], ids=["paper", "all", "drag", "nothing"])
+def test_a_minibatch_and_its_gradient_are_those_of_its_samples(learn):
+    """With respect to θ_p, states and inputs alike."""
+    field, (x, u) = moved(multirotor(IRIS, learn, KNOWN)), samples()
+    weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
+
+    def slope(evaluate):
+        return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x, u)
+
+    for evaluate in (evaluate_batch, deploy_batch):
+        np.testing.assert_allclose(evaluate(field, x, u), one_by_one(field, x, u), rtol=1e-12, atol=1e-11)
+    for ours, theirs in zip(jax.tree.leaves(slope(evaluate_batch)), jax.tree.leaves(slope(one_by_one)), strict=True):
+        np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11)
+
+
+def test_all_terms_are_recovered_from_flights_made_with_them():
+    """Exact data, so what is left is round-off; gains are the inertia's and the lag's as well."""
+    learn = tuple(name for name in ALL if name not in ("torque_gain", "velocity_gain"))
+    truth, (x, u) = moved(multirotor(IRIS, learn), 0.05), samples(30)
+    start, rebuild = ravel_pytree(multirotor(IRIS, learn))
+
+    @jax.jit
+    def flown(parameters):
+        return rollout_batch(rebuild(parameters), x.T, u.T[:, None], 0.02).ravel()
+
+    found, data = start, flown(ravel_pytree(truth)[0])
+    for _ in range(6):  # Gauss and Newton's steps
+        found = found + jnp.linalg.lstsq(jax.jacfwd(flown)(found), data - flown(found))[0]
+    for name, value in truth.theta().items():
+        np.testing.assert_allclose(rebuild(found).theta()[name], value, rtol=1e-6, err_msg=name)
+
+
+AROUND = {"itself": lambda body: body, "frozen rates": FrozenRates, "frozen": Frozen}
+AROUND |= {"hybrid": lambda body: Hybrid(body, HoldState())}
+
+
+@pytest.mark.parametrize("around", AROUND.values(), ids=AROUND)
+def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
+    """An estimator that knows thrust alone has v̂˙ = R T e_z / m − g e_z + (v − v̂) / λ, the last across the thrust."""
+    lag, (x, u) = 0.25, samples()
+    field = around(multirotor(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
+    thrust = one_by_one(multirotor(IRIS, ()), x, u)[VELOCITY]
+    behind = jnp.asarray([0.3, -0.2, 0.0])  # v − v̂ in the body
+    for state, inputs, known in zip(x.T, u.T, thrust.T, strict=True):
+        velocity = state[VELOCITY] + rotation.rotate(state[QUATERNION], behind)
+        estimator = known + (velocity - state[VELOCITY]) / lag
+        push = jnp.concatenate([estimator - field(state, inputs)[VELOCITY], jnp.zeros(3)])
+        for evaluate in (evaluate_batch, deploy_batch, lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]):
+            found = evaluate(disturbed(field, push), state[:, None], inputs[:, None])[:, 0]
+            np.testing.assert_allclose(found[POSITION], velocity, rtol=1e-12, atol=1e-12)
+            np.testing.assert_allclose(found[VELOCITY], estimator, rtol=1e-12, atol=1e-12)
+
+
+def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
+    """A force at (0, 0, −h) that the rotors hold makes the moment −h e_z × F, so F follows from their torque."""
+    below, pull = 0.05, np.array([0.02, -0.03, 0.0])
+    arms = np.array(IRIS.rotor_positions)
+    held = [*-np.cross([0.0, 0.0, -below], pull)[:2], IRIS.mass * IRIS.gravity]
+    lifts = np.linalg.lstsq(np.stack([arms[:, 1], -arms[:, 0], np.ones(4)]), np.array(held))[0]
+    field = multirotor(IRIS, (), Terms(cable_pull=(1 / below, 1 / below)))
+    level = jnp.zeros(13).at[3].set(1.0)
+    derivative = field(level, jnp.sqrt(lifts / IRIS.thrust_coefficient))
+    np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
+
+
+def test_what_is_learned_goes_with_the_vehicle_to_another():
+    field = moved(multirotor(IRIS, ALL, KNOWN))
+    heavy = carried_to(field, replace(IRIS, mass=2.0, inertia=(0.03, 0.04, 0.06), thrust_coefficient=9e-6))
+    for name, value in field.theta().items():
+        np.testing.assert_allclose(heavy.theta()[name], value, rtol=1e-12, atol=1e-15)
+    assert heavy.vehicle.mass == 2.0
+
+
+def test_no_torque_without_gain():
+    x, u = samples()
+    still = x.at[BODY_RATES].set(0.0)
+    derivative = one_by_one(multirotor(IRIS, (), Terms(torque_gain=(0.0, 0.0, 0.0))), still, u)
+    np.testing.assert_array_equal(derivative[BODY_RATES], 0)
+
+
+@pytest.mark.parametrize(
+    ("learn", "said"), [(("mass",), "'mass'"), (("k", "k_rotors"), "both k and k_rotors"), (("Ix", "Ix"), "twice")]
+)
+def test_what_cannot_be_learned_is_refused(learn, said):
+    with pytest.raises(ValueError, match=said):
+        multirotor(IRIS, learn)
+
+
+@pytest.mark.parametrize(
+    "term",
+    [{"drag": (1.0, 2.0)}, {"drag": (1.0, 2.0, np.inf)}, {"aerodynamic_moment": (1.0, 2.0, 3.0)}, {"rate_damping": 1}],
+    ids=str,
+)
+def test_a_term_that_is_none_is_refused_by_name(term):
+    with pytest.raises(ValueError, match=next(iter(term))):
+        Terms(**term)
+
+
+def test_it_survives_a_file_and_its_states_are_checked(tmp_path):
+    field = Hybrid(moved(multirotor(IRIS, ALL, KNOWN)), rigid_body(IRIS))
+    save(tmp_path / "model.npz", field)
+    assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)
+    assert sum(jax.tree.leaves(trainable(field.physics))) == len(ALL)
+    assert moves_a_rigid_body(field.physics)
+
+
+def test_single_precision_stays_single():
+    x, u = (part[:, 0].astype(np.float32) for part in samples())
+    field = jax.tree.map(lambda leaf: leaf.astype(np.float32), multirotor(IRIS, ALL, KNOWN))
+    assert field(x, u).dtype == np.float32

@@ -1,0 +1,119 @@
+"""Ablations: that each value differs from the default in what its name says, and what a run leaves."""
+
+import csv
+import json
+import math
+from dataclasses import replace
+from typing import get_args
+
+import numpy as np
+import pytest
+from rich.console import Console
+from smoke import experiments
+
+from experiments.ablation import PRESETS, Choice, experiment, varied
+from experiments.paper.ablations import Trial, by_choice, figure, tables, to_csv
+from experiments.paper.rows import Row
+from experiments.paper.sensors import Noise, measured
+from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.trajectories import Trajectories
+
+TRUTH = {domain: {"Ix": 0.04, "Iy": 0.02, "k": 1e-5} for domain in ("parameter_shift", "external_force")}
+
+
+def rows(error, ix=0.04):
+    """Two seeds in both domains, source-only and fine-tuned at N = 100."""
+    theta = {"Ix": ix, "Iy": 0.02, "k": 1e-5}
+    return [
+        Row(domain, "hybrid", mode, n, seed, error * (1 + seed), 0.0, 1e-3, 5, "ok", theta)
+        for domain in TRUTH
+        for mode, n in (("source_only", 0), ("fine_tuned", 100))
+        for seed in range(2)
+    ]
+
+
+TRIALS = [
+    Trial("norm", "batch", True, [1e-3, 2e-3], rows(0.1)),
+    Trial("norm", "none", False, [1e-3, math.nan], rows(0.4, ix=0.05)),
+    Trial("solver", "heun", False, [1e-3, 2e-3], rows(0.2)),
+]
+
+
+@pytest.mark.parametrize("choice", get_args(Choice))
+def test_every_choice_has_its_default_once_among_valid_values(choice):
+    config = PRESETS["paper"]
+    changed = list(varied(choice, config).values())
+    assert changed.count(config) == 1
+    assert len({str(other) for other in changed}) == len(changed) > 2
+
+
+@pytest.mark.parametrize(("most", "sizes"), [(40, [40]), (1000, [300, 1000]), (5000, [300, 1000, 3000, 5000])])
+def test_the_source_flights_that_were_asked_for_are_the_most_that_are_tried(most, sizes):
+    config = replace(PRESETS["smoke"], source_train=most)
+    assert [other.source_train for other in varied("source", config).values()] == sizes
+
+
+def test_the_start_in_a_range_of_factors_is_that_whatever_the_others_are_off_by():
+    config = replace(PRESETS["paper"], guess_off=0.3)
+    assert [other.guess_off for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
+
+
+def test_values_that_do_not_go_with_the_other_options_are_refused_before_anything_is_flown(tmp_path):
+    config = replace(PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
+    with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):
+        experiment(config, Console(quiet=True))
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_table_has_a_line_for_each_value_in_each_domain_with_means_and_biases():
+    norm, solver = tables(TRIALS, TRUTH)
+    assert [line[:2] for line in norm.lines] == [
+        [target, value]
+        for target in ("parameter shift, 100", "external force, 100")
+        for value in ("batch (default)", "none")
+    ]
+    assert [line[1] for line in solver.lines] == ["heun", "heun"]
+    assert norm.lines[0][4].startswith("1.50e-01")  # of 0.1 and 0.2
+    assert norm.lines[1][5] == "+25.0, +0.0, +0.0"
+    assert "∞" in norm.lines[1][2]  # a pre-training that was not finite
+
+
+def test_the_csv_has_every_row_and_theta_in_columns():
+    found = list(csv.DictReader(to_csv(TRIALS).splitlines()))
+    assert len(found) == 3 * 8
+    assert {row["choice"] for row in found} == set(by_choice(TRIALS)) == {"norm", "solver"}
+    assert float(found[-1]["Ix"]) == 0.04
+
+
+def test_the_figure_has_a_panel_for_each_domain_and_a_dot_for_each_seed():
+    drawn = figure(TRIALS[:2], "norm", {"external_force": 0.05})
+    assert [axes.get_title() for axes in drawn.axes] == ["Parameter shift", "External force"]
+    assert [label.get_text() for label in drawn.axes[0].get_yticklabels()] == ["batch (default)", "none"]
+    with pytest.raises(ValueError, match="nothing to draw"):
+        figure([], "norm", {})
+
+
+def test_noise_has_its_size_and_spares_the_tests():
+    x = np.zeros((400, 10, 13), np.float32)
+    x[..., 3] = 1
+    clean = Trajectories(x[:, 0], np.zeros((400, 10, 4), np.float32), x, 0.01)
+    noisy = measured(Dataset({"train": clean, "test": clean}, {}), 2.0, seed=0)
+    np.testing.assert_array_equal(noisy.splits["test"].x, x)
+    off = noisy.splits["train"].x - x
+    # 4000 draws of a normal: its spread is known to 1.1 %.
+    np.testing.assert_allclose(off[..., 0].std(), 2 * Noise().position, rtol=0.05)
+    np.testing.assert_allclose(off[..., 12].std(), 2 * Noise().body_rates, rtol=0.05)
+    np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
+
+
+def test_a_run_leaves_a_report_a_page_and_a_figure_for_each_choice(tmp_path):
+    (run,) = experiments("ablation", "ablation", folder=tmp_path, options=("--over", "noise"))
+    assert run.returncode == 0, run.stderr
+    out = tmp_path / "out" / "ablation"
+    rows = [row for row in json.loads((out / "report.json").read_text())["rows"] if row["choice"] == "noise"]
+    assert {row["value"] for row in rows} == {f"{level} × typical" for level in ("0", "0.5", "1", "2")}
+    assert [row["default"] for row in rows].count(True) == 4  # one seed, two modes, two domains
+    assert (out / "noise.png").read_bytes().startswith(b"\x89PNG")
+    assert "Noise" in (out / "report.md").read_text()
+    by_level = {row["value"]: row["val_mse"] for row in rows if row["mode"] == "fine_tuned"}
+    assert by_level["2 × typical"] > by_level["0 × typical"]  # validation is measured with the same noise

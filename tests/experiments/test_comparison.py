@@ -1,0 +1,98 @@
+"""The comparison from its command line, in the smallest preset: what each method leaves alone, and the report."""
+
+import json
+
+import equinox as eqx
+import numpy as np
+import pytest
+from smoke import experiments, refused, smallest, unbegun
+from test_experiments import ROW
+
+import hybrid_jax
+from experiments.reporting.report import load_report
+
+METHODS = (
+    *("hybrid", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer", "least_squares"),
+    "constant_disturbance",
+)
+DOMAINS = ("parameter_shift", "external_force")
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """Left by one run of the methods that share the pre-trained hybrid, or of all."""
+    folder = tmp_path_factory.mktemp("comparison")
+    options = ("--methods", *METHODS, "--repeats", "2")
+    (run,) = experiments("comparison", "comparison", folder=folder, options=options)
+    assert run.returncode == 0, run.stderr
+    assert "Table" not in run.stderr
+    assert "Expert Augmentation" in run.stdout
+    return folder / "out" / "comparison"
+
+
+def field(folder, domain, model, mode="fine_tuned", n=20):
+    return hybrid_jax.load(folder / "models" / domain / f"{model}-{mode}-{n}-seed0.npz").field
+
+
+def test_the_report_keeps_its_contract(folder):
+    report = json.loads((folder / "report.json").read_text())
+    rows = [row for row in report["rows"] if row["model"] in METHODS]
+    assert {(row["domain"], row["model"], row["mode"]) for row in rows} == {
+        (domain, model, "source_only" if model == "expert_augmentation" else "fine_tuned")
+        for domain in DOMAINS
+        for model in METHODS
+    } | {(domain, "hybrid", "source_only") for domain in DOMAINS}
+    for row in rows:
+        assert set(row) == set(ROW)
+        assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
+    assert [claim["id"] for claim in report["claims"] + report["not_judged"]] == ["C9"]
+    assert len(report["coverage"]) == 12  # two truths, noise on two sets of states, three parameters
+    assert (folder / "standings.png").read_bytes().startswith(b"\x89PNG")
+    load_report(folder)
+
+
+@pytest.mark.parametrize("domain", DOMAINS)
+def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
+    source = field(folder, domain, "hybrid", "source_only", 0)
+    for model in ("theta_p_only", "least_squares", "constant_disturbance"):
+        adapted = field(folder, domain, model)
+        assert eqx.tree_equal(adapted.residual, source.residual)
+        physics = adapted.physics.physics if model == "constant_disturbance" else adapted.physics
+        assert not eqx.tree_equal(physics, source.physics)
+    only_network, last = (field(folder, domain, model) for model in ("theta_d_only", "last_layer"))
+    for adapted in (only_network, last):
+        assert eqx.tree_equal(adapted.physics, source.physics)
+        assert not eqx.tree_equal(adapted.residual, source.residual)
+    np.testing.assert_array_equal(last.residual.weight_in, source.residual.weight_in)
+    assert eqx.tree_equal(field(folder, domain, "expert_augmentation", "source_only", 0).expert.field, source)
+
+
+def test_intervals_stand_around_what_was_fitted(folder):
+    rows = json.loads((folder / "report.json").read_text())["rows"]
+    for row in [row for row in rows if row["model"] in METHODS]:
+        adapted = row["mode"] == "fine_tuned" and row["model"] not in (
+            "theta_d_only",
+            "last_layer",
+            "constant_disturbance",
+        )
+        assert (row["theta_interval"] is not None) == adapted
+        for name, (low, high) in (row["theta_interval"] or {}).items():
+            assert low < row["theta"][name] < high
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--methods", "hybrid", "hybrid"), "--methods must be at least one, each different"),
+        (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
+        (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
+        (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
+        (("--sizes", "20", "3", "--batch-size", "3"), "--sizes must each be more than the 3 of θ_p"),
+        (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
+        (("--encoding.stopping.patience", "-1"), "--encoding.stopping.patience must be an integer of at least 0"),
+    ],
+    ids=["twice", "last layer of a view", "no physics without velocities", "repeats", "sizes", "box", "patience"],
+)
+def test_methods_that_do_not_fit_are_refused_before_anything_is_flown(options, named, tmp_path):
+    assert named in refused(unbegun("comparison", *smallest(*options, folder=tmp_path)), "comparison")
+    assert not list(tmp_path.iterdir())

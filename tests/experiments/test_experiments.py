@@ -1,0 +1,210 @@
+"""Both experiments from their command lines, in the smallest preset: what they leave, and what they refuse."""
+
+import csv
+import json
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from smoke import ROOT, command, experiments, refused, smallest, unbegun
+
+import hybrid_jax
+from experiments.external_force import sine_floor
+from experiments.paper.results import physics_in
+from experiments.paper.rows import SOURCE_OF
+from experiments.reporting.report import load_report
+
+EXPERIMENTS = ("param_shift", "external_force")
+ROW = {
+    "domain": str, "model": str, "mode": str, "n_train": int, "seed": int, "test_mse": float, "rho": float,
+    "val_mse": float, "epochs": int, "status": str, "theta": dict | None, "theta_interval": dict | None,
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("experiments")
+
+
+@pytest.fixture(scope="module")
+def finished(folder):
+    """Each experiment run once; the second finds the first one's pre-training in the cache."""
+    runs = dict(zip(EXPERIMENTS, experiments("shifts", *EXPERIMENTS, folder=folder), strict=True))
+    assert {name: run.returncode for name, run in runs.items()} == dict.fromkeys(EXPERIMENTS, 0), runs
+    return runs
+
+
+def record(folder, name, out="out"):
+    return json.loads((folder / out / name / "report.json").read_text())
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_the_report_keeps_its_contract(name, folder, finished):
+    report = record(folder, name)
+    assert report["experiment"] == name
+    assert report["config"]["preset"] == "smoke"
+    assert {"versions", "hardware", "seconds"} <= set(report["environment"])
+    # Three models: source-only once a seed, two modes for each size and seed; and the one that is solved.
+    assert len(report["rows"]) == 3 * (1 + 2) + 1
+    for row in report["rows"]:
+        assert set(row) == set(ROW)
+        assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
+        assert row["model"] in ("hybrid", "no_physics", "physics_only", "constant_disturbance")
+        assert row["mode"] in ("fine_tuned", "target_only", "source_only")
+        assert row["status"] in ("ok", "capped", "diverged")
+        assert (row["theta"] is None) == (row["model"] == "no_physics")
+        assert row["theta"] is None or set(row["theta"]) == {"Ix", "Iy", "k"}
+        assert row["n_train"] == (0 if row["mode"] == "source_only" else 20)
+    for claim in report["claims"]:
+        assert set(claim) == {"id", "text", "holds", "measured"}
+        assert isinstance(claim["holds"], bool)
+    load_report(folder / "out" / name)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
+    rows = record(folder, name)["rows"]
+    source = {row["model"]: row["test_mse"] for row in rows if row["mode"] == "source_only"}
+    for row in rows:
+        error = source[SOURCE_OF.get(row["model"], row["model"])]
+        expected = (error - row["test_mse"]) / error
+        np.testing.assert_allclose(row["rho"], expected, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", EXPERIMENTS)
+def test_tables_and_figures_are_there(name, folder, finished):
+    out = folder / "out" / name
+    with (out / "rows.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 10
+    assert "hybrid" in (out / "report.md").read_text()
+    for figure in ("scores", "example_flight", "theta", "predictions"):
+        assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
+        assert "<svg" in (out / f"{figure}.svg").read_text()
+    assert finished[name].stdout.strip()  # the tables, for a person
+    assert "Traceback" not in finished[name].stderr
+
+
+def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
+    rng = np.random.default_rng(0)
+    x0 = np.zeros((2, 13), np.float32)
+    x0[:, 3] = 1
+    u = np.asarray(rng.uniform(600, 700, (2, 5, 4)), np.float32)
+    rows = record(folder, "param_shift")["rows"]
+    files = sorted((folder / "out" / "param_shift" / "models").iterdir())
+    assert len(files) == len(rows)
+    for row in rows:
+        name = f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz"
+        model = hybrid_jax.load(folder / "out" / "param_shift" / "models" / name)
+        assert model.about["test_mse"] == row["test_mse"]
+        if row["theta"] is not None:
+            assert {key: float(value) for key, value in physics_in(model.field).theta().items()} == row["theta"]
+    predicted = model.predict(x0, u, model.about["dt"])
+    assert predicted.shape == (2, 5, 13)
+    assert np.isfinite(predicted).all()
+
+
+def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
+    assert "pre-training" not in [line for line in finished["param_shift"].stderr.splitlines() if "cache" in line]
+    reused = [line for line in finished["external_force"].stderr.splitlines() if "as found in the cache" in line]
+    assert len(reused) == 3
+    assert all("pre-training" in line for line in reused)
+
+
+def test_a_second_run_reuses_every_stage_and_finds_the_same_rows(folder, finished):
+    again = command("param_shift", folder=folder, out=folder / "again")
+    assert again.returncode == 0, again.stderr
+    assert again.stderr.count("as found in the cache") == 9  # three models: pre-training and two adaptations
+    assert record(folder, "param_shift", "again")["rows"] == record(folder, "param_shift")["rows"]
+
+
+def test_other_input_scaling_is_another_pretraining(folder, finished):
+    """Nothing but what is static in the network differs; and a report without physics has no figure of θ_p."""
+    other = command("param_shift", "--inputs", "raw", "--models", "no_physics", folder=folder, out=folder / "raw")
+    assert other.returncode == 0, other.stderr
+    assert "as found in the cache" not in other.stderr
+    assert "theta.png" not in record(folder, "param_shift", "raw")["figures"]
+
+
+def test_physics_alone_is_an_experiment_too(folder, finished):
+    run = command("param_shift", "--models", "physics_only", folder=folder, out=folder / "physics")
+    assert run.returncode == 0, run.stderr
+    assert len(record(folder, "param_shift", "physics")["rows"]) == 3
+
+
+@pytest.mark.usefixtures("heard")
+@pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
+def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent, code, folder, finished):
+    forever = ["--patience.hybrid-pretraining.minimum", "10000000", "--max-epochs", "10000000"]
+    options = ["--preset", "smoke", "--models", "physics_only", *forever, "--cache", str(folder / "cache")]
+    run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
+    with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
+        try:
+            assert any("lanes active" in line for line in process.stderr)  # said after a few seconds of training
+            second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
+            assert "another run is writing" in refused(second, "param_shift")
+            process.send_signal(sent)
+            rest = process.stderr.read()
+            assert process.wait(timeout=60) == code
+        finally:
+            process.kill()
+    assert "the same command goes on from here" in rest
+    (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun")
+    shutil.rmtree(begun)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--preset", "nonsense"), "--preset must be one of paper, quick, smoke, got 'nonsense'"),
+        (("--sizes", "10"), "--sizes must each be at least --batch-size 20"),
+        (("--seeds", "many"), "--seeds: invalid literal"),
+        (("--no-such-option", "1"), "--no-such-option"),
+    ],
+    ids=["preset", "sizes", "text for a number", "unknown"],
+)
+def test_wrong_options_are_refused_in_one_line(options, named, tmp_path):
+    assert named in refused(unbegun("param_shift", *smallest(*options, folder=tmp_path)), "param_shift")
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
+    out = tmp_path / "precious"
+    out.write_text("mine")
+    assert "--out" in refused(command("external_force", folder=tmp_path, out=out), "external_force")
+    assert out.read_text() == "mine"
+    assert [path.name for path in tmp_path.iterdir()] == ["precious"]
+
+
+@pytest.mark.parametrize("pattern", ["flights-source-*.npz", "sweeps/pre-training-hybrid-*.npz"])
+def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
+    (file,) = (folder / "cache").glob(pattern)
+    content = file.read_bytes()
+    report = (folder / "out" / "param_shift" / "report.json").read_bytes()
+    file.write_bytes(content[: len(content) // 2])
+    try:
+        run = command("param_shift", folder=folder)
+        assert str(file) in refused(run, "param_shift")
+        assert file.read_bytes() == content[: len(content) // 2]
+        assert (folder / "out" / "param_shift" / "report.json").read_bytes() == report
+    finally:
+        file.write_bytes(content)
+
+
+def test_the_sine_s_floor_is_what_a_model_blind_to_time_must_miss():
+    """Integrated numerically over phases: the path that A/m sin(ω t + φ) alone makes from rest."""
+    mass, times = 1.5, 0.1 * np.arange(1, 11)
+    phases = 2 * np.pi * np.arange(400) / 400  # equally spaced: the mean over a phase is exact
+    fine = np.linspace(0, 1, 10_001)
+    push = np.sin(2 * np.pi / 3 * fine + phases[:, None]) / mass
+
+    def integral(values):
+        steps = (values[:, 1:] + values[:, :-1]) / 2 * (fine[1] - fine[0])
+        return np.concatenate([np.zeros((len(values), 1)), np.cumsum(steps, axis=1)], axis=1)
+
+    velocity = integral(push)
+    squares = (velocity**2 + integral(velocity) ** 2)[:, 1000::1000]
+    # The trapezoidal rule at a step of 1e-4 is good to 1e-8.
+    np.testing.assert_allclose(sine_floor(mass, times), squares.mean(), rtol=1e-6)

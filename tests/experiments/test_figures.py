@@ -1,0 +1,176 @@
+"""Figures say what the rows say, whatever the rows are."""
+
+import io
+import math
+
+import matplotlib as mpl
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from reports import ODD_ROWS, SIZES, TRUTH, changed, make_rows
+from test_standings import compared_rows, spoilt
+
+from experiments.paper.comparison_figures import standings
+from experiments.paper.figures import COLOURS, save_figure, scores, theta
+from experiments.paper.flight_figures import example_flight, predictions, tilt
+from experiments.reporting.error_panels import REACH
+
+
+def straight_flight(steps=10):
+    """Along x at 1 m/s, level, one state each 0.1 s."""
+    states = np.zeros((steps + 1, 13))
+    states[:, 0] = 0.1 * np.arange(steps + 1)
+    states[:, 2:4] = 1.0
+    states[:, 7] = 1.0
+    return states
+
+
+def hovering_inputs(steps=10):
+    return np.full((steps, 4), 656.0)
+
+
+FIGURES = {
+    "scores": lambda: scores(make_rows(), "Scores", floor=0.01),
+    "theta": lambda: theta(make_rows(), TRUTH),
+    "standings": lambda: standings(compared_rows(), "Standings", {"external_force": 2e-3}),
+    "predictions": lambda: predictions(straight_flight(), {100: {"hybrid": straight_flight() * 1.01}}, "Paths"),
+    "example_flight": lambda: example_flight(straight_flight(), hovering_inputs(), 0.1),
+}
+
+
+@pytest.mark.parametrize("make", FIGURES.values(), ids=FIGURES)
+def test_the_same_figure_is_the_same_bytes(tmp_path, make):
+    first, again = (save_figure(make(), tmp_path / name / "figure") for name in ("one", "two"))
+    assert [path.name for path in first] == ["figure.png", "figure.svg"]
+    for one, two in zip(first, again, strict=True):
+        assert one.read_bytes() == two.read_bytes()
+    assert first[0].read_bytes().startswith(b"\x89PNG")
+    assert b"<dc:date>" not in first[1].read_bytes()
+
+
+def test_drawing_leaves_matplotlibs_settings_alone(tmp_path):
+    before = dict(mpl.rcParams)
+    save_figure(FIGURES["scores"](), tmp_path / "figure")
+    assert dict(mpl.rcParams) == before
+
+
+def labels(axes):
+    return axes.get_legend_handles_labels()[1]
+
+
+def test_scores_show_every_model_and_mode_with_its_mean():
+    left, right = scores(make_rows(), "Scores").axes
+    assert set(labels(left)) == {
+        f"{model}, {mode}"
+        for model in ("hybrid", "no-physics")
+        for mode in ("fine-tuned", "target-only", "source-only")
+    }
+    assert left.get_yscale() == "log"
+    handles = dict(zip(labels(left), left.get_legend_handles_labels()[0], strict=True))
+    assert handles["hybrid, fine-tuned"][0].get_ydata() == pytest.approx([0.022, 0.018, 0.016])
+    assert [tick.get_text() for tick in right.get_xticklabels()] == [str(n) for n in SIZES]
+
+
+def test_a_failed_seed_is_marked_and_the_axes_stay_readable():
+    rows = changed(make_rows(), "no_physics", "fine_tuned", 100, factor=1e9)
+    rows = changed(rows, "no_physics", "fine_tuned", 500, test_mse=math.nan)
+    left, right = scores(rows, "Scores").axes
+    assert left.get_ylim()[1] <= 0.016 * 1e6 * 1.001
+    assert right.get_ylim()[0] >= -1.2
+    for axes in (left, right):
+        words = " ".join(text.get_text() for text in axes.texts)
+        assert "3/3 not finite" in words
+        assert "e+09" in words
+
+
+def methods_of(axes):
+    return [tick.get_text() for tick in axes.get_yticklabels()]
+
+
+def test_standings_have_a_line_for_every_method_of_each_domain_the_smallest_mean_on_top():
+    shift, force = standings(compared_rows(), "Standings").axes
+    assert methods_of(shift)[:3] == ["hybrid", "Expert Augmentation", "physics-only"]
+    assert methods_of(shift)[-1] == "hybrid, source-only"
+    assert set(methods_of(force)) == set(methods_of(shift))
+    assert shift.yaxis_inverted()
+    assert (shift.get_xscale(), shift.get_title(), force.get_title()) == ("log", "Parameter shift", "External force")
+    dots = [line for line in shift.lines if line.get_marker() == "o"]
+    assert [len(line.get_xdata()) for line in dots] == [3] * len(methods_of(shift))
+    assert dots[0].get_xdata() == pytest.approx([3.26e-3 * factor for factor in (0.99, 1, 1.01)])
+
+
+def test_standings_name_n_where_there_are_several():
+    (axes,) = standings(make_rows(), "Standings").axes
+    assert {"hybrid, N = 100", "hybrid, N = 1000", "hybrid, source-only"} < set(methods_of(axes))
+
+
+def test_a_method_that_failed_is_told_at_the_edge_of_the_standings_and_flattens_nothing():
+    rows = spoilt(compared_rows(), "last_layer", lambda row: math.nan)
+    rows = spoilt(rows, "theta_d_only", lambda row: math.inf if row.seed else row.error)
+    rows = spoilt(rows, "linear_residual", lambda row: 1e9 * row.error)
+    axes = standings(rows, "Standings").axes[0]
+    assert axes.get_xlim()[1] < 3.26e-3 * REACH * 1.2
+    assert methods_of(axes)[-3:] == ["source + linear residual", "θ_d only", "last layer (ridge)"]
+    words = [text.get_text() for text in axes.texts]
+    assert words == ["3 of 3 beyond, mean 5e+06", "2 of 3 not finite", "3 of 3 not finite"]
+
+
+def test_theta_is_relative_to_the_truth_in_percent():
+    rows = make_rows(theta={"Ix": 0.0404, "Iy": 0.0196, "k": 8.5e-6})
+    for axes, bias in zip(theta(rows, TRUTH).axes, (1.0, -2.0, 0.0), strict=True):
+        curve = axes.containers[0][0]
+        assert curve.get_ydata() == pytest.approx([bias] * 3, abs=1e-9)
+        assert curve.get_color() == COLOURS["hybrid"]
+
+
+def test_the_view_of_predictions_is_the_truths_whatever_the_models_do():
+    truth, off, lost = straight_flight(), straight_flight(), straight_flight()
+    off[5:, 1] = 1e30
+    lost[3:] = math.nan
+    figure = predictions(truth, {100: {"no_physics": off, "hybrid": lost}, 1000: {"hybrid": truth}}, "Paths")
+    few, many = figure.axes
+    assert few.get_xlim() == many.get_xlim() == pytest.approx((-0.3, 1.3))
+    words = [text.get_text() for text in few.texts]
+    assert "leaves the view" in words[0]
+    assert words[1] == "hybrid ends: not finite"
+    assert not many.texts
+
+
+def test_tilt_is_the_angle_of_roll_and_pitch_alone():
+    states = np.zeros((2, 13))
+    states[:, 3:7] = [math.cos(0.2), math.sin(0.2), 0, 0], [math.cos(0.5), 0, 0, math.sin(0.5)]
+    assert tilt(states) == pytest.approx([math.degrees(0.4), 0.0], abs=1e-12)
+
+
+def test_what_cannot_be_drawn_is_refused():
+    with pytest.raises(ValueError, match="rows must not be empty"):
+        scores([], "Scores")
+    with pytest.raises(ValueError, match="rows must not be empty"):
+        standings([], "Standings")
+    with pytest.raises(ValueError, match="one domain"):
+        scores(compared_rows(), "Scores")
+    with pytest.raises(ValueError, match="theta"):
+        theta([row for row in make_rows() if row.model == "no_physics"], TRUTH)
+    with pytest.raises(ValueError, match="predicted must not be empty"):
+        predictions(straight_flight(), {}, "Paths")
+    with pytest.raises(ValueError, match=r"predicted\[100\]\['hybrid'\].*13"):
+        predictions(straight_flight(), {100: {"hybrid": np.zeros((4, 12))}}, "Paths")
+    with pytest.raises(ValueError, match=r"inputs must have the shape \(10, 4\)"):
+        example_flight(straight_flight(), hovering_inputs(9), 0.1)
+
+
+@settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
+@given(rows=ODD_ROWS, floor=st.floats(0, 1e6))
+def test_any_rows_with_something_to_draw_are_drawn(rows, floor):
+    compared = rows
+    rows = [row for row in rows if row.domain == "parameter_shift"]
+    known = [row for row in rows if row.theta and row.mode != "source_only"]
+    drawn = (
+        (rows, lambda: scores(rows, "Scores", floor)),
+        (known, lambda: theta(rows, TRUTH)),
+        (compared, lambda: standings(compared, "Standings", {"external_force": floor})),
+    )
+    for enough, draw in drawn:
+        if enough:
+            draw().savefig(io.BytesIO(), format="png", dpi=30)

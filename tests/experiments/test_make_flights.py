@@ -1,0 +1,53 @@
+"""Flights that were made before: what an experiment takes from a file of them, and what it refuses."""
+
+import re
+
+import numpy as np
+import pytest
+
+from experiments.make_flights import chosen_flights
+from hybrid_jax.io.datasets import Dataset, save_dataset
+from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.state import QUATERNION
+from hybrid_jax.trajectories import Trajectories
+
+
+def windows(count, steps):
+    rng = np.random.default_rng(count)
+    shapes = (count, 13), (count, steps, 4), (count, steps, 13)
+    x0, u, x = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    for states in (x0, x):
+        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
+    return Trajectories(x0, u, x, dt=0.01)
+
+
+@pytest.fixture
+def file(tmp_path):
+    path = tmp_path / "flights.npz"
+    splits = {"train": windows(8, 10), "validation": windows(4, 10)}
+    save_dataset(path, Dataset(splits, {"config": SOURCE.describe() | {"seed": 3}}))
+    return path
+
+
+def test_the_first_windows_are_taken_so_that_sizes_are_nested(file):
+    few = chosen_flights(file, SOURCE, {"train": SplitSpec(3, 10)}).splits["train"]
+    more = chosen_flights(file, SOURCE, {"train": SplitSpec(8, 10)}).splits["train"]
+    assert (len(few), len(more)) == (3, 8)
+    np.testing.assert_array_equal(few.x, more.x[:3])
+
+
+@pytest.mark.parametrize(
+    ("domain", "splits", "said"),
+    [
+        (SOURCE, {"train": SplitSpec(9, 10)}, "9 windows of split 'train' asked for, it has 8"),
+        (SOURCE, {"test": SplitSpec(1, 100)}, "has no split 'test'"),
+        (SOURCE, {"train": SplitSpec(3, 20)}, "split 'train' has windows of 10 steps, expected 20"),
+        (PARAMETER_SHIFT, {"train": SplitSpec(3, 10)}, 'domain is "source", expected "parameter_shift"'),
+    ],
+)
+def test_what_the_file_does_not_have_is_refused_in_one_line(file, domain, splits, said):
+    with pytest.raises(ValueError, match=re.escape(said)) as refusal:
+        chosen_flights(file, domain, splits)
+    assert str(file) in str(refusal.value)
+    assert "\n" not in str(refusal.value)

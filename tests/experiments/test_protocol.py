@@ -1,0 +1,204 @@
+"""The presets hold the paper's tables, and the lanes made from them are what the tables say."""
+
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import equinox as eqx
+import jax
+import numpy as np
+import pytest
+
+from experiments.paper.conditions import adaptation, fresh_fields, pretraining
+from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
+from experiments.paper.study import pretrained
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.vehicle import IRIS
+
+# The paper's tables, written down a second time: N → (rate of θ_d, minimum, patience).
+HYBRID = {100: (1e-3, 100, 20), 300: (1e-4, 300, 50), 500: (1e-4, 300, 50), 700: (1e-4, 300, 50), 1000: (1e-3, 100, 20)}
+NO_PHYSICS = {n: (1e-5 if n == 1000 else 1e-4, 250, 50) for n in HYBRID}
+NO_PHYSICS_TARGET_ONLY = dict.fromkeys(HYBRID, (1e-4, 250, 50))
+SMALL = replace(PAPER, seeds=3, hidden=4)
+
+
+def plans_by_lane(model, mode, config=SMALL):
+    """[(N, seed, plan)] in the order of the lanes."""
+    states, plans = adaptation(model, mode, fresh_fields(model, IRIS, config), config)
+    lanes = [(n, seed) for n in config.sizes for seed in range(config.seeds)]
+    assert len(states.epoch) == len(lanes)
+    return [(n, seed, lane(plans, i)) for i, (n, seed) in enumerate(lanes)]
+
+
+def numbers(plan):
+    return int(plan.n_train), int(plan.min_epochs), int(plan.patience), int(plan.max_epochs)
+
+
+def test_the_paper_preset_is_the_paper():
+    paper = PRESETS["paper"]
+    assert paper.sizes == (100, 300, 500, 700, 1000)
+    assert (paper.seeds, paper.hidden, paper.batch_size, paper.max_epochs) == (10, 64, 100, 2000)
+    assert (paper.source_train, paper.validation, paper.test) == (10_000, 1000, 1000)
+    assert (paper.regulariser, paper.regulariser_weight, paper.solver) == ("trajectory_correlation", 1e-3, "rk4")
+    assert paper.guess == (0.8, 1.25)
+    assert paper == AdaptationConfig()  # no preset means the paper
+    assert all(preset.preset == name for name, preset in PRESETS.items())
+
+
+@pytest.mark.parametrize("mode", ["fine_tuned", "target_only"])
+def test_hybrid_lanes_have_the_table_s_rates_and_patience(mode):
+    for n, _, plan in plans_by_lane("hybrid", mode):
+        rate, minimum, patience = HYBRID[n]
+        assert numbers(plan) == (n, minimum, patience, 2000)
+        np.testing.assert_allclose((plan.rates.physics, plan.rates.residual), (1e-2, rate), rtol=1e-6)  # float32
+        np.testing.assert_allclose(plan.regulariser_weight, 1e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize(("mode", "table"), [("fine_tuned", NO_PHYSICS), ("target_only", NO_PHYSICS_TARGET_ONLY)])
+def test_no_physics_lanes_have_the_table_s_rates_and_patience(mode, table):
+    for n, _, plan in plans_by_lane("no_physics", mode):
+        rate, minimum, patience = table[n]
+        assert numbers(plan) == (n, minimum, patience, 2000)
+        np.testing.assert_allclose(plan.rates, rate, rtol=1e-6)
+
+
+def test_physics_only_is_the_hybrid_without_its_network():
+    for n, _, plan in plans_by_lane("physics_only", "fine_tuned"):
+        assert numbers(plan) == (n, *HYBRID[n][1:], 2000)
+        np.testing.assert_allclose(plan.rates, 1e-2, rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("model", "minimum", "patience"), [("hybrid", 100, 20), ("no_physics", 300, 50), ("physics_only", 100, 20)]
+)
+def test_pretraining_lanes_use_all_source_flights(model, minimum, patience):
+    _, plans = pretraining(model, IRIS, SMALL)
+    for seed in range(SMALL.seeds):
+        plan = lane(plans, seed)
+        assert numbers(plan) == (10_000, minimum, patience, 2000)
+        np.testing.assert_array_equal(np.sort(plan.subset), np.arange(10_000))
+        expected = {"hybrid": [1e-2, 1e-4], "no_physics": [1e-4], "physics_only": [1e-2]}[model]
+        np.testing.assert_allclose(jax.tree.leaves(plan.rates), expected, rtol=1e-6)
+
+
+def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
+    config = replace(SMALL, rates=replace(SMALL.rates, decay=(0.1, 0.01)))
+    begun = []
+
+    class Trained:
+        def run(self, name, states, plans, *_):
+            begun.append((states.field, plans.rates))
+            return eqx.tree_at(lambda state: state.best, states, jax.tree.map(lambda leaf: leaf + 1, states.field))
+
+    found = pretrained("hybrid", IRIS, config, Trained(), None)
+    fields, rates = zip(*begun, strict=True)
+    for field, before in zip((*fields[1:], found.best), fields, strict=True):
+        assert eqx.tree_equal(field, jax.tree.map(lambda leaf: leaf + 1, before))
+    for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
+        np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)
+        np.testing.assert_allclose(each.residual, factor * 1e-4, rtol=1e-6)
+
+
+def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():
+    subsets = {(n, seed): plan.subset for n, seed, plan in plans_by_lane("hybrid", "fine_tuned")}
+    for (n, seed), subset in subsets.items():
+        np.testing.assert_array_equal(np.sort(subset), np.arange(1000))
+        # One order a seed; a size takes its first N: nested.
+        np.testing.assert_array_equal(subset, subsets[100, seed], err_msg=f"N = {n}")
+    assert not np.array_equal(subsets[100, 0], subsets[100, 1])
+    for n, seed, plan in plans_by_lane("no_physics", "target_only"):
+        np.testing.assert_array_equal(plan.subset, subsets[n, seed])
+
+
+def test_a_seed_gives_all_models_the_same_parts():
+    fields = {model: fresh_fields(model, IRIS, SMALL) for model in ("hybrid", "no_physics", "physics_only")}
+    assert isinstance(fields["hybrid"], Hybrid)
+    assert eqx.tree_equal(fields["hybrid"].residual, fields["no_physics"])
+    assert eqx.tree_equal(fields["hybrid"].physics, fields["physics_only"])
+    for leaf in (fields["no_physics"].weight_in, fields["physics_only"].log_ratios["Ix"]):
+        assert len(np.unique(leaf, axis=0)) == SMALL.seeds
+    factors = np.exp(list(fields["physics_only"].log_ratios.values()))
+    assert ((factors >= 0.8) & (factors <= 1.25)).all()
+
+
+def test_lanes_start_from_their_own_seed_s_field():
+    fields = fresh_fields("no_physics", IRIS, SMALL)
+    states, _ = adaptation("no_physics", "fine_tuned", fields, SMALL)
+    for i in range(len(SMALL.sizes) * SMALL.seeds):
+        np.testing.assert_array_equal(states.field.weight_in[i], fields.weight_in[i % SMALL.seeds])
+    # A seed fixes the order of minibatches; the seeds' orders differ.
+    assert len(np.unique(states.key, axis=0)) == SMALL.seeds
+
+
+def test_a_size_between_columns_takes_the_nearest_by_ratio():
+    assert [column(n) for n in (1, 100, 170, 180, 300, 600, 700, 1000, 50_000)] == [0, 0, 0, 1, 1, 3, 3, 4, 4]
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"sizes": (10,)}, "--sizes"),
+        ({"sizes": ()}, "--sizes"),
+        ({"sizes": (100, 100)}, "--sizes"),
+        ({"models": ()}, "--models"),
+        ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
+        ({"source_train": 50}, "--source-train"),
+        ({"seeds": 0}, "--seeds"),
+        ({"max_epochs": 0}, "--max-epochs"),
+        ({"guess": (1.2, 0.8)}, "--guess"),
+        ({"guess": (-1.0, 0.8)}, "--guess"),
+        ({"guess": (0.8, math.inf)}, "--guess must be two factors"),
+        ({"guess_off": math.nan}, "--guess-off must be a positive finite number, got nan"),
+        ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
+        ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
+        ({"data_seed": -1}, "--data-seed must be an integer of at least 0, got -1"),
+        ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
+        ({"rates": replace(PAPER.rates, physics=-1.0)}, "--rates.physics must be a finite number of at least 0"),
+        ({"rates": replace(PAPER.rates, no_physics=(1e-4,) * 4 + (math.nan,))}, "--rates.no-physics must be a finite"),
+        ({"rates": replace(PAPER.rates, offset=0.0)}, "--rates.offset"),
+        ({"rates": replace(PAPER.rates, decay=(0.1, 0.0))}, "--rates.decay"),
+        (
+            {"patience": replace(PAPER.patience, hybrid_patience=(20,) * 4 + (-1,))},
+            "--patience.hybrid-patience must be",
+        ),
+        ({"patience": replace(PAPER.patience, no_physics=Stopping(-1, 5))}, "--patience.no-physics.minimum must be"),
+        ({"patience": replace(PAPER.patience, hybrid_minimum=(1, 2))}, "--patience.hybrid-minimum"),
+    ],
+    ids=str,
+)
+def test_options_that_do_not_fit_are_refused_by_name(change, named):
+    with pytest.raises(ValueError, match=named):
+        replace(PAPER, **change)
+
+
+def test_minibatches_of_one_window_are_for_what_does_not_normalise_them():
+    for change in ({"norm": "layer"}, {"models": ("physics_only",)}):
+        assert replace(PAPER, batch_size=1, **change).batch_size == 1
+
+
+def test_smoke_is_small_but_whole():
+    assert SMOKE.models == PAPER.models
+    assert isinstance(SMOKE.cache, Path)
+
+
+@pytest.mark.parametrize("model", ["hybrid", "no_physics"])
+def test_the_output_bias_has_a_rate_of_its_own_if_asked_for(model):
+    """And all else the rate that it had."""
+    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
+    for (_, _, usual), (_, _, found) in zip(
+        plans_by_lane(model, "fine_tuned"), plans_by_lane(model, "fine_tuned", offset), strict=False
+    ):
+        network = found.rates.residual if model == "hybrid" else found.rates
+        rate = usual.rates.residual if model == "hybrid" else usual.rates
+        np.testing.assert_array_equal(network.bias_out, np.float32([rate] * 7 + [0.3] * 6))
+        others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
+        assert {float(each) for each in others} == {float(rate)}
+        if model == "hybrid":
+            assert {float(each) for each in jax.tree.leaves(found.rates.physics)} == {float(usual.rates.physics)}
+
+
+def test_physics_alone_has_no_output_bias():
+    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
+    for _, _, plan in plans_by_lane("physics_only", "fine_tuned", offset):
+        assert {float(each) for each in jax.tree.leaves(plan.rates)} == {np.float32(SMALL.rates.physics)}

@@ -1,0 +1,105 @@
+"""An unfinished run goes on as itself or not at all; nothing of it is deleted."""
+
+import json
+from dataclasses import replace
+
+import pytest
+
+from experiments.paper.config import SMOKE
+from experiments.runner.run_record import FILE, OtherRun, recorded
+
+
+def silent(line):
+    pass
+
+
+def record(folder):
+    return json.loads((folder / FILE).read_text())
+
+
+def interrupt(folder, config, error=KeyboardInterrupt):
+    with pytest.raises(error), recorded(folder, config, silent):
+        raise error
+
+
+def test_a_finished_run_gives_way_to_any_other(tmp_path):
+    with recorded(tmp_path, SMOKE, silent):
+        assert record(tmp_path)["state"] == "unfinished"
+    assert record(tmp_path)["state"] == "finished"
+    with recorded(tmp_path, replace(SMOKE, seeds=2), silent):
+        pass
+    assert record(tmp_path)["config"]["seeds"] == 2
+
+
+def test_an_unfinished_run_goes_on_and_says_so(tmp_path):
+    interrupt(tmp_path, SMOKE)
+    begun, said = record(tmp_path), []
+    with recorded(tmp_path, replace(SMOKE, saving=0.5, cache=tmp_path), said.append):
+        pass
+    assert said == [f"{tmp_path}: goes on with the run begun {begun['started']}"]
+    assert record(tmp_path) == begun | {"state": "finished"}
+
+
+def test_another_configuration_is_refused_field_by_field(tmp_path):
+    interrupt(tmp_path, SMOKE)
+    before = record(tmp_path)
+    other = replace(SMOKE, seeds=2, rates=replace(SMOKE.rates, physics=0.5))
+    with pytest.raises(OtherRun) as refused, recorded(tmp_path, other, silent):
+        pass
+    assert str(refused.value).splitlines() == [
+        f"{tmp_path}: holds an unfinished run, begun {before['started']}, that differs:",
+        "  config.rates.physics: 0.01 → 0.5",
+        "  config.seeds: 1 → 2",
+        "  --fresh starts anew and moves it aside; another --out leaves it as it is",
+    ]
+    assert record(tmp_path) == before
+
+
+def test_flights_are_known_by_their_content(tmp_path):
+    flights, out = tmp_path / "flights.npz", tmp_path / "out"
+    flights.write_bytes(b"one")
+    given = replace(SMOKE, source_flights=flights)
+    interrupt(out, given)
+    flights.rename(tmp_path / "moved.npz")
+    interrupt(out, replace(SMOKE, source_flights=tmp_path / "moved.npz"))
+    flights.write_bytes(b"two")
+    with (
+        pytest.raises(OtherRun, match=r"flights\.source_flights: 7692c3ad\S+ → 3fc4ccfe\S+"),
+        recorded(out, given, silent),
+    ):
+        pass
+
+
+def test_another_version_is_refused(tmp_path, monkeypatch):
+    """A package of another version number stands before the installed one, as after an upgrade."""
+    interrupt(tmp_path / "out", SMOKE)
+    about = tmp_path / "numpy-99.0.dist-info" / "METADATA"
+    about.parent.mkdir()
+    about.write_text("Metadata-Version: 2.1\nName: numpy\nVersion: 99.0\n")
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.raises(OtherRun, match=r"versions\.numpy: \S+ → 99\.0"), recorded(tmp_path / "out", SMOKE, silent):
+        pass
+
+
+def test_fresh_moves_all_aside_but_the_lock(tmp_path):
+    out = tmp_path / "out"
+    interrupt(out, SMOKE)
+    (out / ".lock").touch()
+    (out / "models").mkdir()
+    (out / "models" / "one.npz").write_bytes(b"mine")
+    before = record(out)
+    for count in (1, 2):
+        interrupt(out, replace(SMOKE, seeds=2, fresh=True))
+        assert len(list(tmp_path.glob("out.before-*"))) == count
+        assert {path.name for path in out.iterdir()} == {".lock", FILE}
+    first = min(tmp_path.glob("out.before-*"), key=lambda path: (len(path.name), path.name))
+    assert record(first) == before
+    assert (first / "models" / "one.npz").read_bytes() == b"mine"
+
+
+def test_bad_input_begins_no_run_and_ends_none(tmp_path):
+    interrupt(tmp_path, SMOKE, ValueError)
+    assert not (tmp_path / FILE).exists()
+    interrupt(tmp_path, SMOKE, OSError)
+    interrupt(tmp_path, SMOKE, ValueError)
+    assert record(tmp_path)["state"] == "unfinished"

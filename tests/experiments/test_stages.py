@@ -1,0 +1,111 @@
+"""A sweep is run once, is not lost when interrupted, and is found again only by what it was."""
+
+import signal
+from dataclasses import replace
+
+import jax
+import numpy as np
+import pytest
+from pendulum import DAMPING, pendulum, swings
+from rich.console import Console
+
+from experiments.paper.results import rows_of, trained
+from experiments.reporting.report_tables import lane_notes
+from experiments.runner.progress import SweepLine
+from experiments.runner.stages import Stages
+from hybrid_jax.io.archive import named_leaves
+from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.training.fitting import make_plan, start
+from hybrid_jax.training.objective import Settings
+
+SETTINGS = Settings(batch_size=10)
+DATA = Dataset({"train": swings(20), "validation": swings(10, seed=1)}, {"config": {}})
+STATES = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.6))])
+PLANS = stack([make_plan(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rate in (0.03, 0.01)])
+
+
+def stages(folder):
+    return Stages(folder, Console(quiet=True))
+
+
+def run(folder, states=STATES, plans=PLANS, settings=SETTINGS, data=DATA):
+    found = stages(folder)
+    return found.run("a sweep", states, plans, settings, data), found
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("stages")
+
+
+@pytest.fixture(scope="module")
+def whole(folder):
+    return run(folder)[0]
+
+
+def same(one, other):
+    one, other = named_leaves(one), named_leaves(other)
+    return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
+
+
+def test_a_finished_sweep_is_found_not_run(folder, whole):
+    again, found = run(folder)
+    assert found.reused == ["a sweep"]
+    assert same(again, whole)
+
+
+@pytest.mark.usefixtures("heard")
+def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
+    seen = []
+
+    def interrupt(self, progress):
+        seen.append(progress.epochs)
+        if len(seen) == 2:
+            signal.raise_signal(signal.SIGINT)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(SweepLine, "show", interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            run(tmp_path)
+    assert [path.name.endswith(".begun") for path in tmp_path.iterdir()] == [True]  # the block was finished, and saved
+    later = []
+    with monkeypatch.context() as patch:
+        patch.setattr(SweepLine, "show", lambda self, progress: later.append(progress.epochs))
+        resumed, found = run(tmp_path)
+    assert later[0] > seen[0]  # it did not start anew
+    assert found.reused == []
+    assert same(resumed, whole)
+    assert not list(tmp_path.glob("*.begun"))
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"settings": replace(SETTINGS, batch_size=5)},
+        {"plans": stack([make_plan(0.02, np.arange(20), 20, 1, 1, 2, 0.0)] * 2)},
+        {"data": Dataset({"train": swings(20, seed=7), "validation": swings(10, seed=1)}, {"config": {}})},
+        {"states": stack([start(pendulum(length, 2 * DAMPING), jax.random.key(0)) for length in (0.8, 0.6)])},
+    ],
+    ids=["settings", "plans", "data", "what is static in a field"],
+)
+def test_anything_else_is_another_sweep(folder, whole, other):
+    assert run(folder, **other)[1].reused == []
+
+
+def test_a_diverged_lane_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
+    """A learning rate of 1e3 in one lane: the other keeps every bit."""
+    final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
+    assert same(lane(final, 0), lane(whole, 0))
+    rows = rows_of(trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2)), "parameter_shift")
+    assert [row.status == "diverged" for row in rows] == [False, True]
+    assert rows[1].epochs == final.epoch[1] < 30
+    assert any("1 of 2 runs met a non-finite loss" in note for note in lane_notes(rows))
+
+
+def test_a_damaged_file_is_named(tmp_path, whole):
+    run(tmp_path)
+    (path,) = tmp_path.glob("*.npz")
+    path.write_bytes(path.read_bytes()[:-100])
+    with pytest.raises(ValueError, match=path.name):
+        run(tmp_path)

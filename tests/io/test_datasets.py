@@ -1,0 +1,199 @@
+"""Laws of dataset files."""
+
+import errno
+import json
+import os
+import time
+import zipfile
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hybrid_jax.io.datasets import Dataset, config_hash, content_hash, load_dataset, save_dataset
+from hybrid_jax.state import QUATERNION
+from hybrid_jax.trajectories import Trajectories
+
+CONFIG = {"domain": "source", "seed": 0, "vehicle": {"mass": 1.5, "inertia": (0.1, 0.2, 0.3)}}
+
+
+def windows(count, steps=10, seed=0):
+    rng = np.random.default_rng(seed)
+    shapes = (count, 13), (count, steps, 4), (count, steps, 13)
+    x0, u, x = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
+    for states in (x0, x):
+        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
+    return Trajectories(x0, u, x, dt=0.01)
+
+
+@pytest.fixture
+def dataset():
+    metadata = {"config": CONFIG, "versions": {"jax": "1"}}
+    return Dataset({"train": windows(20), "test": windows(5, 100, seed=1)}, metadata)
+
+
+@pytest.fixture
+def file(tmp_path, dataset):
+    path = tmp_path / "set.npz"
+    save_dataset(path, dataset)
+    return path
+
+
+def refusal(file, **expected):
+    with pytest.raises(ValueError, match=r".") as error:
+        load_dataset(file, **expected)
+    message = str(error.value)
+    assert str(file) in message
+    assert "\n" not in message
+    return message
+
+
+def test_round_trip(file, dataset):
+    loaded = load_dataset(file, CONFIG)
+    assert content_hash(loaded) == content_hash(dataset)
+    for name, split in dataset.splits.items():
+        for part in ("x0", "u", "x"):
+            found = getattr(loaded.splits[name], part)
+            np.testing.assert_array_equal(found, getattr(split, part))
+            assert found.dtype == np.float32
+        assert loaded.splits[name].dt == 0.01
+
+
+def test_same_content_same_bytes_at_another_time_and_in_another_order(file, dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(time, "time", lambda: 2e9)
+    turned = replace(dataset, splits=dict(reversed(dataset.splits.items())))
+    save_dataset(tmp_path / "again.npz", turned)
+    assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
+
+
+@pytest.mark.parametrize("share", [0.0, 0.01, 0.3, 0.9, 0.999])
+def test_truncated_files_are_refused(file, share):
+    content = file.read_bytes()
+    file.write_bytes(content[: int(share * len(content))])
+    assert "truncated" in refusal(file)
+
+
+def test_any_flipped_byte_is_noticed(file):
+    """Every 997th byte: data, header and directory; the zip's own slack is the one place that may change nothing."""
+    content = file.read_bytes()
+    digest = content_hash(load_dataset(file))
+    unnoticed = 0
+    for place in range(0, len(content), 997):
+        flipped = bytearray(content)
+        flipped[place] ^= 0x10
+        file.write_bytes(flipped)
+        try:
+            assert content_hash(load_dataset(file)) == digest
+            unnoticed += 1
+        except ValueError:
+            pass
+    assert unnoticed <= 1
+
+
+def test_an_altered_array_with_a_sound_zip_fails_the_checksum(file):
+    with zipfile.ZipFile(file) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist()}
+    changed = bytearray(entries["train/x.npy"])
+    changed[-2] ^= 1
+    entries["train/x.npy"] = bytes(changed)
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    assert "checksum differs" in refusal(file)
+
+
+def test_a_missing_array_is_noticed(file):
+    with zipfile.ZipFile(file) as archive:
+        entries = {name: archive.read(name) for name in archive.namelist() if name != "test/u.npy"}
+    with zipfile.ZipFile(file, "w") as archive:
+        for name, content in entries.items():
+            archive.writestr(name, content)
+    assert "checksum differs" in refusal(file)
+
+
+def test_missing_files_and_strangers_are_refused(tmp_path):
+    assert "no such file" in refusal(tmp_path / "none.npz")
+    stranger = tmp_path / "stranger.npz"
+    np.savez(stranger, a=np.zeros(3))
+    assert "not a hybrid_jax dataset" in refusal(stranger)
+    text = tmp_path / "text.npz"
+    text.write_text("hello")
+    assert "not a hybrid_jax dataset" in refusal(text)
+    array = tmp_path / "array.npz"
+    with array.open("wb") as handle:
+        np.save(handle, np.zeros(3))
+    assert "not a hybrid_jax dataset" in refusal(array)
+    assert "not a hybrid_jax dataset" in refusal(tmp_path)
+
+
+def test_pickles_are_never_run(tmp_path):
+    class Trap:
+        def __reduce__(self):
+            return os.mkdir, (str(tmp_path / "sprung"),)
+
+    path = tmp_path / "trap.npz"
+    with zipfile.ZipFile(path, "w") as archive:
+        header = {"format": "hybrid_jax dataset 1", "sha256": "", "metadata": {}, "splits": {}}
+        archive.writestr("header.json", json.dumps(header))
+        with archive.open("x.npy", "w") as entry:
+            np.lib.format.write_array(entry, np.array([Trap()], dtype=object), allow_pickle=True)
+    refusal(path)
+    assert not (tmp_path / "sprung").exists()
+
+
+def test_another_configuration_shows_the_fields_that_differ(file):
+    message = refusal(file, expected_config={**CONFIG, "seed": 1, "vehicle": {"mass": 1.6, "inertia": [0.1, 0.2, 0.3]}})
+    assert "seed is 0, expected 1" in message
+    assert "vehicle.mass is 1.5, expected 1.6" in message
+    assert "inertia" not in message
+
+
+def test_other_content_is_not_overwritten_unless_told(file, dataset):
+    before = file.read_bytes()
+    save_dataset(file, dataset)
+    other = replace(dataset, splits={"train": windows(3)})
+    with pytest.raises(ValueError, match="exists with other content"):
+        save_dataset(file, other)
+    assert file.read_bytes() == before
+    save_dataset(file, other, overwrite=True)
+    assert len(load_dataset(file).splits["train"]) == 3
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_no_litter(file, dataset, monkeypatch):
+    before = file.read_bytes()
+
+    def full_disk(_):
+        raise OSError(errno.ENOSPC, "no space left")
+
+    monkeypatch.setattr(os, "fsync", full_disk)
+    with pytest.raises(OSError, match="no space"):
+        save_dataset(file, replace(dataset, splits={"train": windows(3)}), overwrite=True)
+    assert file.read_bytes() == before
+    assert list(file.parent.iterdir()) == [file]
+
+
+def test_malformed_windows_are_not_saved(tmp_path, dataset):
+    broken = windows(4)
+    broken.x[2, 3, 5] = np.nan
+    with pytest.raises(ValueError, match=r"split 'train'.*\[2, 3, 5\]"):
+        save_dataset(tmp_path / "a.npz", replace(dataset, splits={"train": broken}))
+    assert not list(tmp_path.iterdir())
+
+
+def test_metadata_must_be_json(tmp_path, dataset):
+    with pytest.raises(ValueError, match="JSON"):
+        save_dataset(tmp_path / "a.npz", replace(dataset, metadata={"config": {"a": float("nan")}}))
+
+
+def test_subsets_are_nested_and_too_large_ones_refused(file):
+    loaded = load_dataset(file)
+    np.testing.assert_array_equal(loaded.first("train", 7).x, loaded.first("train").x[:7])
+    with pytest.raises(ValueError, match=r"set\.npz: 21 windows of split 'train' asked for, it has 20"):
+        loaded.first("train", 21)
+    with pytest.raises(ValueError, match="no split 'validation', only"):
+        loaded.first("validation")
+
+
+def test_config_hash_ignores_order_and_sees_values():
+    assert config_hash(CONFIG) == config_hash(dict(reversed(CONFIG.items())))
+    assert config_hash(CONFIG) != config_hash({**CONFIG, "seed": 1})

@@ -1,0 +1,262 @@
+"""Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
+
+import itertools
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
+from hybrid_jax.dynamics.base import (
+    AbstractVectorField,
+    Frozen,
+    Statistics,
+    deploy_batch,
+    evaluate_batch,
+    observe,
+    trainable,
+)
+from hybrid_jax.networks import views
+from hybrid_jax.networks.mlp import InputScaling, silenced
+from hybrid_jax.networks.views import BodyFrame, BodyMotion, restricted
+from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import IRIS
+
+KEY = jax.random.key(0)
+HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
+VIEWS = [
+    (inputs, outputs)
+    for inputs, outputs in itertools.product(views.INPUTS, views.OUTPUTS)
+    if inputs in views.GO_WITH.get(outputs, views.INPUTS) and outputs != "rotors"  # see test_rotors
+]
+FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in views.FROM_THE_BODY]
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    """So that every law here holds to round-off, 1e-12."""
+    with jax.enable_x64(True):
+        yield
+
+
+def view(inputs="all", outputs="all", **options):
+    known = {"hidden": 9, "scaling": HOVER, "vehicle": IRIS}
+    return restricted(KEY, inputs=inputs, outputs=outputs, **(known | options))
+
+
+def samples(count=7, seed=0):
+    """States and inputs as columns."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(13, count)) * 2
+    x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
+    return jnp.asarray(x), jnp.asarray(rng.uniform(500, 800, (4, count)))
+
+
+def deployed(field, x, u):
+    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+
+
+def turned(x, yaw):
+    """States, or derivatives of states, turned about the world's vertical."""
+    turn = jnp.broadcast_to(rotation.from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(yaw))[:, None], (4, 1))
+    return jnp.concatenate(
+        [
+            rotation.rotate(turn, x[POSITION]),
+            rotation.multiply(turn, x[QUATERNION]),
+            rotation.rotate(turn, x[VELOCITY]),
+            x[BODY_RATES],
+        ]
+    )
+
+
+def network_of(field):
+    return field if not isinstance(field, views.View) else network_of(field.field)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_by_default_the_network_is_the_paper_s(norm):
+    plain = residual_network(13, 4, KEY, hidden=20, scaling=HOVER, norm=norm)
+    assert eqx.tree_equal(restricted(KEY, hidden=20, scaling=HOVER, norm=norm), plain)
+    assert eqx.tree_equal(restricted(KEY), residual_network(13, 4, KEY))
+
+
+@pytest.mark.parametrize("options", [{"inputs": "world"}, {"outputs": "v"}, {"norm": "group"}], ids=str)
+def test_an_unknown_name_is_refused(options):
+    (name, value), *_ = options.items()
+    with pytest.raises(ValueError, match=rf"{name} must be one of .*'{value}'"):
+        restricted(KEY, **options)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), [pair for pair in VIEWS if pair[0] != "all"])
+def test_where_the_vehicle_is_does_not_matter_and_how_high_may(inputs, outputs):
+    field, (x, u) = view(inputs, outputs), samples()
+    here = deployed(field, x, u)
+    np.testing.assert_array_equal(deployed(field, x.at[:2].add(100.0), u), here)
+    moves = jnp.abs(deployed(field, x.at[2].add(1.0), u) - here).max(0)
+    assert (moves == 0).all() if inputs == "body_motion" else (moves > 1e-3).all()
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), FROM_THE_BODY)
+def test_seen_from_the_body_a_turned_vehicle_has_the_turned_derivative(inputs, outputs):
+    field, (x, u) = view(inputs, outputs), samples()
+    for yaw in (0.3, 2.0, -3.0):
+        np.testing.assert_allclose(deployed(field, turned(x, yaw), u), turned(deployed(field, x, u), yaw), atol=1e-12)
+    tilt = rotation.from_axis_angle(jnp.array([1.0, 0.0, 0.0]), jnp.asarray(0.3))
+    tilted = x.at[QUATERNION].set(rotation.multiply(jnp.broadcast_to(tilt[:, None], (4, 7)), x[QUATERNION]))
+    # Gravity has moved in the body, so this is another situation.
+    assert (jnp.abs(deployed(field, tilted, u) - deployed(field, x, u))[BODY_RATES].max(0) > 1e-3).all()
+
+
+def test_a_world_frame_network_does_see_yaw():
+    """The test above would pass for a network that sees nothing."""
+    field, (x, u) = view("no_xy"), samples()
+    assert (jnp.abs(deployed(field, turned(x, 1.0), u) - deployed(field, x, u))[BODY_RATES].max(0) > 1e-3).all()
+
+
+@pytest.mark.parametrize("outputs", ["all", "accelerations"])
+@pytest.mark.parametrize("inputs", ["no_xy_yaw", "near_ground"])
+def test_without_yaw_a_turned_vehicle_is_the_same_in_the_axes_of_the_world(inputs, outputs):
+    """The attitude alone is turned; the velocity, which a wind of the world acts on, is not."""
+    field, (x, u) = view(inputs, outputs), samples()
+    for yaw in (0.3, 2.0, -3.0):
+        other = x.at[QUATERNION].set(turned(x, yaw)[QUATERNION])
+        np.testing.assert_allclose(deployed(field, other, u), deployed(field, x, u), atol=1e-12)
+        moved = deployed(field, x.at[VELOCITY].set(turned(x, yaw)[VELOCITY]), u)
+        assert (jnp.abs(moved - deployed(field, x, u)).max(0) > 1e-3).all()
+
+
+def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
+    """Up to half a radius, below which both stop."""
+    x = samples()[0].at[2].set(jnp.linspace(-0.5, 1.0, 7))
+    heights = jax.vmap(rotor_altitudes, (-1, None), -1)(x, parameters_of(IRIS).rotor_positions)
+    near = IRIS.rotor_radius / jnp.maximum(heights, IRIS.rotor_radius / 2)
+    assert (near.max(), near.min()) == (2, pytest.approx(0.1, abs=0.05))
+    seen = view("near_ground").read(x)
+    np.testing.assert_allclose(seen[1:5], near, atol=1e-6)  # the simulator's parameters are of single precision
+    np.testing.assert_array_equal(jnp.delete(seen, np.arange(1, 5), axis=0), view("no_xy_yaw").read(x))
+
+
+def test_near_the_ground_of_an_unknown_vehicle_is_refused():
+    with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
+        restricted(KEY, inputs="near_ground")
+    with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
+        view("near_ground", vehicle=replace(IRIS, rotor_radius=0.0))
+
+
+def test_the_body_s_view_of_a_state():
+    """Nose down by a right angle about y: the world's down is the body's forward, the world's x the body's up."""
+    q = rotation.from_axis_angle(jnp.array([0.0, 1.0, 0.0]), jnp.asarray(np.pi / 2))
+    x = jnp.concatenate([jnp.array([5.0, 6.0, 7.0]), q, jnp.array([2.0, 3.0, 0.0]), jnp.array([0.1, 0.2, 0.3])])
+    expected = [7, 1, 0, 0, 0, 3, 2, 0.1, 0.2, 0.3]
+    np.testing.assert_allclose(BodyFrame(rigid_body(IRIS)).read(x), expected, atol=1e-12)
+    motion = [0, 3, 2, 0.1, 0.2, 0.3, -1, 0, 0]
+    np.testing.assert_allclose(BodyMotion(rigid_body(IRIS)).read(x), motion, atol=1e-12)
+
+
+@pytest.mark.parametrize("inputs", views.FROM_THE_BODY)
+def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
+    """All of ṗ, q̇, v̇ and ω̇ are moved, and q̇ is perpendicular to q."""
+    field, (x, u) = view(inputs, "motion"), samples()
+    derivative = deployed(field, x, u)
+    assert (jnp.abs(derivative).max(1) > 1e-3).all()
+    np.testing.assert_allclose((x[QUATERNION] * derivative[QUATERNION]).sum(0), 0, atol=1e-12)
+
+
+def test_motion_is_not_written_in_the_world():
+    with pytest.raises(ValueError, match="outputs 'motion' needs inputs of body or body_motion, got 'all'"):
+        view("all", "motion")
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
+    field, (x, u) = silenced(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
+    np.testing.assert_array_equal(deployed(field, x, u), deployed(rigid_body(IRIS), x, u))
+    slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field.residual)
+    assert (network_of(slope).weight_out != 0).any()
+    with pytest.raises(ValueError, match="no ResidualNetwork"):
+        silenced(rigid_body(IRIS))
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
+    field, (x, u) = view(inputs, outputs, linear=True), samples()
+    assert (evaluate_batch(field, x, u) == 0).all()
+    slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field)
+    path = network_of(slope)
+    assert (path.weight != 0).any()
+    assert (path.field.weight_out != 0).any()
+    moved = jax.tree.map(lambda leaf: leaf + 1, field)
+    assert (deployed(silenced(moved), x, u) == 0).all()
+
+
+@pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])
+@pytest.mark.parametrize("inputs", views.INPUTS)
+def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
+    field, (x, u) = view(inputs, outputs), samples()
+    for evaluate in (deployed, evaluate_batch):
+        derivative = evaluate(field, x, u)
+        assert (derivative[:-written] == 0).all()
+        assert (jnp.abs(derivative[-written:]).max(1) > 1e-3).all()
+    assert network_of(field).weight_out.shape == (written, 9)
+
+
+class Kinetic(AbstractVectorField):
+    """v̇ = −C v, the same in every frame."""
+
+    drag: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.concatenate([jnp.zeros(7), -self.drag * x[4:7], jnp.zeros(3)])
+
+
+def test_isotropic_drag_is_the_same_seen_from_the_body():
+    """A map that reads the body-frame velocity and writes a body-frame v̇ is the drag of the world."""
+    field, (x, u) = BodyFrame(Kinetic(jnp.asarray(0.4))), samples()
+    derivative = deployed(field, x, u)
+    np.testing.assert_allclose(derivative[VELOCITY], -0.4 * x[VELOCITY], atol=1e-12)
+    assert (derivative[:7] == 0).all()
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
+    """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
+    field, (x, u) = view(inputs, outputs), samples(20)
+    trained = evaluate_batch(field, x, u)
+    assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
+
+    def seen(node, x):
+        return seen(node.field, node.read(x)) if isinstance(node, views.View) else x
+
+    network = network_of(field)
+    hidden = network.weight_in @ jnp.concatenate([seen(field, x), network.scaling(u)])
+    here = Statistics(hidden.mean(1), hidden.var(1))
+    exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
+    np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
+    running = network_of(observe(field, x, u)).norm.running
+    np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
+    np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
+    x, u = samples()
+    for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
+        one_by_one = jax.vmap(field, -1, -1)(x, u)
+        np.testing.assert_allclose(deploy_batch(field, x, u), one_by_one, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(deploy_batch(Frozen(field), x, u), one_by_one, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
+    field, (x, u) = Hybrid(rigid_body(IRIS), view(inputs, outputs)), samples()
+    save(tmp_path / "model.npz", field)
+    loaded = load(tmp_path / "model.npz").field
+    assert eqx.tree_equal(loaded, field)
+    np.testing.assert_array_equal(deployed(loaded, x, u), deployed(field, x, u))
+    # θ_p (3), the network's weights, gain, shift and bias (5); not its running statistics.
+    assert sum(jax.tree.leaves(trainable(field))) == 8

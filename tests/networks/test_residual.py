@@ -1,0 +1,267 @@
+"""Laws of the network f_d and its normalisations."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from hybrid_jax import load, save
+from hybrid_jax.dynamics.base import Hybrid, Statistics, deploy_batch, deployed, evaluate_batch, observe, trainable
+from hybrid_jax.networks.mlp import (
+    BatchNorm,
+    Bias,
+    DeployedNetwork,
+    InputScaling,
+    LayerNorm,
+    LinearPath,
+    LinearResidual,
+    ResidualNetwork,
+    residual_network,
+)
+
+STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
+
+
+def network(seed=0, hidden=HIDDEN):
+    """A network whose gains, shifts and running statistics are not those of a fresh one."""
+    keys = jax.random.split(jax.random.key(seed), 5)
+    fresh = residual_network(STATES, INPUTS, keys[0], hidden=hidden, scaling=InputScaling(2.0, 3.0))
+    gain, shift, mean = (jax.random.normal(key, (hidden,)) for key in keys[1:4])
+    running = Statistics(mean, jax.random.uniform(keys[4], (hidden,), minval=0.5, maxval=2.0))
+    return eqx.tree_at(lambda field: field.norm, fresh, BatchNorm(gain, shift, running))
+
+
+def batch(seed=0, columns=COLUMNS):
+    rng = np.random.default_rng(seed)
+    return jnp.asarray(3 + 2 * rng.normal(size=(STATES, columns))), jnp.asarray(rng.normal(size=(INPUTS, columns)))
+
+
+def plain(field, x, u):
+    """The training formula as the papers write it, for autodiff: γ (h − mean) / √(variance + ε) + β."""
+    hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
+    mean, variance = hidden.mean(1, keepdims=True), hidden.var(1, keepdims=True)
+    normal = (hidden - mean) / jnp.sqrt(variance + field.norm.epsilon)
+    active = jnp.maximum(field.norm.gain[:, None] * normal + field.norm.shift[:, None], 0)
+    return field.weight_out @ active + field.bias_out[:, None]
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(seed):
+    with jax.enable_x64(True):
+        field, (x, u) = network(seed), batch(seed)
+        weights = jax.random.normal(jax.random.key(9), (STATES, COLUMNS))
+
+        def gradients(formula):
+            parameters, rest = eqx.partition((field, x, u), eqx.is_inexact_array)
+            return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
+
+        np.testing.assert_allclose(evaluate_batch(field, x, u), plain(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(formula)) for formula in (evaluate_batch, plain))
+        assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
+        for one, other in zip(found, expected, strict=True):
+            # Round-off of float64 on gradients of up to about 100.
+            np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
+        assert sum(float(jnp.abs(leaf).max()) > 1e-3 for leaf in expected) == 7
+
+
+def test_in_training_hidden_units_have_mean_zero_and_variance_one():
+    """As torch.nn.BatchNorm1d in training: the batch's own mean and biased variance, ε = 1e-5."""
+    with jax.enable_x64(True):
+        # relu(h) − relu(−h) = h: with weights ±1 the output shows the normalised units themselves.
+        inner = jax.random.normal(jax.random.key(0), (STATES, STATES + INPUTS))
+        both = BatchNorm(jnp.ones(2 * STATES), jnp.zeros(2 * STATES), Statistics(jnp.zeros(10), jnp.ones(10)))
+        field = ResidualNetwork(
+            jnp.concatenate([inner, -inner]), both, jnp.hstack([jnp.eye(STATES), -jnp.eye(STATES)]), jnp.zeros(STATES)
+        )
+        x, u = batch(columns=50)
+        normalised = np.asarray(evaluate_batch(field, x, u))
+        variance = np.asarray(inner @ jnp.concatenate([x, u])).var(1)
+        np.testing.assert_allclose(normalised.mean(1), 0, atol=1e-13)
+        np.testing.assert_allclose(normalised.var(1), variance / (variance + 1e-5), rtol=1e-12)
+
+
+def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+        target = Statistics(hidden.mean(1), hidden.var(1))
+        before, observed = field.norm.running, field
+        for _ in range(20):
+            observed = observe(observed, x, u)
+        for name in ("mean", "variance"):
+            start, end, goal = (getattr(each, name) for each in (before, observed.norm.running, target))
+            np.testing.assert_allclose(end - goal, 0.9**20 * (start - goal), rtol=0, atol=1e-12)
+        untouched = eqx.tree_at(lambda field: field.norm.running, observed, before)
+        assert eqx.tree_equal(untouched, field)
+
+
+def test_deployment_is_training_when_the_running_statistics_are_the_batch_s():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+        here = Statistics(hidden.mean(1), hidden.var(1))
+        field = eqx.tree_at(lambda field: field.norm.running, field, here)
+        deployed = jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+        np.testing.assert_allclose(deployed, evaluate_batch(field, x, u), rtol=0, atol=1e-12)
+
+
+def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
+    field = network()
+    x, u = jnp.ones((STATES, COLUMNS)), jnp.ones((INPUTS, COLUMNS))
+    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(evaluate_batch(field, x, u))))(x)
+    assert jnp.isfinite(value)
+    assert jnp.isfinite(slope).all()
+
+
+def test_a_linear_path_adds_its_map_in_training_and_in_deployment():
+    with jax.enable_x64(True):
+        field, (x, u) = network(), batch()
+        weight = jax.random.normal(jax.random.key(3), (STATES, STATES + INPUTS))
+        path = LinearPath(weight, field)
+        line = weight @ jnp.concatenate([x, (u - 2) / 3])
+        for evaluate in (evaluate_batch, deploy_batch):
+            np.testing.assert_allclose(evaluate(path, x, u), evaluate(field, x, u) + line, rtol=0, atol=1e-12)
+        assert eqx.tree_equal(observe(path, x, u), LinearPath(weight, observe(field, x, u)))
+        assert sum(jax.tree.leaves(trainable(path))) == 1 + sum(jax.tree.leaves(trainable(field)))
+
+
+def test_running_statistics_are_not_trainable_and_all_else_is():
+    marks = trainable(Hybrid(network(), network()))
+    for part in (marks.physics, marks.residual):
+        assert jax.tree.leaves(part.norm.running) == [False]
+        assert jax.tree.leaves(eqx.tree_at(lambda part: part.norm.running, part, None)) == [True] * 5
+
+
+def test_the_paper_s_network_has_the_paper_s_size():
+    field = residual_network(13, 4, jax.random.key(0))
+    learned = eqx.filter(field, trainable(field))
+    # 17 × 64 (its bias would be removed by batch norm), γ and β of 64, 64 × 13 + 13.
+    assert sum(leaf.size for leaf in jax.tree.leaves(learned)) == 17 * 64 + 2 * 64 + 64 * 13 + 13
+    for weight, fan_in in ((field.weight_in, 17), (field.weight_out, 64), (field.bias_out, 64)):
+        assert 0.85 / fan_in**0.5 < jnp.abs(weight).max() <= 1 / fan_in**0.5  # 13 draws or more, of a fixed seed
+
+
+def test_inputs_are_scaled_before_the_network():
+    x, u = jnp.arange(5.0), jnp.array([7.0, -3.0])
+    scaled, raw = (eqx.tree_at(lambda f: f.scaling, network(), s) for s in (InputScaling(1.0, 4.0), InputScaling()))
+    np.testing.assert_allclose(scaled(x, 4 * u + 1), raw(x, u), rtol=1e-5)  # float32 round-off
+
+
+def test_lanes_of_networks_are_the_networks_one_by_one():
+    fields = [network(seed) for seed in range(3)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *fields)
+    x, u = (part.astype(np.float32) for part in batch())
+    cost = jax.value_and_grad(lambda field: jnp.sum(evaluate_batch(field, x, u) ** 2))
+    values, slopes = jax.jit(jax.vmap(cost))(stacked)
+    alone = jax.jit(cost)
+    for i, field in enumerate(fields):
+        value, slope = alone(field)
+        np.testing.assert_allclose(values[i], value, rtol=1e-5)  # float32 round-off in another order of sums
+        for one, other in zip(jax.tree.leaves(slopes), jax.tree.leaves(slope), strict=True):
+            np.testing.assert_allclose(one[i], other, rtol=0, atol=1e-5 * max(1, jnp.abs(other).max()))
+
+
+def unbatched(norm, seed=0):
+    """A network with layer normalisation, or none, whose gain and shift are not those of a fresh one."""
+    field = network(seed)
+    kind = {"layer": LayerNorm(field.norm.gain, field.norm.shift), "none": Bias(field.norm.shift)}[norm]
+    return eqx.tree_at(lambda field: field.norm, field, kind)
+
+
+def plain_one(field, x, u):
+    """One sample as Ba et al. (2016), Eq. 3 and 4, write it, or without normalisation."""
+    hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
+    if isinstance(field.norm, LayerNorm):
+        mean = jnp.sum(hidden) / HIDDEN
+        deviation = jnp.sqrt(jnp.sum((hidden - mean) ** 2) / HIDDEN + field.norm.epsilon)
+        hidden = field.norm.gain * (hidden - mean) / deviation
+    return field.weight_out @ jnp.maximum(hidden + field.norm.shift, 0) + field.bias_out
+
+
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_formula(norm):
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched(norm), batch()
+        expected = jnp.stack([plain_one(field, x[:, i], u[:, i]) for i in range(COLUMNS)], axis=1)
+        np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        # A sample's result does not depend on its neighbours, and nothing is remembered of them.
+        np.testing.assert_allclose(evaluate_batch(field, x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
+        assert eqx.tree_equal(observe(field, x, u), field)
+
+
+@pytest.mark.parametrize("norm", ["layer", "none"])
+def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched(norm), batch()
+
+        def one_by_one(field):
+            return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
+
+        found = jax.grad(lambda field: jnp.sum(evaluate_batch(field, x[:, :3], u[:, :3]) ** 2))(field)
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.grad(one_by_one)(field)), strict=True):
+            np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
+        assert all(jax.tree.leaves(trainable(field)))
+
+
+def test_layer_normalisation_does_not_see_the_size_of_its_inputs():
+    with jax.enable_x64(True):
+        field, (x, u) = unbatched("layer"), batch()
+        field = eqx.tree_at(lambda field: field.scaling, field, InputScaling())
+        # But for ε = 1e-5 beside variances of 1 and more.
+        np.testing.assert_allclose(evaluate_batch(field, 10 * x, 10 * u), evaluate_batch(field, x, u), atol=1e-3)
+
+
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_every_norm_survives_a_file_and_starts_from_the_same_weights(norm, tmp_path):
+    field = residual_network(STATES, INPUTS, jax.random.key(0), hidden=HIDDEN, norm=norm)
+    save(tmp_path / "model.npz", field)
+    assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)
+    paper = residual_network(STATES, INPUTS, jax.random.key(0), hidden=HIDDEN)
+    assert eqx.tree_equal(eqx.tree_at(lambda field: field.norm, field, paper.norm), paper)
+
+
+def test_without_normalisation_the_bias_starts_as_a_linear_layer_s():
+    shift = residual_network(13, 4, jax.random.key(0), norm="none").norm.shift
+    assert 0.85 / 17**0.5 < jnp.abs(shift).max() <= 1 / 17**0.5  # 64 draws of a fixed seed
+
+
+def test_an_unknown_norm_is_refused():
+    with pytest.raises(ValueError, match="norm must be one of batch, layer, none, got 'group'"):
+        residual_network(13, 4, jax.random.key(0), norm="group")
+
+
+def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
+    with jax.enable_x64(True):
+        rng = np.random.default_rng(0)
+        field, (x, u) = LinearResidual(jnp.asarray(rng.normal(size=(5, 7))), jnp.asarray(rng.normal(size=5))), batch()
+        expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
+        np.testing.assert_allclose(evaluate_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
+@pytest.mark.parametrize("sizes", [(1, 1), (3, 2)], ids=["few inputs", "more"])
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+@pytest.mark.parametrize("linear", [False, True])
+def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
+    """Batch normalisation by its running statistics, which are not those that it began with."""
+    rng = np.random.default_rng(0)
+    network = residual_network(
+        *sizes, jax.random.key(0), hidden=9, norm=norm, outputs=3, scaling=InputScaling(1.0, 2.0)
+    )
+    field = LinearPath(jnp.asarray(rng.normal(size=(3, sum(sizes)))), network) if linear else network
+    field = jax.tree.map(lambda leaf: leaf + rng.uniform(0.1, 1.0, leaf.shape), field)
+    x, u = (jnp.asarray(rng.normal(size=(size, *shape))) for size in sizes)
+    np.testing.assert_allclose(deployed(field)(x, u), field(x, u), rtol=1e-5, atol=1e-5)
+    assert isinstance(deployed(field), DeployedNetwork) == (norm != "layer")
+
+
+@pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
+def test_a_network_of_two_inputs_is_one_of_more_that_are_zero(shape):
+    """Few inputs are summed, more go through a product of matrices."""
+    few = residual_network(1, 1, jax.random.key(0), hidden=9, norm="none", outputs=3)
+    more = eqx.tree_at(lambda network: network.weight_in, few, jnp.pad(few.weight_in, ((0, 0), (1, 0))))
+    x, u = np.random.default_rng(0).normal(size=(2, 1, *shape))
+    np.testing.assert_allclose(few(x, u), more(np.concatenate([np.ones_like(x), x]), u), rtol=1e-5, atol=1e-6)

@@ -1,0 +1,187 @@
+"""Several processes are one run: the same rows as one process, and none is waited for when it is gone."""
+
+import json
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+ROOT = Path(__file__).parents[2]
+EXPERIMENT = ["-m", "experiments.param_shift", "--preset", "smoke", "--seeds", "3", "--models", "hybrid"]
+COUNTED = ("model", "mode", "n_train", "seed", "epochs", "status")
+FAST = 20.0  # s, within which the others must end when one is gone; what they do between two exchanges is part of it
+
+# A sweep of three pendulums as a stage, on two devices for each process: its arguments are a folder, then who is who.
+SWEEP = """
+import sys
+from pathlib import Path
+sys.path.insert(0, "tests")
+import jax
+jax.config.update("jax_num_cpu_devices", 2)
+from hybrid_jax import hosts
+if len(sys.argv) > 2:
+    hosts.join(sys.argv[2], 2, int(sys.argv[3]))
+import numpy as np
+from pendulum import DAMPING, pendulum, swings
+from rich.console import Console
+from experiments import progress
+from experiments.runner.stages import Stages
+from hybrid_jax.io.archive import digest, named_leaves
+from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.sweep.lanes import stack
+from hybrid_jax.training.objective import Settings
+from hybrid_jax.training.fitting import make_plan, start
+progress.FIRST = 0.0
+states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.7, 0.6))])
+plans = stack([make_plan(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
+               ((0.03, 6000), (0.01, 4000), (0.02, 5000))])
+data = Dataset({"train": swings(40), "validation": swings(20, seed=1)}, {"config": {}})
+stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.first()))
+try:
+    final = stages.run("a sweep", states, plans, Settings(batch_size=10), data)
+except hosts.Gone as error:
+    sys.exit(f"gone: {error}")
+print("bytes", len(jax.devices()), digest("", named_leaves(final)))
+"""
+
+
+def address():
+    with socket.socket() as free:
+        free.bind(("127.0.0.1", 0))
+        return f"127.0.0.1:{free.getsockname()[1]}"
+
+
+def begin(arguments, **variables):
+    return subprocess.Popen([sys.executable, *arguments], cwd=ROOT, text=True, stdout=subprocess.PIPE,
+                            stderr=subprocess.PIPE, env=os.environ | {"MPLBACKEND": "agg"} | variables)  # fmt: skip
+
+
+def ended(processes):
+    """Standard output and error of each, once all have ended well."""
+    texts = [process.communicate(timeout=300) for process in processes]
+    assert [process.returncode for process in processes] == [0] * len(processes), texts
+    return texts
+
+
+def sweep(programs, folder, *who):
+    variables = {"JAX_COMPILATION_CACHE_DIR": str(programs), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
+    return begin(["-c", SWEEP, str(folder), *who], **variables)
+
+
+def pair(programs, folder):
+    where = address()
+    return [sweep(programs, folder, where, str(i)) for i in range(2)]
+
+
+def experiment(out, cache, *options):
+    return begin([*EXPERIMENT, "--out", str(out), "--cache", str(cache), *options])
+
+
+@pytest.fixture(scope="module")
+def alone(tmp_path_factory):
+    """The experiment by one process, on as many devices as there are cores: its folder, with its cache."""
+    folder = tmp_path_factory.mktemp("alone")
+    ended([experiment(folder / "out", folder / "cache")])
+    return folder
+
+
+def rows(out):
+    return json.loads((out / "param_shift" / "report.json").read_text())["rows"]
+
+
+def with_flights(alone, folder):
+    """A cache with the flights and programs of the other run, but none of its sweeps."""
+    shutil.copytree(alone / "cache", folder, ignore=shutil.ignore_patterns("sweeps"))
+    return folder
+
+
+def numbers(row):
+    return [row["test_mse"], row["val_mse"], row["rho"], *row["theta"].values()]
+
+
+def test_two_processes_find_the_rows_of_one_and_only_the_first_writes(alone, tmp_path):
+    """Bit for bit; the second has neither the flights nor a sweep in its cache, nor makes any."""
+    where = address()
+    caches = with_flights(alone, tmp_path / "cache"), tmp_path / "other"
+    both = [
+        experiment(tmp_path / f"out{i}", caches[i], "--distributed", "--coordinator", where, "--processes", "2",
+                   "--process-id", str(i)) for i in range(2)
+    ]  # fmt: skip
+    texts = ended(both)
+    assert rows(tmp_path / "out0") == rows(alone / "out")
+    assert not list((tmp_path / "other").glob("*"))
+    assert not list((tmp_path / "out1").iterdir())
+    assert "lanes" in texts[0][1]
+    assert "lanes" not in texts[1][1]
+
+
+@pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cannot choose the cores of a process")
+def test_one_device_finds_the_rows_of_all(alone, tmp_path):
+    """To within round-off: XLA compiles for one device along another path, and sums differ in their last bit."""
+    with_flights(alone, tmp_path / "cache")
+    core = min(os.sched_getaffinity(0))
+    one = f"import os, runpy, sys; os.sched_setaffinity(0, [{core}]); sys.argv = sys.argv[1:]; " + (
+        "runpy.run_module('experiments.param_shift', run_name='__main__', alter_sys=True)"
+    )
+    options = [*EXPERIMENT[1:], "--out", str(tmp_path / "out"), "--cache", str(tmp_path / "cache")]
+    ended([begin(["-c", one, *options])])
+    for row, other in zip(rows(tmp_path / "out"), rows(alone / "out"), strict=True):
+        assert {name: row[name] for name in COUNTED} == {name: other[name] for name in COUNTED}
+        # Measured: up to 2e-7 after these 3 epochs.
+        np.testing.assert_allclose(numbers(row), numbers(other), rtol=1e-5, atol=1e-5)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """What the pendulums' sweep ends in, by one process and never interrupted; and where its programs are kept."""
+    programs = tmp_path_factory.mktemp("programs")
+    ((said, _),) = ended([sweep(programs, tmp_path_factory.mktemp("whole"))])
+    return said.split()[-1], programs
+
+
+@pytest.mark.parametrize(("victim", "later"), [(0, (2,)), (1, (1, 2))])
+def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, later, whole, tmp_path):
+    digest, programs = whole
+    folder = tmp_path / "killed"
+    folder.mkdir()
+    both = pair(programs, folder)
+    assert any("lanes active" in line for line in both[0].stderr)
+    killed, other = both[victim], both[1 - victim]
+    killed.send_signal(signal.SIGKILL)
+    since = time.monotonic()
+    _, said = other.communicate(timeout=60)
+    assert time.monotonic() - since < FAST
+    assert other.returncode == 1
+    assert said.strip().splitlines()[-1].startswith("gone: another process of this run has ended; the same command")
+    assert len(list(folder.glob("*.begun"))) == (victim == 1)  # process 0 saves when another is lost
+    for processes in later:
+        left = shutil.copytree(folder, tmp_path / f"left to {processes}", dirs_exist_ok=True)
+        texts = ended(pair(programs, left) if processes == 2 else [sweep(programs, left)])
+        assert ("goes on where it was interrupted" in texts[0][1]) == (victim == 1)
+        assert {said.split()[-1] for said, _ in texts} == {digest}
+        assert all(said.split()[-2] == str(2 * processes) for said, _ in texts)
+
+
+@pytest.mark.parametrize(
+    ("options", "named"),
+    [
+        (("--processes", "2"), "--coordinator, --processes and --process-id need --distributed"),
+        (("--distributed",), "--distributed: coordinator_address should be defined"),
+        (("--distributed", "--coordinator", "127.0.0.1:1", "--processes", "2", "--process-id", "2"),
+         "--distributed: process_id"),
+    ],
+    ids=["alone", "no cluster", "no such process"],
+)  # fmt: skip
+def test_processes_that_do_not_fit_together_are_refused_in_one_line(options, named, tmp_path):
+    process = experiment(tmp_path / "out", tmp_path / "cache", *options)
+    _, said = process.communicate(timeout=120)
+    assert process.returncode == 2
+    assert len(said.strip().splitlines()) == 1, said
+    assert named in said

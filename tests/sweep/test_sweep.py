@@ -1,0 +1,261 @@
+"""Laws of many runs as one program: lanes do not touch, stop alone, and are compiled once."""
+
+import logging
+import os
+import subprocess
+import sys
+from dataclasses import replace
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import DAMPING, pendulum, swings
+
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.sweep.training import Room, evaluate, sweep
+from hybrid_jax.training import fitting
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, start
+from hybrid_jax.training.objective import Settings
+
+BATCH = 10
+SETTINGS = Settings(batch_size=BATCH)
+TRAIN, VALIDATION = swings(40), swings(20, seed=1)
+LENGTHS = (0.8, 0.7, 0.6)
+
+
+def plan(rate=0.03, n_train=20, minimum=5, patience=3, cap=12, seed=0):
+    subset = np.random.default_rng(seed).permutation(40)
+    return make_plan(rate, subset, n_train, minimum, patience, cap, 0.0)
+
+
+def starts(lengths=LENGTHS):
+    return stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate(lengths)])
+
+
+PLANS = [plan(0.03, 20, seed=1), plan(0.01, 40, seed=2), plan(0.05, 10, cap=6, seed=3)]
+
+
+def swept(states, plans, train=TRAIN, validation=VALIDATION, settings=SETTINGS, **options):
+    return sweep(states, stack(plans), train, validation, settings, **options)
+
+
+def same(one, other):
+    return eqx.tree_equal(*(jax.tree.map(np.asarray, eqx.filter(each, eqx.is_array)) for each in (one, other)))
+
+
+@pytest.fixture(scope="module")
+def final():
+    return swept(starts(), PLANS, width=1)
+
+
+@pytest.mark.skipif("level=0" in os.environ["XLA_FLAGS"], reason="rounds otherwise, not optimised: test_optimised.py")
+def test_a_lane_is_the_same_run_alone(final):
+    """Bit for bit where a chunk is one lane, whichever lanes stand beside it and in which order they are dealt."""
+    for i in range(3):
+        alone = swept(lane(starts(), np.array([i])), PLANS[i : i + 1], width=1)
+        assert same(lane(alone, 0), lane(final, i))
+    turned = swept(lane(starts(), np.array([2, 0, 1])), [PLANS[2], PLANS[0], PLANS[1]], width=1)
+    assert same(lane(turned, np.array([1, 2, 0])), final)
+
+
+def test_a_lane_is_a_run_by_the_plain_function(final):
+    for i in range(3):
+        state = start(pendulum(LENGTHS[i], DAMPING), jax.random.key(i))
+        alone = eqx.filter_jit(fitting.run)(state, PLANS[i], TRAIN, VALIDATION, SETTINGS, jnp.asarray(1000))
+        here = lane(final, i)
+        assert (alone.epoch, alone.status, alone.best_epoch) == (here.epoch, here.status, here.best_epoch)
+        # Another program for the same sums: round-off, grown over some 50 steps.
+        np.testing.assert_allclose(here.field.log_length, alone.field.log_length, rtol=0, atol=1e-5)
+
+
+@pytest.mark.parametrize("solver", [diffrax.Heun(), diffrax.Tsit5()], ids=["heun", "tsit5"])
+def test_a_sweep_trains_through_the_solvers_of_diffrax(solver, final):
+    other = swept(starts(), PLANS, settings=Settings(batch_size=BATCH, solver=solver))
+    # The steps of 0.05 are short, so that the solver's error is all that is between them.
+    np.testing.assert_allclose(other.field.log_length, final.field.log_length, rtol=0, atol=0.02)
+
+
+@pytest.mark.parametrize("width", [2, 3])
+def test_lanes_that_share_a_chunk_are_the_same_runs(width, final):
+    together = swept(starts(), PLANS, width=width)
+    np.testing.assert_array_equal(together.status, final.status)
+    # vmap orders sums differently: round-off, grown over some 50 steps.
+    np.testing.assert_allclose(together.field.log_length, final.field.log_length, rtol=0, atol=1e-5)
+    np.testing.assert_allclose(together.best_mse, final.best_mse, rtol=1e-2, atol=1e-8)
+
+
+def test_every_lane_comes_to_its_own_end(final):
+    assert set(final.status) <= {STOPPED, CAPPED}
+    assert (final.epoch[2], final.status[2]) == (6, CAPPED)
+    assert (final.epoch <= 12).all()
+
+
+def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
+    blocks = []
+    own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        for _ in range(2):
+            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, block_seconds=1e-9,
+                  on_block=lambda states, progress: blocks.append(progress))  # fmt: skip
+    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
+    assert len(blocks) > 3
+    assert sum("run" in message for message in compiled) == 1
+
+
+def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
+    own, room = replace(SETTINGS, batch_size=4), Room(lanes=3, windows=40)
+    states, plans = lane((starts(), stack(PLANS)), np.array([2]))
+    few = states, replace(plans, subset=plans.subset % 20), TRAIN[:20]
+    with jax.log_compiles(), caplog.at_level(logging.WARNING):
+        shared = [
+            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, room=room),
+            sweep(*few, VALIDATION, own, width=1, room=room),
+        ]
+        errors = [evaluate(each.best, VALIDATION, 2, own, room) for each in shared]
+    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
+    assert sum("jit(run)" in message for message in compiled) == 2  # one to train, one to test
+    apart = [
+        sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1),
+        sweep(*few, VALIDATION, own, width=1),
+    ]
+    for one, other, error in zip(shared, apart, errors, strict=True):
+        np.testing.assert_array_equal(one.epoch, other.epoch)
+        np.testing.assert_allclose(one.field.log_length, other.field.log_length, rtol=0, atol=1e-6)
+        np.testing.assert_allclose(error, evaluate(other.best, VALIDATION, 2, own), rtol=1e-4)
+
+
+@pytest.mark.parametrize("listed", [3, 40, 1000])
+def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
+    subset, key = np.random.default_rng(0).permutation(listed), jax.random.key_data(jax.random.key(1))
+    for n in {1, listed // 8, listed // 8 + 1, listed} - {0}:
+        orders = [
+            fitting._shuffled(make_plan(0.1, padded, n, 1, 1, 1, 0.0), key)
+            for padded in (subset, np.pad(subset, (0, 10 * listed)))
+        ]
+        np.testing.assert_array_equal(*(order[:listed] for order in orders))
+        assert set(np.asarray(orders[0][:n])) == set(subset[:n])
+        if n > 20:
+            assert (orders[0][:n] != subset[:n]).any()
+
+
+@pytest.mark.parametrize("width", [1, 3])
+def test_a_diverged_lane_changes_no_bit_of_another(width, final):
+    """A rate of 1e3 makes the pendulum's length vanish at the first step."""
+    wild = swept(starts(), [PLANS[0], plan(1e3, 40, seed=2), PLANS[2]], width=width)
+    tame = final if width == 1 else swept(starts(), PLANS, width=width)
+    for i in (0, 2):
+        assert same(lane(wild, i), lane(tame, i))
+    assert wild.status[1] == DIVERGED
+    assert np.isfinite(wild.best.log_length).all()
+
+
+def test_stopped_lanes_are_run_no_more():
+    seen = []
+
+    def note(states, progress):
+        seen.append((progress.active, states.epoch.copy()))
+
+    swept(starts(), [plan(cap=1), plan(cap=20, minimum=20), plan(cap=20, minimum=20)], width=1,
+          block_seconds=1e-9, on_block=note)  # fmt: skip
+    active, epochs = zip(*seen, strict=True)
+    assert active[0] == 2
+    assert active[-1] == 0
+    assert all(each[0] == 1 for each in epochs)
+    assert epochs[-1].tolist() == [1, 20, 20]
+    assert len(seen) > 3
+
+
+def test_stopped_lanes_cost_no_step(monkeypatch):
+    """Only the active lanes are handed to the compiled block."""
+    from hybrid_jax.sweep import training as module
+
+    handed = []
+
+    run = module.LaneMap.__call__
+
+    def counting(self, lanes, shared, costs, active):
+        handed.append(list(active))
+        return run(self, lanes, shared, costs, active)
+
+    monkeypatch.setattr(module.LaneMap, "__call__", counting)
+    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9)
+    assert handed[1] == [0, 1, 2]  # the first call only compiles
+    assert handed[2] == [1, 2]
+    assert handed[-1] == [2]
+
+
+def test_a_sweep_whose_lanes_have_all_stopped_is_left_as_it_is(final):
+    assert same(swept(final, PLANS, width=1), final)
+
+
+def test_progress_says_what_is_left():
+    reports = []
+    swept(starts(), [plan(cap=12, minimum=12)] * 3, width=1, block_seconds=1e-9,
+          on_block=lambda states, progress: reports.append((states, progress)))  # fmt: skip
+    for states, progress in reports:
+        running = states.status == RUNNING
+        assert (progress.active, progress.lanes, progress.epochs) == (running.sum(), 3, states.epoch.max())
+        assert progress.best == states.best_mse.min()
+        assert progress.at_most == (12 - states.epoch[running]).max(initial=0)
+        assert 0 <= progress.at_least <= progress.at_most
+
+
+def test_evaluate_is_the_error_of_each_lane(final):
+    test = swings(15, seed=2)
+    errors = evaluate(final.best, test, 2, SETTINGS)
+    for i in range(3):
+        alone = deployed_mse(lane(final.best, i), test, 2)
+        np.testing.assert_allclose(errors[i], alone, rtol=1e-4)  # another program for the same float32 sums
+
+
+@pytest.mark.parametrize("size", [41, 9, 0])
+def test_plans_that_do_not_fit_the_data_are_refused(size):
+    with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
+        swept(starts(), [*PLANS[:2], plan(n_train=size)])
+
+
+@pytest.mark.parametrize(("place", "index"), [(0, 40), (39, -1)])
+def test_subsets_that_point_outside_the_data_are_refused(place, index):
+    """A gather would clamp such an index and train on another window in silence."""
+    wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
+    with pytest.raises(ValueError, match=f"subset holds {index}"):
+        swept(starts(), [PLANS[0], wrong, PLANS[2]])
+
+
+def test_subsets_shorter_than_n_train_are_refused():
+    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
+    with pytest.raises(ValueError, match="n_train=40"):
+        swept(starts(), short)
+
+
+def test_bad_data_are_refused_by_name():
+    spoiled = eqx.tree_at(lambda w: w.u, VALIDATION, VALIDATION.u.at[1, 2, 0].set(jnp.nan))
+    with pytest.raises(ValueError, match=r"^validation: u\[1, 2, 0\] is not finite"):
+        swept(starts(), PLANS, validation=spoiled)
+
+
+DEVICES = """
+import sys
+sys.path.insert(0, "tests")
+import jax
+jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
+import numpy as np
+from test_sweep import PLANS, starts, swept
+assert len(jax.devices()) == int(sys.argv[1])
+final = swept(starts(), PLANS, width=1)
+print(final.epoch.tolist(), [np.float32(number).tobytes().hex() for number in final.field.log_length])
+"""
+
+
+def test_the_number_of_devices_changes_nothing():
+    runs = [
+        subprocess.run([sys.executable, "-c", DEVICES, str(n)], capture_output=True, text=True, check=False)
+        for n in (1, 2)
+    ]
+    assert [run.returncode for run in runs] == [0, 0], runs[-1].stderr
+    assert runs[0].stdout == runs[1].stdout
+    assert runs[0].stdout.startswith("[")

@@ -1,0 +1,180 @@
+"""Laws of trajectories under held inputs, in double precision."""
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum
+
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.integrate import RK4, SOLVERS, along, rollout, rollout_batch, rollout_minibatch
+from hybrid_jax.networks.mlp import residual_network
+
+DT = 0.2
+START = np.array([0.5, -1.0])
+TORQUES = np.array([[3.0], [-40.0], [0.0], [25.0], [25.0]])  # jumps that a stage in the wrong interval would feel
+FIELD = {"length": 0.7, "damping": 0.3}
+# Without a state of its own, with a stage kept for the next step, and implicit.
+IMPLICIT = diffrax.Kvaerno3(root_finder=diffrax.VeryChord(rtol=1e-10, atol=1e-10))
+STEPPERS = (RK4(), diffrax.Tsit5(), IMPLICIT)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+@pytest.fixture(scope="module")
+def reference(double_precision):
+    """An adaptive solve of each interval by itself, good to 1e-12."""
+    field = pendulum(**FIELD)
+
+    @jax.jit
+    def interval(x, held):
+        term = diffrax.ODETerm(lambda t, x, held: field(x, held))
+        controller = diffrax.PIDController(rtol=1e-13, atol=1e-13)
+        return diffrax.diffeqsolve(
+            term,
+            diffrax.Dopri8(),
+            0.0,
+            DT,
+            0.01,
+            x,
+            held,
+            stepsize_controller=controller,
+            saveat=diffrax.SaveAt(t1=True),
+        ).ys[0]
+
+    x, path = jnp.asarray(START), []
+    for held in jnp.asarray(TORQUES):
+        x = interval(x, held)
+        path.append(np.asarray(x))
+    return np.array(path)
+
+
+@eqx.filter_jit
+def _path(torques, dt, solver, substeps):
+    return rollout(pendulum(**FIELD), jnp.asarray(START), torques, dt, solver, substeps)
+
+
+def path_of(solver=None, substeps=1, torques=TORQUES, dt=DT):
+    return np.asarray(_path(jnp.asarray(torques), dt, solver, substeps))
+
+
+@pytest.mark.parametrize(
+    ("solver", "order"),
+    [(RK4(), 4), (diffrax.Heun(), 2), (diffrax.Midpoint(), 2), (diffrax.Tsit5(), 5), (diffrax.Dopri5(), 5)],
+    ids=lambda value: type(value).__name__,
+)
+def test_order_of_convergence(solver, order, reference):
+    finer = np.array([4, 8, 16])
+    paths = [path_of(solver, torques=np.repeat(TORQUES, n, axis=0), dt=DT / n)[n - 1 :: n] for n in finer]
+    slope = -np.polyfit(np.log(finer), np.log([np.abs(path - reference).max() for path in paths]), 1)[0]
+    # Higher orders still show at these steps; a lower one would fail by nearly 1.
+    assert order - 0.3 < slope < order + 0.6
+
+
+@pytest.mark.parametrize("name", SOLVERS)
+def test_every_named_solver_meets_the_adaptive_reference(name, reference):
+    # 8 steps of 0.025 an interval, under torques of 40: second order is good to 7e-2 of 8, RK4 to 1e-5.
+    tolerance = 0.2 if name in ("heun", "midpoint") else 5e-5
+    np.testing.assert_allclose(path_of(SOLVERS[name], 8), reference, rtol=0, atol=tolerance)
+
+
+def test_an_implicit_solver_meets_the_adaptive_reference(reference):
+    np.testing.assert_allclose(path_of(IMPLICIT, 4), reference, rtol=0, atol=1e-2)  # order 3 at a step of 0.05
+
+
+def test_rk4_is_the_default():
+    np.testing.assert_array_equal(path_of(), path_of(RK4()))
+
+
+@pytest.mark.parametrize("solver", [RK4(), diffrax.Tsit5(), diffrax.Heun()], ids=lambda value: type(value).__name__)
+def test_an_input_acts_from_its_own_interval_on(solver):
+    """A stage at the end of a step must not read the next input, nor a stage kept from the last step the one before."""
+    before = path_of(solver)
+    for i in range(len(TORQUES)):
+        changed = TORQUES.copy()
+        changed[i] += 1.0
+        after = path_of(solver, torques=changed)
+        np.testing.assert_array_equal(after[:i], before[:i])
+        # A constant torque of 1 over the interval: v + h, up to the pull of gravity on the way.
+        assert abs((after[i] - before[i])[1] - DT) < 0.3 * DT
+
+
+def test_substeps_are_shorter_intervals():
+    finer = rollout(pendulum(**FIELD), jnp.asarray(START), jnp.repeat(jnp.asarray(TORQUES), 3, axis=0), DT / 3)
+    # The same steps; only t + h is rounded otherwise.
+    np.testing.assert_allclose(path_of(substeps=3), finer[2::3], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
+def test_a_program_does_not_grow_with_its_substeps(solver):
+    def size(substeps):
+        program = jax.make_jaxpr(lambda x0: rollout(pendulum(**FIELD), x0, jnp.asarray(TORQUES), DT, solver, substeps))
+        return len(str(program(jnp.asarray(START))).splitlines())
+
+    assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
+
+
+@pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
+def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
+    def by_hand(field):
+        term, begin, end = diffrax.ODETerm(lambda t, x, held: field(x, held)), jnp.zeros(()), jnp.asarray(DT / 3)
+        x = jnp.asarray(START)
+        for held in jnp.asarray(TORQUES[:2]):
+            state = solver.init(term, begin, end, x, held)
+            for _ in range(3):
+                x, _, _, state, _ = solver.step(term, begin, end, x, held, state, made_jump=False)
+        return x.sum()
+
+    def looped(field):
+        return rollout(field, jnp.asarray(START), jnp.asarray(TORQUES[:2]), DT, solver, 3)[-1].sum()
+
+    found, expected = (eqx.filter_jit(eqx.filter_value_and_grad(last))(pendulum(**FIELD)) for last in (looped, by_hand))
+    np.testing.assert_allclose(*map(jax.tree.leaves, (found, expected)), rtol=1e-12)  # order of sums
+
+
+@pytest.mark.parametrize("solver", STEPPERS[:2], ids=lambda value: type(value).__name__)
+def test_substeps_are_differentiated_inside_shard_map(solver):
+    """Where the lanes of a sweep run."""
+
+    def slope(x0):
+        field = pendulum(**FIELD)
+        return jax.grad(lambda field: rollout(field, x0, jnp.asarray(TORQUES), DT, solver, 3).sum())(field).log_length
+
+    mesh, part = jax.sharding.Mesh(np.array(jax.devices()[:1]), ("lanes",)), jax.sharding.PartitionSpec("lanes")
+    share = jax.shard_map(lambda x0: slope(x0[0])[None], mesh=mesh, in_specs=part, out_specs=part, check_vma=False)
+    x0 = jnp.asarray(START)
+    np.testing.assert_allclose(jax.jit(share)(x0[None])[0], jax.jit(slope)(x0), rtol=1e-12)  # order of sums
+
+
+def test_a_batch_is_a_loop_of_rollouts():
+    rng = np.random.default_rng(0)
+    x0, u = jnp.asarray(rng.normal(size=(4, 2))), jnp.asarray(rng.normal(size=(4, 6, 1)))
+    field = Hybrid(pendulum(), residual_network(2, 1, jax.random.key(0), hidden=5))
+    together = rollout_batch(field, x0, u, DT)
+    for i in range(4):
+        np.testing.assert_allclose(together[i], rollout(field, x0[i], u[i], DT), rtol=0, atol=1e-13)  # order of sums
+    # A field to which the batch means nothing is the same in training, features first.
+    trained = rollout_minibatch(field.physics, x0.T, jnp.moveaxis(u, 0, -1), DT, RK4())
+    np.testing.assert_allclose(
+        jnp.moveaxis(trained, -1, 0), rollout_batch(field.physics, x0, u, DT), rtol=0, atol=1e-13
+    )
+
+
+def test_along_pairs_each_input_with_the_state_it_found():
+    rng = np.random.default_rng(0)
+    x0, u, x = rng.normal(size=(2, 3)), rng.normal(size=(4, 1, 3)), rng.normal(size=(4, 2, 3))
+    states, inputs = along(jnp.asarray(x0), jnp.asarray(x), jnp.asarray(u))
+    pairs = {(*state, *held) for state, held in zip(np.asarray(states).T, np.asarray(inputs).T, strict=True)}
+    starts = np.concatenate([x0[None], x[:-1]])
+    assert pairs == {(*starts[t, :, b], *u[t, :, b]) for t in range(4) for b in range(3)}
+
+
+def test_the_error_of_a_solver_by_name_says_where_the_names_are():
+    with pytest.raises(ValueError, match=r"`from hybrid_jax\.rollout import SOLVERS`, got 'rk4'"):
+        path_of("rk4")

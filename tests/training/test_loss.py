@@ -1,0 +1,204 @@
+"""Laws of the loss and of each regulariser, in double precision."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum
+
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.integrate import RK4, along, rollout_batch, rollout_minibatch
+from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.training.loss import REGULARISERS, Minibatch, cosine, loss, minibatch, mse
+from hybrid_jax.training.objective import Settings
+from hybrid_jax.trajectories import Trajectories
+
+DT, WINDOWS, STEPS = 0.05, 6, 4
+
+
+@pytest.fixture(autouse=True, scope="module")
+def double_precision():
+    with jax.enable_x64(True):
+        yield
+
+
+class Affine(AbstractVectorField):
+    """ẋ = A x + b: parts of a hybrid whose angle is known."""
+
+    matrix: jax.Array
+    offset: jax.Array
+
+    def __call__(self, x, u):
+        return self.matrix @ x + self.offset
+
+
+def affine(matrix, offset=(0.0, 0.0)):
+    return Affine(jnp.asarray(matrix, float), jnp.asarray(offset, float))
+
+
+def windows():
+    rng = np.random.default_rng(0)
+    x0, u = jnp.asarray(rng.normal(size=(WINDOWS, 2))), jnp.asarray(rng.normal(size=(WINDOWS, STEPS, 1)))
+    return Trajectories(x0, u, rollout_batch(pendulum(damping=0.8), x0, u, DT), DT)
+
+
+@pytest.fixture(scope="module")
+def batch(double_precision):
+    return minibatch(windows(), RK4())
+
+
+@eqx.filter_jit
+def regulariser(name, field, batch):
+    return REGULARISERS[name](field, batch, rollout_minibatch(field, batch.x0, batch.u, batch.dt, RK4()))
+
+
+def silent(field):
+    """A residual whose output is zero everywhere."""
+    zero = (jnp.zeros_like(field.weight_out), jnp.zeros_like(field.bias_out))
+    return eqx.tree_at(lambda field: (field.weight_out, field.bias_out), field, zero)
+
+
+def network(seed=0):
+    return residual_network(2, 1, jax.random.key(seed), hidden=5)
+
+
+def test_a_minibatch_has_features_first():
+    cut = windows()
+    turned = minibatch(cut, RK4())
+    assert turned.x.shape == (STEPS, 2, WINDOWS)
+    assert turned.dt == DT
+    for i in range(WINDOWS):
+        np.testing.assert_array_equal(turned.x0[:, i], cut.x0[i])
+        np.testing.assert_array_equal(turned.u[..., i], cut.u[i])
+        np.testing.assert_array_equal(turned.x[..., i], cut.x[i])
+
+
+def test_mse_by_hand():
+    truth = jnp.zeros((2, 3))
+    predicted = jnp.array([[1.0, 2.0, 2.0], [0.0, 3.0, 4.0]])
+    assert mse(predicted, truth) == (9 + 25) / 2  # squared norms, mean over time: not over the elements
+    both = mse(jnp.stack([predicted, 2 * predicted], -1), jnp.zeros((2, 3, 2)))
+    np.testing.assert_array_equal(both, [17, 68])
+
+
+def test_trajectory_correlation_is_the_paper_s_formula(batch):
+    field = Hybrid(pendulum(0.7), network())
+    cut = windows()
+    physics = np.asarray(rollout_batch(field.physics, cut.x0, cut.u, DT)).reshape(WINDOWS, -1)
+    predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
+    whole = np.asarray(jnp.moveaxis(predicted, -1, 0)).reshape(WINDOWS, -1)
+    product = (physics * whole).sum(1) / np.linalg.norm(physics, axis=1) / np.linalg.norm(whole, axis=1)
+    found = regulariser("trajectory_correlation", field, batch)
+    # The 1e-12 under the square root, against squared norms of about 1.
+    np.testing.assert_allclose(found, np.mean(1 - product), rtol=0, atol=1e-11)
+
+
+def test_trajectory_correlation_grows_with_the_residual_from_zero(batch):
+    small = network()
+    strengths = [0.0, 0.1, 0.3, 1.0, 3.0]
+    values = []
+    for strength in strengths:
+        parts = (strength * small.weight_out, strength * small.bias_out)
+        residual = eqx.tree_at(lambda field: (field.weight_out, field.bias_out), small, parts)
+        values.append(float(regulariser("trajectory_correlation", Hybrid(pendulum(), residual), batch)))
+    assert abs(values[0]) < 1e-25  # ½‖a − b‖² of equal a and b
+    assert values == sorted(values)
+    assert values[-1] > 1e-4
+
+
+def test_trajectory_correlation_shows_small_differences_in_single_precision(batch):
+    """1 − ⟨a, b⟩ would round to 0 or to 6e-8 here."""
+    with jax.enable_x64(False):
+        single = jax.tree.map(lambda leaf: jnp.asarray(leaf, np.float32), batch)
+        push = affine(np.zeros((2, 2)), (0.0, 1e-3))
+        value = regulariser("trajectory_correlation", Hybrid(pendulum(), push), single)
+    exact = regulariser("trajectory_correlation", Hybrid(pendulum(), push), batch)
+    assert exact < 1e-7
+    np.testing.assert_allclose(value, exact, rtol=0.05)  # the differences of 1e-4 carry an error of 1e-7
+
+
+def test_cosine_is_one_for_parallel_and_zero_for_orthogonal_parts(batch):
+    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
+    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
+    for factor in (2.0, -0.5):
+        # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
+        np.testing.assert_allclose(
+            regulariser("cosine", Hybrid(affine(turn), affine(factor * turn)), batch), 1, rtol=0, atol=1e-7
+        )
+    assert abs(regulariser("cosine", Hybrid(affine(turn), affine(quarter @ turn)), batch)) < 1e-20
+
+
+def test_inner_product_is_the_squared_product_of_the_parts(batch):
+    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
+    other = np.array([[0.5, -0.1], [0.2, 0.9]])
+    field = Hybrid(affine(turn), affine(other, (0.3, -0.2)))
+    predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
+    x = np.concatenate([batch.x0[None], np.asarray(predicted)[:-1]])
+    products = np.einsum("tib,tib->tb", np.einsum("ij,tjb->tib", turn, x),
+                         np.einsum("ij,tjb->tib", other, x) + np.array([0.3, -0.2])[:, None])  # fmt: skip
+    found = regulariser("inner_product", field, batch)
+    np.testing.assert_allclose(found, np.mean(products**2), rtol=1e-12)
+    assert abs(regulariser("inner_product", Hybrid(affine(turn), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
+
+
+def test_pearson_is_the_correlation_and_blind_to_offset_and_scale(batch):
+    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
+    other = affine([[0.5, -0.1], [0.2, 0.9]])
+    predicted = rollout_minibatch(Hybrid(affine(turn), other), batch.x0, batch.u, DT, RK4())
+
+    def value(residual):
+        return REGULARISERS["pearson"](Hybrid(affine(turn), residual), batch, predicted)
+
+    x, _ = along(batch.x0, predicted, batch.u)
+    expected = [np.corrcoef(a, b)[0, 1] ** 2 for a, b in zip(turn @ x, other.matrix @ x, strict=True)]
+    np.testing.assert_allclose(value(other), np.mean(expected), rtol=1e-9)  # the 1e-12 under the roots
+    np.testing.assert_allclose(value(affine(-7 * other.matrix, (5.0, -3.0))), value(other), rtol=1e-9)
+    np.testing.assert_allclose(value(affine(3 * turn, (1.0, 1.0))), 1, rtol=1e-9)
+
+
+def test_residual_norm_is_the_mean_square_of_the_residual(batch):
+    field = Hybrid(pendulum(), affine(np.zeros((2, 2)), (3.0, 4.0)))
+    np.testing.assert_allclose(regulariser("residual_norm", field, batch), 25, rtol=1e-12)
+
+
+@pytest.mark.parametrize("name", REGULARISERS)
+@pytest.mark.parametrize("precision", [np.float32, np.float64])
+def test_gradients_are_finite_where_the_residual_is_zero(name, precision, batch):
+    with jax.enable_x64(precision == np.float64):
+        field, here = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), silent(network())), batch)
+        )
+        value, slope = eqx.filter_value_and_grad(lambda field: regulariser(name, field, here))(field)
+    assert abs(value) < 1e-10
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
+
+
+def test_the_loss_is_the_error_plus_the_weighted_regulariser(batch):
+    field = Hybrid(pendulum(0.7), network())
+    predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
+    error = np.square(np.asarray(predicted - batch.x)).sum(1).mean()
+    np.testing.assert_allclose(loss(field, batch, predicted, None, 1e3), error, rtol=1e-13)
+    for rule in REGULARISERS.values():
+        expected = error + 0.3 * rule(field, batch, predicted)
+        np.testing.assert_allclose(loss(field, batch, predicted, rule, 0.3), expected, rtol=1e-13)
+
+
+@pytest.mark.parametrize("name", REGULARISERS)
+def test_a_field_without_two_parts_has_no_regulariser(name, batch):
+    for field in (pendulum(0.7), network()):
+        predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
+        plain = loss(field, batch, predicted, None, 0.0)
+        assert loss(field, batch, predicted, REGULARISERS[name], 1e3) == plain
+
+
+def test_minibatch_is_a_pytree_with_its_step_static(batch):
+    assert isinstance(batch, Minibatch)
+    assert len(jax.tree.leaves(batch)) == 3
+
+
+def test_a_regulariser_by_name_is_refused_where_it_is_set():
+    said = r"^regulariser must be a function, such as one of hybrid_jax\.loss\.REGULARISERS, got 'cosine'$"
+    with pytest.raises(ValueError, match=said):
+        Settings(regulariser="cosine")
+    assert hash(Settings(regulariser=cosine)) == hash(Settings(regulariser=cosine))

@@ -1,0 +1,102 @@
+"""Laws of training in stages."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import DAMPING, LENGTH, pendulum, swings
+
+from hybrid_jax import Hybrid, Settings, residual_network
+from hybrid_jax.dynamics.base import Frozen
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.networks.mlp import silenced
+from hybrid_jax.training.fitting import make_plan
+from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
+from hybrid_jax.vehicle import IRIS
+
+TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
+SETTINGS = Settings(batch_size=20)
+FIELD = Hybrid(pendulum(0.6), silenced(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none")))
+
+
+def trained(stages, field=FIELD, train=TRAIN, **options):
+    return fit_in_stages(field, train, VALIDATION, KEY, stages, SETTINGS, **options)
+
+
+def test_groups_that_are_not_named_do_not_move():
+    physics = trained([Stage({"physics": 0.03}, epochs=5)])[-1].best
+    assert physics.physics.log_length != FIELD.physics.log_length
+    assert eqx.tree_equal(physics.residual, FIELD.residual)
+    output = trained([Stage({"residual": 0.01, "residual/weight_in": 0.0}, epochs=5)])[-1].best
+    assert eqx.tree_equal(output.physics, FIELD.physics)
+    assert eqx.tree_equal(output.residual.weight_in, FIELD.residual.weight_in)
+    assert (output.residual.weight_out != FIELD.residual.weight_out).all()
+
+
+def test_the_longest_group_that_fits_counts():
+    rates = rates_by_group(FIELD, {"": 1e-3, "residual": 1e-2, "residual/norm": 0.0})
+    assert rates.physics.log_length == np.float32(1e-3)
+    assert rates.residual.weight_in == np.float32(1e-2)
+    assert rates.residual.norm.shift == 0
+    with pytest.raises(ValueError, match="no learned array begins with 'resid', only physics/log_length, residual"):
+        rates_by_group(FIELD, {"resid": 1.0})
+
+
+def test_stages_go_on_from_each_other_and_never_get_worse():
+    stages = [Stage({"physics": 0.03}, steps=2, epochs=30), Stage({"": 0.01}, epochs=60)]
+    first, second = trained(stages)
+    start = float(deployed_mse(FIELD, VALIDATION))
+    assert second.best_mse < first.best_mse < start
+    np.testing.assert_allclose(first.best_mse, deployed_mse(first.best, VALIDATION), rtol=1e-5)
+    assert second.best_mse < 0.5 * first.best_mse  # the damping is the network's
+
+
+def test_the_start_is_kept_where_nothing_is_better():
+    """Physics that is exact, trained on windows of another pendulum, as a residual that only learns noise would be."""
+    exact = pendulum(LENGTH, DAMPING)
+    state = trained([Stage({"": 0.05}, epochs=5)], exact, train=swings(60, length=2.0))[-1]
+    assert eqx.tree_equal(state.best, exact)
+    assert (int(state.best_epoch), int(state.epoch)) == (0, 5)
+    assert state.field.log_length != exact.log_length
+
+
+def test_short_windows_are_the_beginning_of_long_ones():
+    short = cut(TRAIN, 3)
+    np.testing.assert_array_equal(short.x, TRAIN.x[:, :3])
+    np.testing.assert_array_equal(short.u, TRAIN.u[:, :3])
+    assert cut(TRAIN, None) is TRAIN
+    with pytest.raises(ValueError, match="steps must be at most the 8 intervals"):
+        cut(TRAIN, 9)
+
+
+@pytest.mark.parametrize(
+    ("stages", "said"), [([], "stages"), ([Stage({"": 0.1}, steps=9)], "steps"), ([Stage({"wing": 0.1})], "'wing'")]
+)
+def test_stages_that_make_no_sense_are_refused(stages, said):
+    with pytest.raises(ValueError, match=said):
+        trained(stages)
+    with pytest.raises(ValueError, match="rates"):
+        Stage({"": -1.0})
+
+
+@pytest.mark.parametrize(
+    ("field", "size", "said"),
+    [
+        (rigid_body(IRIS), 20, "train: field: RigidBody does not take a state"),
+        (FIELD, 2.5, "settings.batch_size must be an integer of at least 1, got 2.5"),
+        (FIELD, 61, "train has 60 windows, fewer than batch_size=61"),
+        (Frozen(FIELD), 20, "field: Frozen has nothing to learn"),
+    ],
+    ids=["other field", "no count", "few windows", "frozen"],
+)
+def test_what_a_fit_refuses_stages_refuse(field, size, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        fit_in_stages(field, TRAIN, VALIDATION, KEY, [Stage({"": 0.1})], Settings(size))
+
+
+def test_rates_by_group_are_those_of_a_plan():
+    """What a sweep takes: the tree begins as the field does."""
+    plan = make_plan(rates_by_group(FIELD, {"": 1e-3}), jnp.arange(3), 3, 0, 1, 1, 0.0)
+    assert all(rate == np.float32(1e-3) for rate in jax.tree.leaves(plan.rates))

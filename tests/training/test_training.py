@@ -1,0 +1,294 @@
+"""Laws of one training run, on a system that is no quadrotor: a pendulum whose length, or damping, is unknown."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import DAMPING, LENGTH, pendulum, swings
+
+from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.state import VELOCITY
+from hybrid_jax.sweep.lanes import stack
+from hybrid_jax.sweep.training import sweep
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, run, start
+from hybrid_jax.training.loss import residual_norm, trajectory_correlation
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import IRIS
+
+BATCH = 20
+SETTINGS = Settings(batch_size=BATCH)
+TRAIN, VALIDATION = swings(60), swings(40, seed=1)
+KEY = jax.random.key(0)
+_run = eqx.filter_jit(run)
+
+
+def trained(field, rates=0.03, key=KEY, train=TRAIN, validation=VALIDATION, settings=SETTINGS, **rules):
+    rules = {"min_epochs": 10, "patience": 10, "max_epochs": 60} | rules
+    return fit(field, train, validation, key, rates=rates, settings=settings, **rules)
+
+
+def planned(field, subset, n_train, train=TRAIN, epochs=4):
+    plan = make_plan(0.03, subset, n_train, 100, 100, epochs, 0.0)
+    return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)
+
+
+def validated(field):
+    return float(eqx.filter_jit(deployed_mse)(field, VALIDATION))
+
+
+@pytest.fixture(scope="module")
+def damped():
+    """The run that most laws are read off: the right damping, the wrong length."""
+    return trained(pendulum(0.8, DAMPING))
+
+
+@pytest.fixture(scope="module")
+def hybrid():
+    """An undamped pendulum of another length, and a network for what it lacks."""
+    field = Hybrid(pendulum(0.6), residual_network(2, 1, jax.random.key(1), hidden=16))
+    settings = Settings(BATCH, trajectory_correlation)
+    return field, trained(field, Hybrid(0.03, 0.01), settings=settings, max_epochs=150, min_epochs=150)
+
+
+def test_an_unknown_length_is_recovered(damped):
+    # The data are the model's own up to float32; Adam at 0.03 with minibatches hovers within a few 1e-3 of it.
+    np.testing.assert_allclose(np.exp(damped.best.log_length), LENGTH, rtol=1e-2)
+    assert damped.best_mse < 1e-3 * validated(pendulum(0.8, DAMPING))
+
+
+def test_a_hybrid_of_one_s_own_learns_predicts_and_survives_a_file(hybrid, tmp_path):
+    field, state = hybrid
+    # What physics alone can do with its length free is the measure of what the network adds.
+    physics_only = trained(field.physics)
+    assert state.best_mse < 0.2 * physics_only.best_mse
+    np.testing.assert_allclose(np.exp(state.best.physics.log_length), LENGTH, rtol=0.1)
+
+    save(tmp_path / "model.npz", state.best, {"val_mse": float(state.best_mse)})
+    model = load(tmp_path / "model.npz")
+    assert eqx.tree_equal(model.field, state.best)
+    test = swings(30, seed=2)
+    predicted = model.predict(test.x0, test.u, test.dt)
+    error = np.square(np.asarray(predicted - test.x)).sum(-1).mean()
+    assert error < 4 * state.best_mse  # windows never seen, of the same kind
+    # The network has learned the damping itself, at rest and within what was flown.
+    rates = jnp.array([-2.0, -1.0, 1.0, 2.0])
+    push = jax.vmap(lambda rate: model.field(jnp.array([0.0, rate]), jnp.zeros(1))[1])(rates)
+    np.testing.assert_allclose(push, -DAMPING * rates, atol=0.5)
+
+
+def test_running_statistics_move_while_a_part_with_rate_zero_does_not(hybrid):
+    field, _ = hybrid
+    state = trained(field, Hybrid(0.03, 0.0), max_epochs=3)
+    for name in ("weight_in", "weight_out", "bias_out"):
+        np.testing.assert_array_equal(getattr(state.field.residual, name), getattr(field.residual, name))
+    np.testing.assert_array_equal(state.field.residual.norm.gain, field.residual.norm.gain)
+    assert (state.field.residual.norm.running.mean != field.residual.norm.running.mean).all()
+    assert state.field.physics.log_length != field.physics.log_length
+    turned = trained(field, Hybrid(0.0, 0.03), max_epochs=3)
+    assert turned.field.physics.log_length == field.physics.log_length
+    assert (turned.field.residual.weight_out != field.residual.weight_out).any()
+
+
+class Dragged(AbstractVectorField):
+    """The rigid body with drag, −0.3 v [m/s²]."""
+
+    body: AbstractVectorField
+
+    def __call__(self, x, u):
+        return self.body(x, u).at[VELOCITY].add(-0.3 * x[VELOCITY])
+
+
+def test_exact_physics_leaves_a_silent_residual_silent():
+    rng = np.random.default_rng(0)
+    x0 = np.zeros((40, 13), np.float32)
+    x0[:, 3], x0[:, 7:] = 1, rng.normal(size=(40, 6))
+    u = np.asarray(IRIS.hover_speed + 30 * rng.normal(size=(40, 10, 4)), np.float32)
+    network = residual_network(13, 4, KEY, hidden=8, scaling=InputScaling(IRIS.hover_speed, 60.0))
+    zero = (jnp.zeros_like(network.weight_out), jnp.zeros_like(network.bias_out))
+    silent = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, zero)
+    push = {}
+    for truth in (rigid_body(IRIS), Dragged(rigid_body(IRIS))):
+        flown = Trajectories(x0, u, np.asarray(jax.jit(rollout_batch)(truth, x0, u, 0.01)), 0.01)
+        field = Hybrid(rigid_body(IRIS), silent)
+        state = trained(field, Hybrid(0.0, 3e-3), train=flown, validation=flown, max_epochs=40, min_epochs=40)
+        forces = jax.vmap(state.best.residual)(x0, u[:, 0])[:, VELOCITY]
+        push[type(truth)] = float(jnp.sqrt(jnp.mean(jnp.square(forces))))
+    # Adam turns even a gradient of round-off into steps of the rate, so silence is not exact; a force is far louder.
+    assert push[RigidBody] < 0.02
+    assert push[Dragged] > 0.1
+
+
+def test_the_best_epoch_is_the_best_that_validation_saw():
+    """Epoch by epoch by hand: the best field is the one kept, and its error is what validation says."""
+    whole = trained(pendulum(0.8, DAMPING), max_epochs=15)
+    state = start(pendulum(0.8, DAMPING), KEY)
+    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
+    errors, fields = [], []
+    for until in range(1, 16):
+        state = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
+        errors.append(validated(state.field))
+        fields.append(state.field)
+    best = int(np.argmin(errors))
+    assert int(whole.best_epoch) == best + 1
+    np.testing.assert_array_equal(whole.best.log_length, fields[best].log_length)
+    np.testing.assert_allclose(whole.best_mse, errors[best], rtol=1e-4)  # another program for the same sums
+    # Run in one go or in blocks, the run is the same.
+    np.testing.assert_array_equal(state.field.log_length, whole.field.log_length)
+
+
+def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
+    for state, minimum, patience in ((damped, 10, 10), (trained(pendulum(LENGTH, DAMPING), 0.0, patience=5), 10, 5)):
+        assert state.status == STOPPED
+        assert state.epoch == max(minimum, state.best_epoch + patience)
+    # With a rate of zero the first epoch is the best for ever; no later one is better.
+    assert state.best_epoch == 1
+
+
+def test_without_a_better_epoch_patience_alone_decides():
+    state = trained(pendulum(LENGTH, DAMPING), 0.0, min_epochs=0, patience=7)
+    assert (int(state.status), int(state.epoch)) == (STOPPED, 8)
+
+
+def test_the_cap_is_marked():
+    state = trained(pendulum(0.8, DAMPING), min_epochs=20, max_epochs=7)
+    assert (int(state.status), int(state.epoch)) == (CAPPED, 7)
+
+
+def test_a_run_that_is_not_over_is_marked_running():
+    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
+    assert _run(start(pendulum(), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3)).status == RUNNING
+
+
+def test_the_key_decides_the_order_of_minibatches(damped):
+    again, other = (trained(pendulum(0.8, DAMPING), key=key) for key in (KEY, jax.random.key(5)))
+    assert again.field.log_length == damped.field.log_length
+    assert other.field.log_length != damped.field.log_length
+
+
+def test_only_the_first_n_train_of_the_subset_are_used():
+    subset = np.random.default_rng(0).permutation(60)
+    used, unused = subset[:40], subset[40:]
+    spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[unused].set(jnp.nan))
+    field = pendulum(0.8, DAMPING)
+    plain = planned(field, subset, 40)
+    assert eqx.tree_equal(planned(field, subset, 40, spoiled), plain)
+    assert eqx.tree_equal(planned(field, np.concatenate([used, unused[::-1]]), 40), plain)
+    touched = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[used[7]].add(0.1))
+    assert not eqx.tree_equal(planned(field, subset, 40, touched), plain)
+
+
+def test_each_epoch_sees_every_window_once():
+    """With one feature and a rate of 0 the mean training loss is that of all windows, whatever their order."""
+    field = pendulum(0.8, DAMPING)
+    for key in (KEY, jax.random.key(1)):
+        state = trained(field, 0.0, key=key, max_epochs=1)
+        np.testing.assert_allclose(state.train_loss, deployed_mse(field, TRAIN), rtol=1e-5)  # float32 sums
+
+
+class Learned(AbstractVectorField):
+    """A field of Equinox' own parts; its activation is a function, which is no array."""
+
+    network: eqx.nn.MLP
+
+    def __call__(self, x, u):
+        return self.network(jnp.concatenate([x, u]))
+
+
+def test_a_field_with_leaves_that_are_no_arrays_trains():
+    field = Learned(eqx.nn.MLP(3, 2, 16, 1, activation=jax.nn.softplus, key=KEY))
+    state = trained(field, 0.01, max_epochs=40)
+    assert state.best_mse < 0.5 * validated(field)
+    assert state.best.network.activation is jax.nn.softplus
+
+
+def test_a_huge_rate_ends_the_run_as_diverged_with_a_finite_field(hybrid):
+    state = trained(hybrid[0], Hybrid(0.0, 1e30), max_epochs=30)
+    assert state.status == DIVERGED
+    assert state.epoch < 30
+    assert jnp.isfinite(state.best_mse) == (state.best_epoch > 0)
+    assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(state.best, eqx.is_array)))
+
+
+def test_double_precision_trains_alone_and_in_a_sweep():
+    with jax.enable_x64(True):
+        field, train, validation = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf, float), (pendulum(0.8), TRAIN, VALIDATION)
+        )
+        alone = trained(field, train=train, validation=validation, max_epochs=3)
+        plans = stack([make_plan(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
+        lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
+    assert (alone.status.dtype, int(alone.status)) == (np.int32, CAPPED)
+    assert alone.best.log_length.dtype == alone.best_mse.dtype == np.float64
+    # Another program for the same sums, in the round-off of double precision.
+    np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
+
+
+def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
+    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
+    good = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
+    spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x * jnp.nan)
+    bad = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
+    assert (int(bad.status), int(bad.epoch)) == (DIVERGED, 4)
+    assert eqx.tree_equal(bad.best, good.best)
+    assert bad.best_mse == good.best_mse
+
+
+@pytest.mark.parametrize("name", ["train", "validation"])
+def test_bad_data_are_refused_by_name(name):
+    spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[2, 3, 1].set(jnp.inf))
+    with pytest.raises(ValueError, match=rf"^{name}: x\[2, 3, 1\] is not finite"):
+        trained(pendulum(), **{name: spoiled})
+
+
+def test_fewer_windows_than_a_minibatch_are_refused():
+    with pytest.raises(ValueError, match="19 windows, fewer than batch_size=20"):
+        trained(pendulum(), train=TRAIN[:19])
+
+
+def test_a_weight_is_that_of_a_regulariser_or_is_refused():
+    with pytest.raises(ValueError, match=r"^regulariser_weight is 1.0 but settings.regulariser is None; leave it out"):
+        trained(pendulum(), regulariser_weight=1.0)
+    field, settings = Hybrid(pendulum(0.6), residual_network(2, 1, KEY, hidden=4)), Settings(BATCH, residual_norm)
+    usual, same, other = (
+        trained(field, settings=settings, max_epochs=1, **given)
+        for given in ({}, {"regulariser_weight": 1e-3}, {"regulariser_weight": 1.0})
+    )
+    assert eqx.tree_equal(usual, same)
+    assert usual.train_loss < other.train_loss
+
+
+class Stiff(AbstractVectorField):
+    """A pendulum whose length is a Python float."""
+
+    length: float
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - jnp.sin(x[0]) / self.length])
+
+
+@pytest.mark.parametrize("field", [Stiff(1.0), Frozen(pendulum())], ids=["float", "frozen"])
+def test_a_field_with_nothing_to_learn_is_refused(field):
+    said = rf"^field: {type(field).__name__} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
+    with pytest.raises(ValueError, match=said):
+        trained(field)
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["fit", "sweep"])
+def test_one_window_is_not_normalised_by_itself(alone):
+    def train(norm, wrap=lambda network: network):
+        field = Hybrid(pendulum(), wrap(residual_network(2, 1, KEY, hidden=4, norm=norm)))
+        if alone:
+            return trained(field, settings=Settings(1), max_epochs=1)
+        plan = make_plan(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
+        return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
+
+    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
+        train("batch")
+    for trains in (lambda: train("layer"), lambda: train("batch", Frozen)):
+        assert np.all(trains().epoch == 1)
