@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import optax
 
 from benchmarks.subjects import DT
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, Statistics, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, RunningStats, trainable
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm
 
@@ -70,7 +70,9 @@ def observed(field: AbstractVectorField, x0, u, predicted):
     starts = jnp.concatenate([x0[None], predicted[:-1]])
     mean, variance = moments(field.weight_in @ jnp.concatenate([starts, field.scaling(u)], axis=1).T)
     norm = field.norm
-    running = jax.tree.map(lambda old, new: old + norm.momentum * (new - old), norm.running, Statistics(mean, variance))
+    running = jax.tree.map(
+        lambda old, new: old + norm.momentum * (new - old), norm.running, RunningStats(mean, variance)
+    )
     return eqx.tree_at(lambda network: network.norm.running, field, running)
 
 

@@ -76,10 +76,10 @@ def take_part(order: str) -> None:
     jax.config.update("jax_num_cpu_devices", place.devices)
     imported = time.perf_counter()
     if place.processes > 1:
-        hosts.join(part["address"], place.processes, part["process"])
+        hosts.initialize(part["address"], place.processes, part["process"])
     joined = time.perf_counter()
     seconds, first = timed_epochs(place, preset)
-    if hosts.first():
+    if hosts.is_main_process():
         apart = {"imports": imported - began, "joining": joined - imported, "first_block": first}
         print(json.dumps({"epoch": seconds, **apart}))
 

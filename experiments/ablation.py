@@ -99,7 +99,9 @@ def variations(choice: str, config: Config) -> dict[str, dict[str, Any]]:
             return {norm: {"norm": norm} for norm in ("batch", "layer", "none")}
         case "start":
             factors = f"random in {config.guess[0]:g} to {config.guess[1]:g}"
-            return {factors: {"guess_off": None}} | {f"off by {off:.0%}": {"guess_off": off} for off in (0.2, 0.5, 1.0)}
+            return {factors: {"perturbed_by": None}} | {
+                f"off by {off:.0%}": {"perturbed_by": off} for off in (0.2, 0.5, 1.0)
+            }
         case "source":
             sizes = [n for n in (300, 1000, 3000, 10_000) if config.batch_size <= n < config.source_train]
             return {f"{n} trajectories": {"source_train": n} for n in (*sizes, config.source_train)}
@@ -130,9 +132,9 @@ def experiment(config: AblationConfig, console: Console) -> None:
             stages = stages_of(config, console)
             trials.append(tried(choice, value, other, config, stages))
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
-        if hosts.first():
+        if hosts.is_main_process():
             write(config, trials, seconds)
-    if hosts.first():
+    if hosts.is_main_process():
         print_tables(Console(), tables(trials, truth()))
 
 

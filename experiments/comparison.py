@@ -37,7 +37,7 @@ from experiments.reporting.environment import environment
 from experiments.reporting.report import FLOOR, Report, print_report, write_report
 from experiments.runner import command
 from experiments.runner.stages import Stages, stages_of
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
@@ -55,11 +55,11 @@ GIVEN_NETWORK = (
     "can trade with each other, which the interval does not."
 )
 ENCODING_RULES = {
-    "hidden": validation.count,
-    "rate": validation.not_negative,
-    "weight": validation.not_negative,
+    "hidden": checks.count,
+    "rate": checks.not_negative,
+    "weight": checks.not_negative,
     "stopping": FROM_ZERO,
-    "max_epochs": validation.count,
+    "max_epochs": checks.count,
 }
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
@@ -81,7 +81,7 @@ class ComparisonConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
-        validation.count("--repeats", self.repeats)
+        checks.count("--repeats", self.repeats)
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)
@@ -108,10 +108,10 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
         lanes = compared(Case(config, stages, learned, experts, target), config.methods)
         found = with_rho([row for group in lanes for row in rows_of(group, domain.name)])
-        if hosts.first():
+        if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)
         rows, datasets = rows + found, datasets | {domain.name: target.metadata}
-    if not hosts.first():
+    if not hosts.is_main_process():
         return
     covered = stages.timed(
         "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]), console)

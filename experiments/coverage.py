@@ -23,9 +23,9 @@ from rich.table import Table
 from experiments.paper.sensors import Noise, measure
 from experiments.runner.command import BAD_INPUT, INTERRUPTED, check_folder
 from experiments.runner.progress import PartLine
-from hybrid_jax import rotation, validation
-from hybrid_jax.adaptation.least_squares import fit_physics
-from hybrid_jax.adaptation.uncertainty import Kind, intervals, physics_covariance
+from hybrid_jax import checks, rotation
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
 from hybrid_jax.integrate import rollout_batch
@@ -168,7 +168,7 @@ def check(config: Config) -> None:
     for name in ("repeats", "steps", "batch"):
         if getattr(config, name) < 1:
             raise ValueError(f"--{name} must be at least 1, got {getattr(config, name)}")
-    validation.count("--seed", config.seed, 0)
+    checks.count("--seed", config.seed, 0)
     if not 0 < config.level < 1:
         raise ValueError(f"--level must be between 0 and 1, got {config.level}")
     if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
@@ -232,8 +232,8 @@ def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Arr
 
     def one(key: PRNGKeyArray) -> Repeat:
         windows = recording(config, start_is_measured, drag, key)
-        found = fit_physics(rigid_body(IRIS), windows)
-        around = intervals(found.field, physics_covariance(found.field, windows, config.kind), config.level)
+        found = fit_least_squares(rigid_body(IRIS), windows)
+        around = intervals(found.field, covariance_of(found.field, windows, config.kind), config.level)
         value, low, high = (jnp.stack(side) for side in zip(*(around[name] for name in LEARNED), strict=True))
         true = jnp.array([TRUTH[name] for name in LEARNED])
         inside = (low <= true) & (true <= high) & found.converged

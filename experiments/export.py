@@ -12,7 +12,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from experiments.runner.command import BAD_INPUT, check_folder
-from hybrid_jax import Model, load, validation
+from hybrid_jax import Model, checks, load
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 
@@ -78,7 +78,7 @@ def step_length(config: Config, model: Model) -> float:
     dt = model.about.get("dt") if config.dt is None else config.dt
     if dt is None:
         raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
-    validation.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
+    checks.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
     return dt
 
 

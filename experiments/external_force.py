@@ -24,7 +24,7 @@ def experiment(config: AdaptationConfig, console: Console) -> None:
     found = study(EXTERNAL_FORCE, IRIS, config, console)
     times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)
     floor = sine_floor(IRIS.mass, times)
-    if hosts.first():
+    if hosts.is_main_process():
         write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, Console(), floor)
 
 

@@ -19,7 +19,7 @@ NAME, TITLE = "param_shift", "Parameter shift"
 def experiment(config: AdaptationConfig, console: Console) -> None:
     """Run the protocol on the shifted vehicle and write what came of it."""
     found = study(PARAMETER_SHIFT, IRIS, config, console)
-    if hosts.first():
+    if hosts.is_main_process():
         write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())
 
 

@@ -15,14 +15,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
-from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, evaluate_batch
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 
 
 # A program is traced once for all stages of a step, not once for each; the compiler puts it in line again.
-_evaluate, _deploy = eqx.filter_jit(evaluate_batch), eqx.filter_jit(deploy_batch)
+_evaluate, _deploy = eqx.filter_jit(train_batch), eqx.filter_jit(infer_batch)
 
 
 class RK4(diffrax.AbstractSolver):
@@ -140,18 +140,15 @@ def checked(
     Raises:
         ValueError: as `rollout`.
     """
-    x0, u = validation.floating("x0", x0), validation.floating("u", u)
+    x0, u = checks.floating("x0", x0), checks.floating("u", u)
     expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
     if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
         raise ValueError(f"{expected} expected, got shapes {x0.shape} and {u.shape}")
-    validation.positive("dt", dt, "a positive number of seconds")
-    validation.count("substeps", substeps)
+    checks.positive("dt", dt, "a positive number of seconds")
+    checks.count("substeps", substeps)
     solver = RK4() if solver is None else solver
     if not isinstance(solver, diffrax.AbstractSolver):
-        # An import, as `hybrid_jax.rollout.SOLVERS` would be looked for in the function of that name.
-        raise ValueError(
-            f"solver must be one of diffrax or `from hybrid_jax.rollout import SOLVERS`, got {validation.shown(solver)}"
-        )
+        raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
     slope = check_field(
         field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
     )
@@ -169,7 +166,7 @@ def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.
     try:
         slope = eqx.filter_eval_shape(field, x, u)
     except Exception as error:  # the field may be anybody's code
-        said = f"{type(error).__name__}: {validation.one_line(error)}"
+        said = f"{type(error).__name__}: {checks.first_line(error)}"
         raise ValueError(f"field: {name} does not take {given}: {said}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
         found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__

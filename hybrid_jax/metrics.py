@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check
@@ -26,7 +26,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
     return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
 
 
-def deployed_mse(
+def rollout_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
     """L_MSE of a field as deployed, mean over windows, compared with the truth at every `every`-th interval's end.
@@ -38,8 +38,8 @@ def deployed_mse(
         ValueError: windows that `trajectories.check` or the field refuses, or an `every` beyond their horizon.
     """
     check(windows, "windows")
-    validation.count("chunk", chunk)
-    validation.count("every", every)
+    checks.count("chunk", chunk)
+    checks.count("every", every)
     if every > windows.horizon:
         raise ValueError(f"every={every} is more than the {windows.horizon} intervals of the windows")
 
@@ -67,6 +67,6 @@ def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"])
     Raises:
         ValueError: a source_mse that is known, and zero or negative: against it nothing is a gain.
     """
-    if not validation.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
+    if not checks.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
         raise ValueError(f"source_mse must be positive, got {source_mse}")
     return (source_mse - adapted_mse) / source_mse

@@ -21,12 +21,12 @@ EXTRA = "--xla_backend_extra_options"
 WHOLE_LOOPS = f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=10000000"
 # Compiler options of what runs seldom or is large. XLA's fusion emitters make a gradient step faster, but least squares
 # and predictions compile in half the time without; later versions may have no other way.
-SOONER: dict[str, bool | int] = {}
+FAST_COMPILE: dict[str, bool | int] = {}
 if version("jaxlib").split(".")[:2] == ["0", "10"]:
-    SOONER["xla_cpu_use_fusion_emitters"] = False
+    FAST_COMPILE["xla_cpu_use_fusion_emitters"] = False
 # At its first level of optimisation the simulator compiles in two thirds of the time of its third, for flights that are
 # 3 % slower. None at all, which XLA_FLAGS may ask for, makes them five times as slow.
-SOONEST = SOONER | {"xla_backend_optimization_level": 1}
+FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
 
 
 def configure(cache: Path) -> None:

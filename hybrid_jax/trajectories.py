@@ -5,7 +5,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.state import STATE_SIZE
 
 
@@ -55,7 +55,7 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
     for part, array in (("x0", x0), ("u", u), ("x", x)):
         found = getattr(array, "dtype", type(array).__name__)
-        if not isinstance(array, validation.Numbers) or found not in (np.float32, np.float64):
+        if not isinstance(array, checks.Numbers) or found not in (np.float32, np.float64):
             raise ValueError(f"{name}: {part} must be an array of float32 or float64, got {found}")
     if x0.ndim != 2 or u.ndim != 3 or x.ndim != 3:
         raise ValueError(
@@ -68,9 +68,9 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
         raise ValueError(f"{name}: is empty: x0 {x0.shape}, u {u.shape}")
     if isinstance(trajectories.dt, np.ndarray | jax.Array):
         raise ValueError(f"{name}: dt must be a number and no array, such as float(dt)")
-    validation.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
+    checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
     for part, array in (("x0", x0), ("u", u), ("x", x)):
-        validation.finite(f"{name}: {part}", array)
+        checks.finite(f"{name}: {part}", array)
     return trajectories
 
 
@@ -82,7 +82,7 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
     """
     for part in ("x0", "x"):
         if trajectories.x0.shape[-1] == STATE_SIZE:
-            validation.unit_quaternions(f"{name}: {part}", getattr(trajectories, part))
+            checks.unit_quaternions(f"{name}: {part}", getattr(trajectories, part))
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
@@ -91,7 +91,7 @@ def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectori
     Raises:
         ValueError: a part would be empty.
     """
-    validation.count("at", at)
+    checks.count("at", at)
     if not at < trajectories.horizon:
         raise ValueError(f"at must lie between 0 and the horizon {trajectories.horizon}, got {at}")
     x0, u, x, dt = trajectories.x0, trajectories.u, trajectories.x, trajectories.dt
@@ -118,15 +118,15 @@ def windows_of(
         ValueError: arrays of the wrong shape or type, a dt that is not positive, or a flight shorter than one window.
     """
     states, inputs = (
-        np.asarray(validation.real_array("states", states)),
-        np.asarray(validation.real_array("inputs", inputs)),
+        np.asarray(checks.real_array("states", states)),
+        np.asarray(checks.real_array("inputs", inputs)),
     )
     if states.ndim != 2 or inputs.ndim != 2 or len(states) != len(inputs) + 1:
         raise ValueError(f"states (t + 1, d) and inputs (t, m) expected, got shapes {states.shape} and {inputs.shape}")
-    validation.positive("dt", dt, "a positive number of seconds")
+    checks.positive("dt", dt, "a positive number of seconds")
     stride = steps if stride is None else stride
-    validation.count("steps", steps)
-    validation.count("stride", stride)
+    checks.count("steps", steps)
+    checks.count("stride", stride)
     if len(inputs) < steps:
         raise ValueError(f"a flight of {len(inputs)} intervals has no window of steps={steps}, stride={stride}")
     starts = np.arange(0, len(inputs) - steps + 1, stride)

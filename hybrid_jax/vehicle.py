@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 
 
 @dataclass(frozen=True)
@@ -47,17 +47,17 @@ class Vehicle:
             _require_positive("rotor_radius", self.rotor_radius, "a finite number of at least 0")
         if not isinstance(self.inertia, tuple) or len(self.inertia) != 3:
             raise ValueError(
-                f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {validation.shown(self.inertia)}"
+                f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {checks.short_repr(self.inertia)}"
             )
         for name, moment in zip(("Ix", "Iy", "Iz"), self.inertia, strict=True):
             _require_positive(f"inertia {name}", moment)
         if not _is_four(self.rotor_positions, _is_point):
-            got = validation.shown(self.rotor_positions)
+            got = checks.short_repr(self.rotor_positions)
             raise ValueError(f"rotor_positions must be a tuple of four pairs (x, y) [m], got {got}")
         if not _is_four(self.spin, lambda sign: _is_finite(sign) and abs(sign) == 1):
-            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {validation.shown(self.spin)}")
+            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {checks.short_repr(self.spin)}")
         if not isinstance(self.name, str):
-            raise ValueError(f"name must be text, got {validation.shown(self.name)}")
+            raise ValueError(f"name must be text, got {checks.short_repr(self.name)}")
 
     @property
     def hover_speed(self) -> float:
@@ -87,7 +87,7 @@ def read_tables(path: str | Path) -> dict[str, Any]:
     try:
         return tomllib.loads(Path(path).read_bytes().decode())
     except (OSError, ValueError, RecursionError) as error:
-        raise ValueError(f"{path}: not a readable TOML file: {validation.one_line(error)}") from error
+        raise ValueError(f"{path}: not a readable TOML file: {checks.first_line(error)}") from error
 
 
 def vehicle_of(tables: dict[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
@@ -117,18 +117,18 @@ def _made(table: dict[str, Any], known: set[str], where: str) -> Vehicle:
     try:
         return Vehicle(**{key: as_tuple(value) for key, value in table.items()})
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {validation.one_line(error).replace('Vehicle.__init__()', 'table')}") from error
+        raise ValueError(f"{where}: {checks.first_line(error).replace('Vehicle.__init__()', 'table')}") from error
 
 
 def _require_positive(name: str, value: Any, what: str = "a positive finite number") -> None:
     if not isinstance(value, int | float):  # a vehicle is hashed and written to files: its numbers are Python's own
-        raise ValueError(f"{name} must be {what}, got {validation.shown(value)}")
-    validation.positive(name, value, what)
+        raise ValueError(f"{name} must be {what}, got {checks.short_repr(value)}")
+    checks.positive(name, value, what)
 
 
 def _is_finite(value: Any) -> bool:
-    number = validation.real(value) if isinstance(value, int | float) else None
-    return number is not None and abs(number) <= validation.LARGEST
+    number = checks.real(value) if isinstance(value, int | float) else None
+    return number is not None and abs(number) <= checks.LARGEST
 
 
 def _is_point(value: Any) -> bool:

@@ -13,8 +13,8 @@ from hybrid_jax.integrate import SOLVERS, rollout_batch
 def test_a_perfect_model_has_no_error():
     windows = swings(20)
     # Equal up to float32 round-off of states of about 10: (1e-6)² a number, and the order of vmap.
-    assert metrics.deployed_mse(pendulum(damping=DAMPING), windows) < 1e-10
-    assert metrics.deployed_mse(pendulum(damping=0.0), windows) > 1e-3
+    assert metrics.rollout_mse(pendulum(damping=DAMPING), windows) < 1e-10
+    assert metrics.rollout_mse(pendulum(damping=0.0), windows) > 1e-3
 
 
 @pytest.mark.parametrize(("every", "chunk"), [(1, 250), (2, 7), (4, 250), (8, 20)])
@@ -23,14 +23,14 @@ def test_it_is_the_definition_at_every_so_many_intervals(every, chunk):
     predicted = np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt), np.float64)
     squares = np.square(predicted - np.asarray(windows.x)).sum(-1)
     rows = [i for i in range(8) if (i + 1) % every == 0]
-    found = metrics.deployed_mse(field, windows, every, chunk=chunk)
+    found = metrics.rollout_mse(field, windows, every, chunk=chunk)
     np.testing.assert_allclose(found, squares[:, rows].mean(), rtol=1e-5)  # float32 sums of 160 numbers
 
 
 def test_the_solver_is_the_one_asked_for():
     windows, field = swings(20), pendulum(damping=DAMPING)
     # The data are RK4's own; Heun differs by its error at a step of 0.05.
-    assert metrics.deployed_mse(field, windows, solver=SOLVERS["heun"]) > 1e-6
+    assert metrics.rollout_mse(field, windows, solver=SOLVERS["heun"]) > 1e-6
 
 
 def test_mse_keeps_the_windows_apart():
@@ -47,5 +47,5 @@ def test_improvement():
 
 def test_an_error_beyond_float_is_infinite_or_nan_and_not_hidden():
     lost = pendulum(damping=-1e6)
-    assert not jnp.isfinite(metrics.deployed_mse(lost, swings(20)))
+    assert not jnp.isfinite(metrics.rollout_mse(lost, swings(20)))
     assert not jax.numpy.isnan(metrics.improvement(jnp.array(1.0), jnp.array(jnp.inf)))

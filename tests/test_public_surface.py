@@ -18,7 +18,7 @@ from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
 import hybrid_jax as hj
 from hybrid_jax import metrics
 from hybrid_jax.adaptation import ridge, uncertainty
-from hybrid_jax.adaptation.least_squares import fit_physics
+from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
 from hybrid_jax.networks.mlp import InputScaling
@@ -139,12 +139,12 @@ def test_rates_that_do_not_go_with_the_field_are_refused(rates):
 
 # Name → a function of windows; each finite or refused, if the windows are those of a pendulum of moderate speed.
 OF_WINDOWS = {
-    "fit_physics": lambda w, n: fit_physics(SWING, w, max_steps=n).field,
-    "covariance": lambda w, n: uncertainty.physics_covariance(SWING, w, chunk=n),
+    "fit_least_squares": lambda w, n: fit_least_squares(SWING, w, max_steps=n).field,
+    "covariance": lambda w, n: uncertainty.covariance_of(SWING, w, chunk=n),
     "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
     "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),
     "adapted": lambda w, n: ridge.adapted(ridge.last_layer, MIXED, w, WINDOWS, (1.0, n)),
-    "mse": lambda w, n: metrics.deployed_mse(SWING, w, n),
+    "mse": lambda w, n: metrics.rollout_mse(SWING, w, n),
     "split": lambda w, n: split(check(w), n),
     "windows_of": lambda w, n: check(windows_of(w.u[0], w.u[0, :-1], w.dt, steps=n)),
     "concatenate": lambda w, n: check(concatenate([w, WINDOWS])),

@@ -19,7 +19,7 @@ from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import QUICK, SMOKE, Config, Rates, ResidualInputs, distinct, preset_like
 from experiments.paper.solved import constant_disturbance, needed_disturbance
 from experiments.runner import command
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
@@ -93,14 +93,14 @@ class ClosedLoopConfig(Config):
             known = ", ".join(self.references)
             raise ValueError(f"--away-references must be among --references ({known}), got {', '.join(unknown)}")
         for option in ("seconds", "away", "bandwidth"):
-            validation.positive(f"--{option}", getattr(self, option))
+            checks.positive(f"--{option}", getattr(self, option))
         if not self.safe_rates:
             raise ValueError("--safe-rates must be at least one")
         for rate in self.safe_rates:
-            validation.positive("--safe-rates", rate)
-        validation.count("--safe-hidden", self.safe_hidden)
+            checks.positive("--safe-rates", rate)
+        checks.count("--safe-hidden", self.safe_hidden)
         if self.safe_offset is not None:
-            validation.positive("--safe-offset", self.safe_offset)
+            checks.positive("--safe-offset", self.safe_offset)
         if self.seconds < 1.0:
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
         if self.calls < 1:
@@ -141,7 +141,7 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
     fly_models(config, crews, console, outcome)
     if config.ablation:
         fly_ablation(config, console, outcome)
-    if hosts.first():
+    if hosts.is_main_process():
         outcome.speeds = speeds(config, trained)
         write(NAME, config, outcome, Console())
 

@@ -5,7 +5,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, deployed, pushed, pushforward, taken_up
+from hybrid_jax.dynamics.base import (
+    AbstractVectorField,
+    Hybrid,
+    apply_residual,
+    fuse_for_inference,
+    jvp_columns,
+    linearize,
+)
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
 from hybrid_jax.io.models import portable
@@ -42,14 +49,14 @@ class CommonField(AbstractVectorField):
 
     def acting(self, x: State, residual: State) -> State:
         """What of ẋ is not f_p, from what the residual returned."""
-        return taken_up(self.body, x, self.steady.of_all + residual)
+        return apply_residual(self.body, x, self.steady.of_all + residual)
 
 
-@pushforward.register
+@linearize.register
 def _(field: CommonField, x, u, dx, du):
-    alone, slope = pushforward(field.body, x, u, dx, du)
-    more = pushforward(field.residual, x, u, dx, du)
-    added, further = pushed(field.acting, (x, more[0]), (dx, more[1]))
+    alone, slope = linearize(field.body, x, u, dx, du)
+    more = linearize(field.residual, x, u, dx, du)
+    added, further = jvp_columns(field.acting, (x, more[0]), (dx, more[1]))
     return field.share * alone + added, field.share * slope + further
 
 
@@ -100,7 +107,7 @@ def common(field: AbstractVectorField, vehicle: Vehicle, hidden: int, scaling: I
             residual = silent(hidden, scaling)
         case _:
             share, residual, body = 0.0, field, rigid_body(vehicle)
-    return CommonField(jnp.asarray(share), body, steady, deployed(residual))
+    return CommonField(jnp.asarray(share), body, steady, fuse_for_inference(residual))
 
 
 def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:

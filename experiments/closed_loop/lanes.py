@@ -23,7 +23,7 @@ from hybrid_jax.control.promises import excess, least_promise, promises
 from hybrid_jax.control.references import Path as Reference
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import aside
+from hybrid_jax.io.files import backup_path
 from hybrid_jax.io.models import describe
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, Domain
 from hybrid_jax.sim.forces import Parameters, Wrench
@@ -203,7 +203,7 @@ class Airspace:
         if about is None:
             about, arrays = self._flown(lanes)
             words = clock(about["seconds"])
-            if hosts.first():
+            if hosts.is_main_process():
                 save_archive(path, FORMAT, about, arrays)
         self._console.print(f"{block.name}: {len(block.keys())} flights, {words}", highlight=False, soft_wrap=True)
         return Flights(block, arrays, about["seconds"], about["processor_seconds"], about["devices"])
@@ -217,7 +217,9 @@ class Airspace:
             return None, {}
         about, arrays = load_archive(path, FORMAT)
         if self._fresh and about["versions"] != versions(*MADE_BY):
-            self._console.print(f"{path}: moved aside to {path.rename(aside(path, 'before')).name}", highlight=False)
+            self._console.print(
+                f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}", highlight=False
+            )
             return None, {}
         return about, arrays
 

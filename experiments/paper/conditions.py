@@ -11,14 +11,14 @@ from jaxtyping import Int, PRNGKeyArray
 from experiments.paper.config import Config, Encoding, Stopping, column
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, guess, guess_off
+from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.views import restricted
-from hybrid_jax.runtime import SOONEST
+from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import FitState, Plan, make_plan
+from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -41,7 +41,7 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
 
 
 # Equinox hands the options on to jax.jit, but does not declare them.
-@eqx.filter_jit(compiler_options=SOONEST)  # pyright: ignore[reportCallIssue]
+@eqx.filter_jit(compiler_options=FASTEST_COMPILE)  # pyright: ignore[reportCallIssue]
 def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
     def build(seed):
         physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
@@ -51,12 +51,12 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
     return eqx.filter_vmap(build)(seeds)
 
 
-def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, Plan]:
+def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, RunConfig]:
     """One lane a seed, on all source trajectories."""
     return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
 
 
-def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, Plan]:
+def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, RunConfig]:
     """Pre-training that goes on from the seeds' fields, with all its rates times a factor."""
     rate, rule = _pretraining_rule(model, config)
     everything = np.arange(config.source_train)
@@ -66,7 +66,7 @@ def annealing(model: str, fields: AbstractVectorField, factor: float, config: Co
     return starts, stack([plan] * config.seeds)
 
 
-def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, Plan]:
+def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, RunConfig]:
     """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
     subsets = [drawn(seed, config) for seed in range(config.seeds)]
     one = lane(fields, 0)
@@ -81,7 +81,7 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
 
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
-) -> tuple[FitState, Plan]:
+) -> tuple[FitState, RunConfig]:
     """One lane a seed: the encoder of Expert Augmentation, on source flights as flown and as the expert flies them.
 
     Args:
@@ -96,7 +96,7 @@ def augmentation(
     seeds, size = np.arange(config.seeds), 2 * config.source_train
     learners = jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(experts, seeds))
     rule, cap = encoding.stopping, min(encoding.max_epochs, config.max_epochs)
-    plan = make_plan(encoding.rate, np.arange(size), size, rule.minimum, rule.patience, cap, encoding.weight)
+    plan = make_run_config(encoding.rate, np.arange(size), size, rule.minimum, rule.patience, cap, encoding.weight)
     return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
 
 
@@ -113,10 +113,10 @@ def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
 
 
 def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
-    if config.guess_off is None:
-        body = guess(vehicle, key, low=config.guess[0], high=config.guess[1])
+    if config.perturbed_by is None:
+        body = perturbed(vehicle, key, low=config.guess[0], high=config.guess[1])
     else:
-        body = guess_off(vehicle, key, config.guess_off)
+        body = perturbed_by(vehicle, key, config.perturbed_by)
     return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs in FORCED else body
 
 
@@ -148,14 +148,16 @@ def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[
     return rates.hybrid[i], Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
 
 
-def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.ndarray, size: int) -> Plan:
+def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.ndarray, size: int) -> RunConfig:
     physics: Any = config.rates.physics
     network: Any = rate
     rates = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
-    return make_plan(rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight)
+    return make_run_config(
+        rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight
+    )
 
 
-def _with_offset(plan: Plan, field: AbstractVectorField, config: Config) -> Plan:
+def _with_offset(plan: RunConfig, field: AbstractVectorField, config: Config) -> RunConfig:
     """The plan with a rate of its own for v̇ and ω̇ in the output bias of the field's network, if one is asked for."""
     offset = config.rates.offset
     if offset is None:

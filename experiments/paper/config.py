@@ -9,7 +9,7 @@ from typing import Any, Literal, TypeVar, get_args
 
 import platformdirs
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.training.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
@@ -22,12 +22,12 @@ ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
 Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
-FROM_ZERO: Rule = partial(validation.count, least=0)
+FROM_ZERO: Rule = partial(checks.count, least=0)
 RULES: Mapping[str, Rule] = (
-    dict.fromkeys(("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"), validation.count)
+    dict.fromkeys(("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"), checks.count)
     | dict.fromkeys(("data_seed", "patience"), FROM_ZERO)
-    | dict.fromkeys(("noise", "regulariser_weight", "rates"), validation.not_negative)
-    | {"guess_off": validation.positive}
+    | dict.fromkeys(("noise", "regulariser_weight", "rates"), checks.not_negative)
+    | {"perturbed_by": checks.positive}
 )
 
 
@@ -162,7 +162,7 @@ class Config(Run):
     """A linear map goes past f_d's hidden layer, and both begin at zero."""
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
-    guess_off: float | None = None
+    perturbed_by: float | None = None
     """Instead: at nominal times or over 1 + this, each of θ_p at random."""
     noise: float = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
@@ -182,7 +182,7 @@ class Config(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         check_numbers("--", self, RULES)
-        check_numbers("--rates.", self.rates, dict.fromkeys(("offset", "decay"), validation.positive))
+        check_numbers("--rates.", self.rates, dict.fromkeys(("offset", "decay"), checks.positive))
         factors("--guess", self.guess)
         if not self.sizes or min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")

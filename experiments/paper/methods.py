@@ -18,8 +18,8 @@ from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
 from hybrid_jax.adaptation.least_squares import physics_of
-from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, thaw
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane
@@ -68,7 +68,7 @@ def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field:
         config = case.config
         starts, plans = adaptation(model, "fine_tuned", mark(case.pretrained[model].best), config)
         final = case.stages.run(f"fine_tuned {name} {case.name}", starts, plans, settings(config), case.target)
-        whole = eqx.tree_at(lambda state: state.best, final, thaw(final.best))
+        whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
         errors = case.tested(name, whole.best)
         return with_intervals(case, trained(name, "fine_tuned", *places(config.sizes, config), whole, errors))
 
@@ -127,7 +127,7 @@ def with_intervals(case: Case, lanes: Lanes) -> Lanes:
 
     def one(lane, pool: Trajectories):
         field, subset = lane
-        found = intervals(field, physics_covariance(field, pool[subset], solver=solver))
+        found = intervals(field, covariance_of(field, pool[subset], solver=solver))
         return {name: jnp.stack([interval.low, interval.high]) for name, interval in found.items()}
 
     def of_size(index: int, size: int):

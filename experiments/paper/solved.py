@@ -13,13 +13,13 @@ import numpy as np
 from experiments.paper.conditions import drawn, settings
 from experiments.paper.config import Config
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation.disturbance_selection import fit_disturbance
-from hybrid_jax.adaptation.least_squares import PhysicsFit, fit_physics
+from hybrid_jax.adaptation.disturbance_selection import fit_with_selected_disturbance
+from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.runtime import SOONER
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import PROGRAMS
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
@@ -74,13 +74,13 @@ class _Lane:
     def __call__(self, lane: Any, pool: Trajectories, validation: Trajectories) -> Solved:
         field, subset = lane
         field, steps, status = self.solve(field, pool[subset], validation, self.shared)
-        val_mse = deployed_mse(field, validation, solver=self.shared.solver)
+        val_mse = rollout_mse(field, validation, solver=self.shared.solver)
         return Solved(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
 
 
 def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):
     """θ_p by least squares, everything else as it is."""
-    return _told(fit_physics(field, train, shared.solver))
+    return _told(fit_least_squares(field, train, shared.solver))
 
 
 def constant_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
@@ -90,10 +90,10 @@ def constant_disturbance(field, train: Trajectories, validation: Trajectories, s
 
 def needed_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
     """The same, but a disturbance of zero where the windows need none."""
-    return _told(fit_disturbance(field, train, shared.solver).fit)
+    return _told(fit_with_selected_disturbance(field, train, shared.solver).fit)
 
 
-def _told(found: PhysicsFit):
+def _told(found: LeastSquaresFit):
     status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
     return found.field, found.steps, status
 
@@ -110,7 +110,7 @@ def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
         return jax.lax.map(lambda lane: function(lane, *shared), lanes)
 
     # Equinox hands the options on to jax.jit, but does not declare them.
-    return eqx.filter_jit(mapped, compiler_options=SOONER)  # pyright: ignore[reportCallIssue]
+    return eqx.filter_jit(mapped, compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
 
 
 def subsets(size: int, config: Config) -> np.ndarray:

@@ -18,7 +18,7 @@ from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
 from experiments.real_flight.simulated_logs import write_logs
 from experiments.real_flight.study import study
 from experiments.runner import command
-from hybrid_jax.adaptation.least_squares import fit_physics
+from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.vehicle_file import LAG, load_description, of_field
 from hybrid_jax.flights.cleaning import lag_motors
@@ -71,7 +71,7 @@ def experiment(config: RealFlightConfig, console: Console) -> None:
         flown = following_rotors(flown, before, config, console)
     say_checks(flown, console)
     found = study(before, after, flown, config, console)
-    if hosts.first():
+    if hosts.is_main_process():
         write_outcome(Outcome(NAME, config, before, after, flown, dt, found), Console())
 
 
@@ -135,7 +135,7 @@ def following_rotors(
         fold = Fold("", logs[: len(train)], logs[len(train) :], [])
         windows = thinned(cut(fold.train, INTERVAL_STEPS).windows, FITTED)
         judged = cut(fold.validation, INTERVAL_STEPS).windows
-        fitted = fit_physics(multirotor(craft.vehicle, craft.learn, craft.terms), windows).field
+        fitted = fit_least_squares(multirotor(craft.vehicle, craft.learn, craft.terms), windows).field
         return relative_error(flight_errors(fitted, judged), flight_errors(baseline, judged), (INTERVAL_STEPS,))
 
     chosen, _ = choose_time_constant([*train, *validation], error)

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 from experiments.paper.config import Run, distinct
 from experiments.real_flight.recipes import RECIPES, Model, RecipeName
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
 # What a rigid body of known shape leaves open on a real vehicle; mass is weighed, not learned.
@@ -42,11 +42,11 @@ class Cleaning:
             raise ValueError("--cleaning.align finds the delay itself: leave --cleaning.delay out")
         if self.longest_gap and self.resample is None:
             raise ValueError("--cleaning.longest-gap needs --cleaning.resample")
-        validation.not_negative("--cleaning.longest-gap", self.longest_gap)
-        validation.number("--cleaning.delay", self.delay)
+        checks.not_negative("--cleaning.longest-gap", self.longest_gap)
+        checks.number("--cleaning.delay", self.delay)
         for name in ("resample", "low_pass"):
             if getattr(self, name) is not None:
-                validation.positive(f"--cleaning.{name.replace('_', '-')}", getattr(self, name))
+                checks.positive(f"--cleaning.{name.replace('_', '-')}", getattr(self, name))
 
 
 @dataclass(frozen=True)

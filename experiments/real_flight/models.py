@@ -16,20 +16,20 @@ from experiments.real_flight.logs import Windows
 from experiments.real_flight.recipes import Recipe, Step, stage_of
 from experiments.runner.stages import Stages
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates
-from hybrid_jax.dynamics.multirotor import Multirotor, carried_to, multirotor
+from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.io.models import portable
-from hybrid_jax.networks.mlp import InputScaling, silenced
+from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import restricted
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training import fitting
-from hybrid_jax.training.channels import ChannelPrediction, channels_from
-from hybrid_jax.training.fitting import FitState, Plan, make_plan
+from hybrid_jax.training.channels import ChannelLoss, channels_from
+from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.training.stages import cut, judged, rates_by_group
 from hybrid_jax.trajectories import Trajectories, concatenate
@@ -47,8 +47,8 @@ class Kinematics(AbstractVectorField):
         return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), still])
 
 
-@evaluate_batch.register(Kinematics)
-@deploy_batch.register(Kinematics)
+@train_batch.register(Kinematics)
+@infer_batch.register(Kinematics)
 def _(field, x, u):
     return field(x, u)
 
@@ -88,7 +88,7 @@ def fresh(model: str, craft: Craft, recipe: Recipe, hidden: int, seeds: int) -> 
 
     def network(key: PRNGKeyArray) -> AbstractVectorField:
         seen: dict[str, Any] = {"inputs": "body_motion", "outputs": outputs, "norm": "none", "scaling": hover}
-        return silenced(restricted(key, hidden=hidden, **seen))
+        return zero_output(restricted(key, hidden=hidden, **seen))
 
     def build(seed):
         match model:
@@ -109,7 +109,7 @@ def moved(field: Any, vehicle: Vehicle) -> Any:
         return isinstance(node, Multirotor)
 
     def move(node):
-        return carried_to(node, vehicle) if is_body(node) else node
+        return with_vehicle(node, vehicle) if is_body(node) else node
 
     def one(field):
         return jax.tree.map(move, field, is_leaf=is_body)
@@ -121,7 +121,7 @@ def settings_of(craft: Craft, lessons: Lessons, recipe: Recipe, batch_size: int)
     """Each channel weighed by the error of nominal thrust with frozen rates at the end of the training windows."""
     position, *others = channels_from(craft.thrust(), lessons.train.windows)  # in the state's order
     position = replace(position, scale=recipe.position * position.scale)
-    return Settings(batch_size, objective=ChannelPrediction((position, *others), recipe.huber))
+    return Settings(batch_size, objective=ChannelLoss((position, *others), recipe.huber))
 
 
 @dataclass(frozen=True)
@@ -218,15 +218,15 @@ def all_windows(lessons: Lessons, more: Windows) -> Lessons:
     return replace(lessons, train=Windows(both, [*old.sizes, *more.sizes], old.stride))
 
 
-def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> Plan:
+def _plans(model: str, fields: Any, lanes: Sequence[Lane], step: Step) -> RunConfig:
     longest = max(len(each.subset) for each in lanes)
     one = lane(fields, 0)
 
-    def plan(each: Lane) -> Plan:
+    def plan(each: Lane) -> RunConfig:
         stage = stage_of(step, model, each.share)
         subset = np.resize(each.subset, longest)  # of one length; only the first len(subset) are used
         rates = rates_by_group(one, rates_of(step, model, one))
-        return make_plan(rates, subset, len(each.subset), 0, stage.patience, stage.epochs, 0.0)
+        return make_run_config(rates, subset, len(each.subset), 0, stage.patience, stage.epochs, 0.0)
 
     return jax.device_get(stack([jax.device_get(plan(each)) for each in lanes]))
 
@@ -242,7 +242,7 @@ def _paths_of(names: Sequence[str], field: AbstractVectorField) -> list[str]:
     return [path for path in named_leaves(learned) if path.rpartition("/")[-1] in names]
 
 
-def _until(plans: Plan, epochs: np.ndarray) -> Plan:
+def _until(plans: RunConfig, epochs: np.ndarray) -> RunConfig:
     """Plans that end after so many epochs, and not before; no fewer than one."""
     exact = np.maximum(epochs, 1).astype(np.int32)
     return eqx.tree_at(lambda plan: (plan.max_epochs, plan.min_epochs), plans, (exact, exact))

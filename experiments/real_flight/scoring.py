@@ -17,13 +17,13 @@ from experiments.real_flight.logs import Windows, cut
 from experiments.real_flight.models import Lane, Trained
 from experiments.real_flight.rows import QUANTITIES, SUM, FlightRow, finite
 from hybrid_jax.adaptation import least_squares, ridge
-from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.flights.scores import FlightErrors, flight_errors, mean_by_step
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import stages
-from hybrid_jax.training.channels import ChannelPrediction
+from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
 from hybrid_jax.trajectories import Trajectories
 
@@ -112,9 +112,7 @@ def score_lanes(
     ]
 
 
-def parameters(
-    fields: Any, lanes: Sequence[Lane], training: Windows, objective: ChannelPrediction
-) -> list[dict[str, Any]]:
+def parameters(fields: Any, lanes: Sequence[Lane], training: Windows, objective: ChannelLoss) -> list[dict[str, Any]]:
     """θ_p of each lane and its intervals, from those of its windows that share no sample, as the loss counts errors."""
     if not any(map(_is_body, jax.tree.leaves(fields, is_leaf=_is_body))):
         return [{} for _ in lanes]
@@ -131,7 +129,7 @@ def parameters(
     return found
 
 
-def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: ChannelPrediction):
+def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: ChannelLoss):
     """θ_p alone where there are no more windows than parameters."""
     enough = own.shape[1] > least_squares.parametrise(lane(fields, 0))[0].size
     ends = jax.device_get(_intervals(fields, own, windows, objective) if enough else _values(fields))
@@ -145,10 +143,10 @@ def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: 
 
 
 @eqx.filter_jit
-def _intervals(fields: Any, own: Int[np.ndarray, "lanes n"], windows: Trajectories, objective: ChannelPrediction):
+def _intervals(fields: Any, own: Int[np.ndarray, "lanes n"], windows: Trajectories, objective: ChannelLoss):
     def one(lane):
         field, places = lane
-        return intervals(body_of(field), physics_covariance(field, windows[places], error=objective.error))
+        return intervals(body_of(field), covariance_of(field, windows[places], error=objective.error))
 
     return jax.lax.map(one, (fields, own))
 

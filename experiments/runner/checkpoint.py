@@ -15,7 +15,7 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint._src.futures import signaling_client
 
 from hybrid_jax.io.archive import Arrays, digest
-from hybrid_jax.io.files import aside
+from hybrid_jax.io.files import backup_path
 
 KEPT = 2
 PARTIAL = ".orbax-checkpoint-tmp"  # orbax writes under a name that ends so, then renames
@@ -72,7 +72,7 @@ class Checkpoints:
             try:
                 return self._read(path)
             except Exception as error:  # a damaged byte can make orbax and its storage raise anything
-                renamed = path.rename(aside(path, "damaged"))
+                renamed = path.rename(backup_path(path, "damaged"))
                 say(f"{path}: truncated or damaged, set aside as {renamed.name}: {_cause(error)}")
         return None
 

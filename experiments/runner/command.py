@@ -44,13 +44,13 @@ def run(
         check_folder("--out", config.out)
         configure(config.cache)
         if config.distributed:
-            hosts.join(config.coordinator, config.processes, config.process_id)
+            hosts.initialize(config.coordinator, config.processes, config.process_id)
         signal.signal(signal.SIGTERM, _terminate)
-        quiet = not hosts.first()  # process 0 alone speaks and writes
+        quiet = not hosts.is_main_process()  # process 0 alone speaks and writes
         console, folder = Console(stderr=True, quiet=quiet), config.out / name
         say = partial(console.print, highlight=False, soft_wrap=True)
         with contextlib.ExitStack() as held:
-            if hosts.first():
+            if hosts.is_main_process():
                 held.enter_context(alone(folder))
                 held.enter_context(recorded(folder, config, say))
             experiment(config, console)

@@ -10,7 +10,7 @@ from typing import Any
 from experiments.paper.config import Run
 from experiments.reporting.environment import PACKAGES
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import aside, json_text, json_value, read_json, write_whole
+from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_whole
 
 FILE = "run.json"
 FIXED = ("config", "versions", "flights")  # what must be the same for a run to go on
@@ -88,7 +88,7 @@ def _move_aside(folder: Path, say: Callable[[str], None]) -> None:
     """Move all that a run has left into a neighbour, its record last: a kill in between loses nothing."""
     left = [path for path in folder.iterdir() if path.name != ".lock"]
     if left:
-        elsewhere = aside(folder, "before")
+        elsewhere = backup_path(folder, "before")
         elsewhere.mkdir()
         for path in sorted(left, key=lambda path: path.name == FILE):
             path.rename(elsewhere / path.name)

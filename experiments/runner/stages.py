@@ -16,12 +16,12 @@ from experiments.runner.run_record import require_same
 from experiments.runner.signals import Held
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import aside
+from hybrid_jax.io.files import backup_path
 from hybrid_jax.io.models import describe
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import NO_MORE, Progress, Room, sweep
-from hybrid_jax.training.fitting import FitState, Plan
-from hybrid_jax.training.objective import Prediction, Settings
+from hybrid_jax.training.fitting import FitState, RunConfig
+from hybrid_jax.training.objective import Settings, TrajectoryLoss
 
 FORMAT = "hybrid_jax sweep 1"
 RECIPE = 1  # raise it when the same start, plan and data no longer give the same result
@@ -48,7 +48,7 @@ class Stages:
         self._ran = self._saving = 0.0
 
     def run(
-        self, name: str, states: FitState, plans: Plan, settings: Settings, data: Dataset, room: Room = NO_MORE
+        self, name: str, states: FitState, plans: RunConfig, settings: Settings, data: Dataset, room: Room = NO_MORE
     ) -> FitState:
         """The final states of a sweep on the train and validation splits of a dataset.
 
@@ -63,7 +63,7 @@ class Stages:
         identity = _identity(states, plans, settings, data)
         finished = self._folder / f"{_stem(name)}-{identity[:16]}.npz"
         begun = finished.with_suffix(".begun")
-        if self._fresh and hosts.first():
+        if self._fresh and hosts.is_main_process():
             self._make_way(finished, begun)
         checkpoints = Checkpoints(begun)
         done, spent, states = self._found(name, states, finished, checkpoints, begun)
@@ -76,7 +76,7 @@ class Stages:
             keeper = _Keeper(checkpoints, held, name, spent, self._share)
             states = self._sweep(name, states, plans, settings, data, room, keeper)
             self.seconds[name] = keeper.seconds()
-            if hosts.first():
+            if hosts.is_main_process():
                 _save(finished, name, states, self.seconds[name])
                 checkpoints.delete()
         self._ran, self._saving = self._ran + keeper.seconds() - spent, self._saving + keeper.saving
@@ -115,7 +115,7 @@ class Stages:
     def _make_way(self, finished: Path, begun: Path) -> None:
         stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
         for path in [begun] * begun.exists() + [finished] * stale:
-            self._say(f"{path}: moved aside to {path.rename(aside(path, 'before')).name}")
+            self._say(f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}")
 
     def _found(
         self, name: str, start: FitState, finished: Path, checkpoints: Checkpoints, begun: Path
@@ -151,7 +151,7 @@ class Stages:
             train, validation = data.splits["train"], data.splits["validation"]
             try:
                 return sweep(states, plans, train, validation, settings, room=room, on_block=on_block)
-            except hosts.Gone:
+            except hosts.PeerLost:
                 keeper.rescue()
                 raise
 
@@ -186,13 +186,13 @@ class _Keeper:
         """Save the states after a block if it is time; let a signal act that came during the block."""
         self._unsaved = states
         due = self.saving + self._cost < self._share * (self.seconds() - self._spent)
-        if hosts.first() and (due or self._held.waiting):
+        if hosts.is_main_process() and (due or self._held.waiting):
             self._save(states)
         self._held.deliver()
 
     def rescue(self) -> None:
         """Save the last block, if it was not: another process has ended."""
-        if self._unsaved is not None and hosts.first():
+        if self._unsaved is not None and hosts.is_main_process():
             self._save(self._unsaved)
 
     def _save(self, states: FitState) -> None:
@@ -214,7 +214,7 @@ def summary(states: FitState) -> str:
     return f"{len(states.epoch)} lanes, {first} to {last} epochs, best validation loss {states.best_mse.min():.3g}"
 
 
-def _identity(states: FitState, plans: Plan, settings: Settings, data: Dataset) -> str:
+def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
     shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
     # Leaves say nothing of what is static in a field: the vehicle, how inputs are scaled.
@@ -224,7 +224,7 @@ def _identity(states: FitState, plans: Plan, settings: Settings, data: Dataset) 
 
 def _described(objective: Any) -> list[Any]:
     """An objective of another kind than the default one, as JSON values."""
-    return [] if isinstance(objective, Prediction) else [type(objective).__name__, asdict(objective)]
+    return [] if isinstance(objective, TrajectoryLoss) else [type(objective).__name__, asdict(objective)]
 
 
 def _save(path: Path, name: str, states: FitState, seconds: float) -> None:

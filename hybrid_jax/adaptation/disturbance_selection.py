@@ -16,14 +16,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.adaptation.least_squares import PhysicsFit, fit_physics, physics_of
+from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares, physics_of
 from hybrid_jax.adaptation.uncertainty import inverse, normal_equations
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.trajectories import Trajectories
 
 
-class DisturbanceFit(eqx.Module):
+class SelectedFit(eqx.Module):
     """What was fitted.
 
     Attributes:
@@ -33,18 +33,18 @@ class DisturbanceFit(eqx.Module):
         error: the standard error of this.
     """
 
-    fit: PhysicsFit
+    fit: LeastSquaresFit
     needed: Bool[Array, ""]
     gain: Float[Array, ""]
     error: Float[Array, ""]
 
 
-def fit_disturbance(
+def fit_with_selected_disturbance(
     field: Hybrid, windows: Trajectories, solver: diffrax.AbstractSolver | None = None, max_steps: int = 100
-) -> DisturbanceFit:
+) -> SelectedFit:
     """Minimise L_MSE over θ_p and, if that predicts windows that were left out better, a constant disturbance.
 
-    Pure, as `fit_physics`. A single window, or windows that do not tell the parameters apart, need no
+    Pure, as `fit_least_squares`. A single window, or windows that do not tell the parameters apart, need no
     disturbance.
 
     Args:
@@ -53,15 +53,17 @@ def fit_disturbance(
         max_steps: of each of the two fits.
 
     Raises:
-        ValueError: no hybrid; as `fit_physics`.
+        ValueError: no hybrid; as `fit_least_squares`.
     """
-    richer = fit_physics(with_disturbance(field), windows, solver, max_steps)
-    plain = fit_physics(field, windows, solver, max_steps)
+    richer = fit_least_squares(with_disturbance(field), windows, solver, max_steps)
+    plain = fit_least_squares(field, windows, solver, max_steps)
     return _choice(field, plain, richer, windows, solver)
 
 
 @eqx.filter_jit
-def _choice(field: Hybrid, plain: PhysicsFit, richer: PhysicsFit, windows: Trajectories, solver) -> DisturbanceFit:
+def _choice(
+    field: Hybrid, plain: LeastSquaresFit, richer: LeastSquaresFit, windows: Trajectories, solver
+) -> SelectedFit:
     without, having = (left_out(fit.field, windows, solver) for fit in (plain, richer))
     gains = without - having
     gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(windows))
@@ -69,7 +71,7 @@ def _choice(field: Hybrid, plain: PhysicsFit, richer: PhysicsFit, windows: Traje
     still = with_disturbance(Hybrid(physics_of(plain.field), field.residual))
     at_rest = eqx.tree_at(lambda fit: fit.field, plain, still)
     kept = jax.tree.map(lambda one, other: jnp.where(needed, one, other), richer, at_rest)
-    return DisturbanceFit(kept, needed, gain, error)
+    return SelectedFit(kept, needed, gain, error)
 
 
 def left_out(

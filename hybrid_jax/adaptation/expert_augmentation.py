@@ -15,9 +15,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import parametrise
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, Statistics
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.models import portable
 from hybrid_jax.metrics import mse
@@ -38,7 +38,7 @@ class Encoder(eqx.Module):
 
     weights: tuple[Float[Array, "out in"], ...]
     biases: tuple[Float[Array, " out"], ...]
-    seen: Statistics
+    seen: RunningStats
 
     def __call__(self, past: Trajectories) -> Float[Array, " p"]:
         z = (read(past) - self.seen.mean) * jax.lax.rsqrt(self.seen.variance + 1e-12)
@@ -97,8 +97,8 @@ def expert_augmented(
     if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
         raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
     check(past, "past")
-    validation.count("hidden", hidden)
-    validation.key("key", key)
+    checks.count("hidden", hidden)
+    checks.key("key", key)
     readings = jax.vmap(read)(past)
     sizes = (readings.shape[1], hidden, hidden, parametrise(expert)[0].size)
     keys = jax.random.split(key, len(sizes) - 1)
@@ -106,7 +106,7 @@ def expert_augmented(
         jax.random.uniform(k, (out, fan_in), minval=-1.0, maxval=1.0) * (3 / fan_in) ** 0.5
         for k, fan_in, out in zip(keys, sizes[:-1], sizes[1:], strict=True)
     )
-    seen = Statistics(readings.mean(0), readings.var(0))
+    seen = RunningStats(readings.mean(0), readings.var(0))
     return ExpertAugmented(Encoder(weights, tuple(jnp.zeros(out) for out in sizes[1:]), seen), Frozen(expert), box)
 
 
@@ -148,8 +148,8 @@ class Augmentation:
     seed: int = 0
 
     def __post_init__(self):
-        validation.count("past", self.past)
-        validation.count("seed", self.seed, least=0)
+        checks.count("past", self.past)
+        checks.count("seed", self.seed, least=0)
 
     def prepare(self, windows: Trajectories, name: str) -> Labelled:
         check(windows, name)

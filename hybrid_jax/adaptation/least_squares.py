@@ -15,7 +15,7 @@ import optimistix
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import rollout
@@ -24,7 +24,7 @@ from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 
 
-class PhysicsFit(eqx.Module):
+class LeastSquaresFit(eqx.Module):
     """What least squares found.
 
     Attributes:
@@ -61,12 +61,12 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
         return state.terminate | small, state.result
 
 
-def fit_physics(
+def fit_least_squares(
     field: AbstractVectorField,
     windows: Trajectories,
     solver: diffrax.AbstractSolver | None = None,
     max_steps: int = 100,
-) -> PhysicsFit:
+) -> LeastSquaresFit:
     """Minimise L_MSE of the field as deployed over the θ_p of its physics; a hybrid's residual stays as it is.
 
     Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. The precision
@@ -80,8 +80,8 @@ def fit_physics(
         ValueError: the physics has nothing to fit, or windows that are malformed or not of this field.
     """
     check_windows(field, windows)
-    validation.count("max_steps", max_steps)
-    return _fit_physics(field, windows, solver, max_steps)
+    checks.count("max_steps", max_steps)
+    return _fit_least_squares(field, windows, solver, max_steps)
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
@@ -96,7 +96,9 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
 
 
 @eqx.filter_jit
-def _fit_physics(field, windows: Trajectories, solver: diffrax.AbstractSolver | None, max_steps: int) -> PhysicsFit:
+def _fit_least_squares(
+    field, windows: Trajectories, solver: diffrax.AbstractSolver | None, max_steps: int
+) -> LeastSquaresFit:
     start, rebuild = parametrise(field)
 
     def residuals(theta: Float[Array, " p"]) -> Float[Array, "n t d"]:
@@ -127,7 +129,7 @@ def _fit_physics(field, windows: Trajectories, solver: diffrax.AbstractSolver | 
     theta = theta_at(found.value)
     reached = _mse(residuals(theta))
     finite = jnp.isfinite(reached)
-    return PhysicsFit(
+    return LeastSquaresFit(
         field=rebuild(jnp.where(finite, theta, start)),
         mse=jnp.where(finite, reached, _mse(at_start)),
         steps=jnp.asarray(found.stats["num_steps"], jnp.int32),

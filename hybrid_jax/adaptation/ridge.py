@@ -14,10 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import checked, integrate
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import LinearResidual, ResidualNetwork
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -72,7 +72,7 @@ def last_layer(
     if not isinstance(network, ResidualNetwork):
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
     check(windows, "windows")
-    validation.positive("penalty", penalty)
+    checks.positive("penalty", penalty)
     intervals = intervals_of(windows)
     lacking = defects(field, intervals, solver)
     activations = jax.vmap(network.activations)
@@ -98,7 +98,7 @@ def linear_residual(
         ValueError: windows that are malformed, or a penalty that is known and not positive.
     """
     check(windows, "windows")
-    validation.positive("penalty", penalty)
+    checks.positive("penalty", penalty)
     intervals = intervals_of(windows)
     z = jnp.concatenate([(intervals.before + intervals.after) / 2, intervals.u], axis=1)
     mean, scale = standard(z)
@@ -126,7 +126,7 @@ def adapted(
     if not penalties:
         raise ValueError("penalties must be some positive numbers, got none")
     for penalty in penalties:
-        validation.positive("penalties", penalty, "positive finite numbers")
+        checks.positive("penalties", penalty, "positive finite numbers")
     grid = jnp.asarray(penalties, float)
     # The decomposition inside `ridge` does not depend on the penalty, so vmap computes it once for the whole grid.
     candidates = eqx.filter_vmap(lambda penalty: method(field, train, penalty))(grid)
@@ -144,7 +144,7 @@ def select(
     One that diverges is never chosen; if all do, the first is.
     """
     arrays, rest = eqx.partition(candidates, eqx.is_array)
-    errors = jax.lax.map(lambda one: deployed_mse(eqx.combine(one, rest), windows, solver=solver), arrays)
+    errors = jax.lax.map(lambda one: rollout_mse(eqx.combine(one, rest), windows, solver=solver), arrays)
     return jnp.argmin(jnp.where(jnp.isfinite(errors), errors, jnp.inf)), errors
 
 

@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import check_windows, parametrise, physics_of, residual
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
@@ -44,7 +44,7 @@ class Interval(NamedTuple):
     high: Float[Array, "*lanes"]
 
 
-def physics_covariance(
+def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
     kind: Kind = "sandwich",
@@ -68,7 +68,7 @@ def physics_covariance(
             white, or windows that are malformed.
     """
     check_windows(field, windows)
-    validation.count("chunk", chunk)
+    checks.count("chunk", chunk)
     n, p = len(windows), parametrise(field)[0].size
     if n <= p:
         raise ValueError(f"windows: {n} are too few for a covariance of {p} parameters, at least {p + 1} are needed")
@@ -76,11 +76,11 @@ def physics_covariance(
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
     if error is not None and kind == "homoscedastic":
         raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
-    return _physics_covariance(field, windows, kind, solver, chunk, error)
+    return _covariance_of(field, windows, kind, solver, chunk, error)
 
 
 @eqx.filter_jit
-def _physics_covariance(
+def _covariance_of(
     field, windows: Trajectories, kind: Kind, solver, chunk: int, error: Counted | None
 ) -> Float[Array, "p p"]:
     gram, score, square = normal_equations(field, windows, solver, chunk, error)
@@ -162,8 +162,8 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
         ValueError: a level that is not between 0 and 1, or physics that is neither `RigidBody` nor `Multirotor` nor
             another `AbstractRigidBody`; as `standard_errors`.
     """
-    if not 0 < (validation.real(level) or 0) < 1:
-        raise ValueError(f"level must be between 0 and 1, got {validation.shown(level)}")
+    if not 0 < (checks.real(level) or 0) < 1:
+        raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
     physics = physics_of(field)
     if not isinstance(physics, AbstractRigidBody):
         name = type(physics).__name__
@@ -187,16 +187,16 @@ def _entries(physics) -> dict[str, Float[Array, ""]]:
 
 def _deviations(covariance: Float[Array, "p p"], p: int) -> Float[Array, " p"]:
     variances = jnp.diagonal(_square(covariance, p))
-    if not validation.is_traced(variances) and (variances < 0).any():
+    if not checks.is_traced(variances) and (variances < 0).any():
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
     return jnp.sqrt(variances)
 
 
 def _square(covariance: Float[Array, "p p"], p: int) -> Float[Array, "p p"]:
-    array = validation.real_array("covariance", covariance)
+    array = checks.real_array("covariance", covariance)
     if array.shape != (p, p):
         raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
-    return validation.floating("covariance", array)
+    return checks.floating("covariance", array)
 
 
 def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:

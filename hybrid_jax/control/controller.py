@@ -17,12 +17,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control.attitude import one_sheet
 from hybrid_jax.control.cost import Scalar, Weights, deviations, plan_cost, stage_factors, unrest
 from hybrid_jax.control.sensitivities import advance, advanced
 from hybrid_jax.control.steadying import steadying_speeds
-from hybrid_jax.dynamics.base import AbstractVectorField, deployed
+from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vehicle import Vehicle
@@ -95,12 +95,12 @@ class Controller:
     def __post_init__(self):
         for name, kind in (("vehicle", Vehicle), ("weights", Weights)):
             if not isinstance(getattr(self, name), kind):
-                raise ValueError(f"{name} must be a {kind.__name__}, got {validation.shown(getattr(self, name))}")
-        validation.count("steps", self.steps, least=2)
-        validation.count("iterations", self.iterations)
+                raise ValueError(f"{name} must be a {kind.__name__}, got {checks.short_repr(getattr(self, name))}")
+        checks.count("steps", self.steps, least=2)
+        checks.count("iterations", self.iterations)
         for name in ("interval", "period", "damping"):
-            validation.positive(name, getattr(self, name))
-        validation.not_negative("min_speed", self.min_speed)
+            checks.positive(name, getattr(self, name))
+        checks.not_negative("min_speed", self.min_speed)
         if abs(self.stride * self.period - self.interval) > 1e-6 * self.interval:
             raise ValueError(f"interval must be a multiple of period {self.period}, got {self.interval}")
         if not self.min_speed < self.vehicle.hover_speed < self.vehicle.max_rotor_speed:
@@ -136,9 +136,9 @@ class Controller:
         Raises:
             ValueError: where i is known, one that is negative or whose horizon goes on beyond the reference.
         """
-        validation.count("i", i, least=0)
+        checks.count("i", i, least=0)
         last = len(reference) - 1 - self.steps * self.stride
-        if not validation.is_traced(i) and i > last:
+        if not checks.is_traced(i) and i > last:
             raise ValueError(f"reference must have {self.steps * self.stride} samples after i, so i ≤ {last}; got {i}")
         return reference[i + self.stride * jnp.arange(1, self.steps + 1)]
 
@@ -156,16 +156,16 @@ class Controller:
                 is not finite or a quaternion that is none of a rotation. A compiled call normalises that of x.
         """
         if not callable(model):
-            raise ValueError(f"model must be a vector field, got {validation.shown(model)}")
-        x, reference = validation.floating("x", x), validation.floating("reference", reference)
+            raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
+        x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
         self._check_plan(plan)
-        validation.unit_quaternions("x", x)
-        validation.unit_quaternions("reference", reference)
+        checks.unit_quaternions("x", x)
+        checks.unit_quaternions("reference", reference)
         x, reference, plan = in_common(x, reference, plan)
         x = x.at[QUATERNION].set(one_sheet(normalise(x[QUATERNION])))
-        model = deployed(model)
+        model = fuse_for_inference(model)
         free, states, cost = self._first(model, reference, x, plan)
 
         def iteration(_, point):
@@ -177,7 +177,7 @@ class Controller:
 
     def _check_plan(self, plan: Plan) -> None:
         if not isinstance(plan, Plan):
-            raise ValueError(f"plan must be begin() or that of the last call, got {validation.shown(plan)}")
+            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
         if plan.free.shape != (self.steps, INPUT_SIZE):
             expected = f"{self.steps} intervals, as begin() has"
             raise ValueError(f"plan must be one of {expected}, got free numbers of shape {plan.free.shape}")

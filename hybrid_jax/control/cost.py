@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control.attitude import attitude_error
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, State
 
@@ -45,7 +45,7 @@ class Weights:
     def __post_init__(self):
         for field in fields(self):
             required = field.name in ("position", "yaw", "change")
-            (validation.positive if required else validation.not_negative)(field.name, getattr(self, field.name))
+            (checks.positive if required else checks.not_negative)(field.name, getattr(self, field.name))
 
 
 def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12"]:

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control import observer
 from hybrid_jax.control.attitude import heading
 from hybrid_jax.control.controller import Controller, Plan, in_common
@@ -79,8 +79,8 @@ def fly(
         ValueError: shapes that do not fit, a reference no longer than the horizon, or, where it is known, a number that
             is not finite, a quaternion that is none of a rotation or a bandwidth that is negative.
     """
-    validation.not_negative("bandwidth", bandwidth)
-    x0, reference = validation.floating("x0", x0), validation.floating("reference", reference)
+    checks.not_negative("bandwidth", bandwidth)
+    x0, reference = checks.floating("x0", x0), checks.floating("reference", reference)
     periods = _periods(reference, x0, controller)
 
     def tick(carry, i):
@@ -92,8 +92,8 @@ def fly(
         x = plant(x, u, i * controller.period).astype(x.dtype)
         return (x, plan, estimate), (x, u, plan, estimate.disturbance)
 
-    validation.unit_quaternions("x0", x0)
-    validation.unit_quaternions("reference", reference)
+    checks.unit_quaternions("x0", x0)
+    checks.unit_quaternions("reference", reference)
     x0, reference, plan = in_common(x0, reference, controller.begin())
     start = (x0, plan, observer.begin(x0))
     _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))

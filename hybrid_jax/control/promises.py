@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller
 from hybrid_jax.control.loop import Flight, Plant, realised
 
@@ -45,7 +45,7 @@ def least_promise(controller: Controller, distance: float = NEAR) -> float:
     Raises:
         ValueError: a distance that is not positive.
     """
-    validation.positive("distance", distance)
+    checks.positive("distance", distance)
     weights = controller.weights
     return (controller.steps - 1 + weights.terminal**2) * (weights.position * distance) ** 2
 

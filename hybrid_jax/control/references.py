@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller
 from hybrid_jax.rotation import Quaternion, conjugate, from_axis_angle, multiply
 from hybrid_jax.state import BODY_RATES, STATE_SIZE, State
@@ -31,8 +31,8 @@ def sample(path: Path, controller: Controller, duration: float) -> Float[Array, 
         ValueError: no path, or a duration that is no positive number.
     """
     if not callable(path):
-        raise ValueError(f"path must be a function of time, such as hover(), got {validation.shown(path)}")
-    validation.positive("duration", duration, "a positive number of seconds")
+        raise ValueError(f"path must be a function of time, such as hover(), got {checks.short_repr(path)}")
+    checks.positive("duration", duration, "a positive number of seconds")
     count = round(duration / controller.period) + controller.steps * controller.stride + 1
     times = controller.period * jnp.arange(count)
     return jax.vmap(lambda t: state_on(path, t, controller.vehicle.gravity))(times)
@@ -70,7 +70,7 @@ def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0
         ValueError: a place that is none, or a number that is not finite.
     """
     _check_vector("position", position)
-    validation.number("yaw", yaw)
+    checks.number("yaw", yaw)
     return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
 
 
@@ -80,10 +80,10 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
     Raises:
         ValueError: a speed or a width that is not positive, or a number that is not finite.
     """
-    validation.positive("top_speed", top_speed)
-    validation.positive("half_width", half_width)
-    validation.number("altitude", altitude)
-    validation.number("yaw", yaw)
+    checks.positive("top_speed", top_speed)
+    checks.positive("half_width", half_width)
+    checks.number("altitude", altitude)
+    checks.number("yaw", yaw)
     turning = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):
@@ -102,7 +102,7 @@ def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, alti
     """
     _check_vector("to", to)
     for name, value in (("at", at), ("yaw", yaw), ("altitude", altitude)):
-        validation.number(name, value)
+        checks.number(name, value)
 
     def path(t):
         after = jnp.where(t >= at, 1.0, 0.0)
@@ -119,10 +119,10 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
     Raises:
         ValueError: altitudes that are not 0 < low < high, a time that is not positive, or a number that is not finite.
     """
-    validation.number("speed", speed)
-    validation.number("high", high)
-    validation.positive("low", low)
-    validation.positive("every", every)
+    checks.number("speed", speed)
+    checks.number("high", high)
+    checks.positive("low", low)
+    checks.positive("every", every)
     if not low < high:
         raise ValueError(f"high must be above low {low}, got {high}")
 
@@ -139,7 +139,7 @@ def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> 
     Raises:
         ValueError: no state, or no rates.
     """
-    state = validation.floating("state", state)
+    state = checks.floating("state", state)
     if state.shape != (STATE_SIZE,):
         raise ValueError(f"state (13,) expected, got {state.shape}")
     _check_vector("rates", rates)
@@ -147,8 +147,6 @@ def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> 
 
 
 def _check_vector(name: str, value: tuple[float, float, float]) -> None:
-    array = validation.finite(
-        name, validation.real_array(name, value)
-    )  # no JAX array: modules make paths when imported
+    array = checks.finite(name, checks.real_array(name, value))  # no JAX array: modules make paths when imported
     if array.shape != (3,):
-        raise ValueError(f"{name} must be three numbers (x, y, z), got {validation.shown(value)}")
+        raise ValueError(f"{name} must be three numbers (x, y, z), got {checks.short_repr(value)}")

@@ -10,7 +10,7 @@ import diffrax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, pushed, pushforward
+from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns, linearize
 from hybrid_jax.integrate import RK4
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION, Input, State
@@ -24,13 +24,13 @@ def advanced(
     dx, du = directions[: len(x)], directions[len(x) :]
 
     def slopes(t, both, held):
-        value, columns = pushforward(model, both[:, 0], held, both[:, 1:], du)
+        value, columns = linearize(model, both[:, 0], held, both[:, 1:], du)
         return jnp.concatenate([value[:, None], columns], axis=1)
 
     start = jnp.concatenate([x[:, None], dx], axis=1)
     both = RK4().step(diffrax.ODETerm(slopes), 0.0, dt, start, u, None, made_jump=False)[0]
     x, columns = both[:, 0], both[:, 1:]
-    return pushed(with_unit_quaternion, (x,), (columns,)) if unit_quaternion else (x, columns)
+    return jvp_columns(with_unit_quaternion, (x,), (columns,)) if unit_quaternion else (x, columns)
 
 
 def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:

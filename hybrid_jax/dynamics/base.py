@@ -1,7 +1,7 @@
 """Vector fields ẋ = f(x, u): what a model is. Physics, a network, their sum and a user's own are all values of it.
 
 A field is any Equinox module that maps one state x (d,) and one input u (m,) to ẋ (d,). Many samples are evaluated at
-once, features first: x (d, b), u (m, b); by `evaluate_batch` in training, by `deploy_batch` in deployment. Both do it
+once, features first: x (d, b), u (m, b); by `train_batch` in training, by `infer_batch` in deployment. Both do it
 by `vmap`, so a user writes code for one sample and is done. A field registers its own version when the batch means
 something to it (batch normalisation), or when its code, in terms of x[0], x[1], …, serves a batch as it stands and is
 twice as fast without the transposes.
@@ -33,11 +33,11 @@ class Hybrid(AbstractVectorField):
     residual: AbstractVectorField
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.physics(x, u) + taken_up(self.physics, x, self.residual(x, u))
+        return self.physics(x, u) + apply_residual(self.physics, x, self.residual(x, u))
 
 
 class Frozen(AbstractVectorField):
-    """A field that training leaves as it is: no parameter and no running statistic moves (see `thaw`)."""
+    """A field that training leaves as it is: no parameter and no running statistic moves (see `unfreeze`)."""
 
     field: AbstractVectorField
 
@@ -45,44 +45,44 @@ class Frozen(AbstractVectorField):
         return self.field(x, u)
 
 
-def thaw(field: AbstractVectorField) -> AbstractVectorField:
+def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
     """The field without its `Frozen` wrappers."""
 
     def frozen(node) -> bool:
         return isinstance(node, Frozen)
 
-    return jax.tree.map(lambda node: thaw(node.field) if frozen(node) else node, field, is_leaf=frozen)
+    return jax.tree.map(lambda node: unfreeze(node.field) if frozen(node) else node, field, is_leaf=frozen)
 
 
 @singledispatch
-def evaluate_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ on a minibatch, as in training: features first, one column a sample."""
     return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: Hybrid, x, u):
-    return evaluate_batch(field.physics, x, u) + taken_up(field.physics, x, evaluate_batch(field.residual, x, u))
+    return train_batch(field.physics, x, u) + apply_residual(field.physics, x, train_batch(field.residual, x, u))
 
 
 @singledispatch
-def deploy_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ of many samples, each as in deployment: features first, one column a sample."""
     return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: Hybrid, x, u):
-    return deploy_batch(field.physics, x, u) + taken_up(field.physics, x, deploy_batch(field.residual, x, u))
+    return infer_batch(field.physics, x, u) + apply_residual(field.physics, x, infer_batch(field.residual, x, u))
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: Frozen, x, u):
-    return deploy_batch(field.field, x, u)
+    return infer_batch(field.field, x, u)
 
 
 @singledispatch
-def taken_up(
+def apply_residual(
     field: AbstractVectorField, x: Float[Array, " d *b"], more: Float[Array, " d *b"]
 ) -> Float[Array, " d *b"]:
     """What another field's derivative at x adds when it acts on what this field describes: itself, unless a force shows
@@ -91,47 +91,47 @@ def taken_up(
     return more
 
 
-@taken_up.register
+@apply_residual.register
 def _(field: Hybrid, x, more):
-    return taken_up(field.physics, x, more)
+    return apply_residual(field.physics, x, more)
 
 
-@taken_up.register
+@apply_residual.register
 def _(field: Frozen, x, more):
-    return taken_up(field.field, x, more)
+    return apply_residual(field.field, x, more)
 
 
-def pushed(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
+def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
     """The value of a function of some vectors, and its derivative in each direction of which they have a column."""
     value, slope = jax.linearize(function, *values)
     return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
 
 
 @singledispatch
-def pushforward(
+def linearize(
     field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
 ) -> tuple[Float[Array, " d"], Columns]:
     """ẋ of one sample as in deployment, and its derivative in the directions dx (d, c), du (m, c): a pair of columns
     for each. A field that knows a shorter way than one direction after the other registers its own.
     """
-    return pushed(field, (x, u), (dx, du))
+    return jvp_columns(field, (x, u), (dx, du))
 
 
-@pushforward.register
+@linearize.register
 def _(field: Hybrid, x, u, dx, du):
-    alone, slope = pushforward(field.physics, x, u, dx, du)
-    more = pushforward(field.residual, x, u, dx, du)
-    added, further = pushed(lambda x, more: taken_up(field.physics, x, more), (x, more[0]), (dx, more[1]))
+    alone, slope = linearize(field.physics, x, u, dx, du)
+    more = linearize(field.residual, x, u, dx, du)
+    added, further = jvp_columns(lambda x, more: apply_residual(field.physics, x, more), (x, more[0]), (dx, more[1]))
     return alone + added, slope + further
 
 
-@pushforward.register
+@linearize.register
 def _(field: Frozen, x, u, dx, du):
-    return pushforward(field.field, x, u, dx, du)
+    return linearize(field.field, x, u, dx, du)
 
 
 @singledispatch
-def deployed(field: AbstractVectorField) -> AbstractVectorField:
+def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
     """The same map as in deployment, laid out to be asked for few samples at a time, hundreds of times in a row.
 
     The field itself, unless a faster one is registered.
@@ -139,28 +139,28 @@ def deployed(field: AbstractVectorField) -> AbstractVectorField:
     return field
 
 
-@deployed.register
+@fuse_for_inference.register
 def _(field: Hybrid):
-    return Hybrid(deployed(field.physics), deployed(field.residual))
+    return Hybrid(fuse_for_inference(field.physics), fuse_for_inference(field.residual))
 
 
-@deployed.register
+@fuse_for_inference.register
 def _(field: Frozen):
-    return deployed(field.field)
+    return fuse_for_inference(field.field)
 
 
 @singledispatch
-def observe(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
+def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
     """The field after it has seen a training batch: running statistics move, learned parameters do not."""
     return field
 
 
-@observe.register
+@update_running_stats.register
 def _(field: Hybrid, x, u):
-    return Hybrid(observe(field.physics, x, u), observe(field.residual, x, u))
+    return Hybrid(update_running_stats(field.physics, x, u), update_running_stats(field.residual, x, u))
 
 
-class Statistics(eqx.Module):
+class RunningStats(eqx.Module):
     """Running mean and variance of hidden units: state that training observes and the optimiser leaves alone."""
 
     mean: Float[Array, " h"]
@@ -171,7 +171,7 @@ def trainable(field: AbstractVectorField) -> AbstractVectorField:
     """A tree like `field` with True at each leaf that the optimiser may move, for `equinox.partition`."""
 
     def fixed(node) -> bool:
-        return isinstance(node, Statistics | Frozen)
+        return isinstance(node, RunningStats | Frozen)
 
     def leaves(node):
         return False if fixed(node) else eqx.is_inexact_array(node)

@@ -6,7 +6,7 @@ A linear residual is another: see `linear_adaptation.linear_residual`.
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, evaluate_batch, observe, taken_up
+from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual, infer_batch, train_batch, update_running_stats
 from hybrid_jax.state import BODY_RATES
 
 
@@ -30,27 +30,27 @@ def _frozen(derivative: Float[Array, " 13 *b"]) -> Float[Array, " 13 *b"]:
     return derivative.at[BODY_RATES].set(0.0)
 
 
-@evaluate_batch.register(HoldState)
-@deploy_batch.register(HoldState)
+@train_batch.register(HoldState)
+@infer_batch.register(HoldState)
 def _(field, x, u):
     return field(x, u)
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: FrozenRates, x, u):
-    return _frozen(evaluate_batch(field.field, x, u))
+    return _frozen(train_batch(field.field, x, u))
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: FrozenRates, x, u):
-    return _frozen(deploy_batch(field.field, x, u))
+    return _frozen(infer_batch(field.field, x, u))
 
 
-@observe.register
+@update_running_stats.register
 def _(field: FrozenRates, x, u):
-    return FrozenRates(observe(field.field, x, u))
+    return FrozenRates(update_running_stats(field.field, x, u))
 
 
-@taken_up.register
+@apply_residual.register
 def _(field: FrozenRates, x, more):
-    return taken_up(field.field, x, more)
+    return apply_residual(field.field, x, more)

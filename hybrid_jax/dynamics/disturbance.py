@@ -4,9 +4,9 @@ A steady wind, a load off centre, a bent blade: all of them push or turn the veh
 Six numbers hold that, and together with θ_p least squares finds them from seconds of flight, where a network that was
 taught by plenty of flight would forget some of it:
 
-    fit_physics(with_disturbance(hybrid), windows).field
+    fit_least_squares(with_disturbance(hybrid), windows).field
 
-Whether there is such a push the windows tell as well: see `disturbance_fit.fit_disturbance`.
+Whether there is such a push the windows tell as well: see `disturbance_fit.fit_with_selected_disturbance`.
 """
 
 import equinox as eqx
@@ -14,8 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 SIZE = STATE_SIZE - VELOCITY.start
@@ -47,18 +47,18 @@ def disturbed(field: AbstractVectorField, acceleration: Float[Array, "6"]) -> Hy
 
 
 def with_disturbance(field: Hybrid) -> Hybrid:
-    """A hybrid whose physics has a constant disturbance of zero beside it, which `least_squares.fit_physics` fits too.
+    """A hybrid whose physics has a constant disturbance of zero beside it, which `fit_least_squares` fits too.
 
     Raises:
         ValueError: no hybrid.
     """
     if not isinstance(field, Hybrid):
-        raise ValueError(f"field must be a Hybrid, got {validation.shown(field)}")
+        raise ValueError(f"field must be a Hybrid, got {checks.short_repr(field)}")
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(field.physics, eqx.is_inexact_array)))
     return Hybrid(disturbed(field.physics, jnp.zeros(SIZE, jnp.result_type(*dtypes, jnp.float32))), field.residual)
 
 
-@evaluate_batch.register(ConstantDisturbance)
-@deploy_batch.register(ConstantDisturbance)
+@train_batch.register(ConstantDisturbance)
+@infer_batch.register(ConstantDisturbance)
 def _(field, x, u):
     return field(x, u)

@@ -13,8 +13,8 @@ moment of the pull, and tell it.
 
 S and λ are no physics but the estimator's. Many take all force of flight to be along the body's z axis, so that drag,
 wind or a cable reach their velocity v̂ from the position alone, d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the
-thrust. Then v − v̂ is λ times the force that a log shows there, which is f and what a residual adds to it (`taken_up`).
-The gain S of each axis says the same of drag alone, and of other errors in scale.
+thrust. Then v − v̂ is λ times the force that a log shows there, which is f and what a residual adds to it
+(`apply_residual`). The gain S of each axis says the same of drag alone, and of other errors in scale.
 
 The rotors' lag behind what a log says of them is no part of the field but a change to the log: as four more states they
 would start each window unknown, and a window is about as long as the lag. A log knows their past; see
@@ -28,8 +28,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import rotation, validation
-from hybrid_jax.dynamics.base import deploy_batch, evaluate_batch, taken_up
+from hybrid_jax import checks, rotation
+from hybrid_jax.dynamics.base import apply_residual, infer_batch, train_batch
 from hybrid_jax.dynamics.rigid_body import LEARNED, AbstractRigidBody, euler
 from hybrid_jax.dynamics.terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
 from hybrid_jax.rotation import Rows
@@ -61,11 +61,11 @@ class Multirotor(AbstractRigidBody):
 
     def __check_init__(self):
         if not isinstance(self.vehicle, Vehicle):
-            raise ValueError(f"vehicle must be a Vehicle, got {validation.shown(self.vehicle)}")
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.short_repr(self.vehicle)}")
         if not isinstance(self.terms, Terms):
-            raise ValueError(f"terms must be Terms, got {validation.shown(self.terms)}")
+            raise ValueError(f"terms must be Terms, got {checks.short_repr(self.terms)}")
         if not isinstance(self.deviations, dict):
-            raise ValueError(f"deviations must be a dictionary, got {validation.shown(self.deviations)}")
+            raise ValueError(f"deviations must be a dictionary, got {checks.short_repr(self.deviations)}")
         check_names(self.deviations)
 
     def theta(self) -> dict[str, Float[Array, "..."]]:
@@ -105,7 +105,7 @@ def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms 
     return Multirotor({name: jnp.zeros(SHAPES[name]) for name in learn}, vehicle, Terms() if terms is None else terms)
 
 
-def carried_to(field: Multirotor, vehicle: Vehicle) -> Multirotor:
+def with_vehicle(field: Multirotor, vehicle: Vehicle) -> Multirotor:
     """The field on another vehicle, such as the same one with a payload, with θ_p what it was in SI units.
 
     The same deviations would not do: they are relative to the vehicle's nominal values, weight and arm.
@@ -207,7 +207,7 @@ def _is_present(term, absent: float = 0.0) -> bool:
     return any(not isinstance(number, float) or number != absent for number in term)
 
 
-@taken_up.register
+@apply_residual.register
 def _(field: Multirotor, x, more):
     """A force beside those of physics, too, moves the position before the log's velocity has seen it."""
     lag = field.constants(field.entries())["velocity_lag"]
@@ -218,12 +218,12 @@ def _(field: Multirotor, x, more):
     return jnp.concatenate([more[POSITION] + lag[0] * _in_world(attitude, across), more[POSITION.stop :]])
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: Multirotor, x, u):
     return field(x, u)
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: Multirotor, x, u):
     return _columns(field, x, u)
 

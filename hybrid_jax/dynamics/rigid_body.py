@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import rotation, validation
-from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, evaluate_batch, taken_up
+from hybrid_jax import checks, rotation
+from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual, infer_batch, train_batch
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -44,9 +44,9 @@ class RigidBody(AbstractRigidBody):
 
     def __check_init__(self):
         if not isinstance(self.log_ratios, dict) or set(self.log_ratios) != set(LEARNED):
-            raise ValueError(f"log_ratios must hold {', '.join(LEARNED)}, got {validation.shown(self.log_ratios)}")
+            raise ValueError(f"log_ratios must hold {', '.join(LEARNED)}, got {checks.short_repr(self.log_ratios)}")
         if not isinstance(self.vehicle, Vehicle):
-            raise ValueError(f"vehicle must be a Vehicle, got {validation.shown(self.vehicle)}")
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.short_repr(self.vehicle)}")
 
     def theta(self) -> dict[str, Float[Array, ""]]:
         """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
@@ -81,7 +81,7 @@ class ForcedBody(RigidBody):
         return jnp.ones(STATE_SIZE, jnp.result_type(*easier)).at[BODY_RATES.start : -1].set(jnp.stack(easier))
 
 
-@taken_up.register
+@apply_residual.register
 def _(field: ForcedBody, x, more):
     return jnp.reshape(field.yielding(), (-1,) + (1,) * (more.ndim - 1)) * more
 
@@ -91,7 +91,7 @@ def rigid_body(vehicle: Vehicle) -> RigidBody:
     return RigidBody({name: jnp.zeros(()) for name in LEARNED}, vehicle)
 
 
-def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
+def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
     """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm.
 
     Raises:
@@ -103,7 +103,7 @@ def guess(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float 
     return RigidBody(dict(zip(LEARNED, factors, strict=True)), vehicle)
 
 
-def guess_off(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
+def perturbed_by(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
     """The rigid body with each of θ_p at nominal times or over 1 + off, at random."""
     signs = jax.random.rademacher(key, (len(LEARNED),), float)
     return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
@@ -122,7 +122,7 @@ def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
         ValueError: the place of the first and its norm.
     """
     if x0.shape[-1:] == (STATE_SIZE,) and moves_a_rigid_body(field):
-        validation.unit_quaternions("x0", x0)
+        checks.unit_quaternions("x0", x0)
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:
@@ -150,12 +150,12 @@ def euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     )
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: RigidBody, x, u):
     return field(x, u)
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: RigidBody, x, u):
     return _columns(field, x, u)
 

@@ -3,7 +3,7 @@
 import math
 from dataclasses import dataclass
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.vehicle import Vehicle
 
 SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
@@ -56,7 +56,7 @@ class Terms:
     def __post_init__(self):
         for name, shape in SIGNED.items():
             object.__setattr__(self, name, _floats(name, getattr(self, name), shape))
-        validation.not_negative("motor_time_constant", self.motor_time_constant)
+        checks.not_negative("motor_time_constant", self.motor_time_constant)
 
 
 def check_names(learn) -> None:
@@ -67,7 +67,7 @@ def check_names(learn) -> None:
     """
     for name in learn:
         if name not in tuple(SHAPES):
-            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {validation.shown(name)}")
+            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {checks.short_repr(name)}")
     if len(set(learn)) != len(tuple(learn)):
         raise ValueError(f"learn names something twice: {', '.join(learn)}")
     if {"k", "k_rotors"} <= set(learn):
@@ -106,10 +106,10 @@ def _flat(value) -> tuple[float, ...]:
 def _floats(name: str, value, shape: tuple[int, ...]):
     """Python's own floats, alone or in nested tuples, which can be hashed and written to files."""
     if not shape:
-        validation.number(name, value)
+        checks.number(name, value)
         return float(value)
     if not isinstance(value, tuple) or len(value) != shape[0]:
         raise ValueError(
-            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {validation.shown(value)}"
+            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {checks.short_repr(value)}"
         )
     return tuple(_floats(name, part, shape[1:]) for part in value)

@@ -16,7 +16,7 @@ drag = [0.01, 0.01, 0.0]
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import SHAPES, Terms, check_names
@@ -63,7 +63,7 @@ def check_learned(learn: tuple[str, ...]) -> None:
         ValueError: what is there to be named, or which names do not go together.
     """
     if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
-        raise ValueError(f"learn must be a list of names, got {validation.shown(learn)}")
+        raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
     if learn.count(LAG) > 1 or not set(learn) <= {*SHAPES, LAG}:
         raise ValueError(f"learn must be names of {', '.join([*SHAPES, LAG])}, each once, got {', '.join(learn)}")
     check_names(of_field(learn))
@@ -94,12 +94,12 @@ def load_description(path: str | Path, variant: str | None = None) -> VehicleDes
     try:
         return VehicleDescription(vehicle, _terms(tables.get("terms", {})), as_tuple(tables.get("learn", [*LEARNED])))
     except ValueError as error:
-        raise ValueError(f"{path}: {validation.one_line(error)}") from error
+        raise ValueError(f"{path}: {checks.first_line(error)}") from error
 
 
 def _terms(table) -> Terms:
     if not isinstance(table, dict):
-        raise ValueError(f"terms must be a table [terms], got {validation.shown(table)}")
+        raise ValueError(f"terms must be a table [terms], got {checks.short_repr(table)}")
     known = [entry.name for entry in fields(Terms)]
     unknown = sorted(repr(key) for key in table.keys() - set(known))
     if unknown:
@@ -107,4 +107,4 @@ def _terms(table) -> Terms:
     try:
         return Terms(**{key: as_tuple(value) for key, value in table.items()})
     except ValueError as error:
-        raise ValueError(f"[terms]: {validation.one_line(error)}") from error
+        raise ValueError(f"[terms]: {checks.first_line(error)}") from error

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.export.step import one_step
 from hybrid_jax.integrate import Derivative, check_field
@@ -47,7 +47,7 @@ def casadi_step(
         ValueError: dt that is not positive; as `casadi_function`.
         ImportError: casadi is not installed.
     """
-    validation.positive("dt", dt, "a positive number of seconds")
+    checks.positive("dt", dt, "a positive number of seconds")
     return _function(
         field, lambda double: partial(one_step, double, dt=float(dt)), state_size, input_size, name, "xnext"
     )
@@ -60,10 +60,10 @@ def _function(field, whole, state_size: int, input_size: int, name: str, output:
         from hybrid_jax.export.casadi_operations import evaluate
     except ImportError as error:
         raise ImportError("CasADi functions need casadi: pip install 'hybrid_jax[casadi]'") from error
-    validation.count("state_size", state_size)
-    validation.count("input_size", input_size, least=0)
+    checks.count("state_size", state_size)
+    checks.count("input_size", input_size, least=0)
     if not isinstance(name, str) or not ca.Function.check_name(name):
-        raise ValueError(f"name must be one that CasADi accepts for a function, got {validation.shown(name)}")
+        raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
     symbols = [ca.SX.sym("x", state_size), ca.SX.sym("u", input_size)]
     # In double precision throughout: otherwise the constants of the physics would be rounded to single on the way.
     with jax.enable_x64(True):

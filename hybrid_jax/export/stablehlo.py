@@ -21,8 +21,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
-from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
 from hybrid_jax.export.step import one_step
 from hybrid_jax.integrate import Derivative, check_field
 from hybrid_jax.io.archive import load_archive, save_archive
@@ -63,7 +63,7 @@ class Program:
         Raises:
             ValueError: other shapes, or a number that is not finite.
         """
-        x, u = (validation.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
+        x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
         batch = x.shape[:1] if self.batched else ()
         if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
             form = "x (b, {}) and u (b, {})" if self.batched else "x ({},) and u ({},)"
@@ -115,7 +115,7 @@ def export_step(
         ValueError: dt that is not positive; as `export_field`.
         ImportError, OSError: as `export_field`.
     """
-    validation.positive("dt", dt, "a positive number of seconds")
+    checks.positive("dt", dt, "a positive number of seconds")
     _export(path, field, float(dt), state_size, input_size, batched, platforms, about)
 
 
@@ -133,20 +133,20 @@ def load_program(path: str | Path) -> Program:
         _check_calls(exported)
         dt, about = metadata["dt"], dict(metadata["about"])
         if dt is not None:
-            validation.positive("dt", dt)
+            checks.positive("dt", dt)
         batched, state_size, input_size = _sizes(exported)
     except Exception as error:  # of forged bytes, JAX's parser raises whatever it meets
-        raise ValueError(f"{path}: not a program of a field or a step: {validation.one_line(error)}") from error
+        raise ValueError(f"{path}: not a program of a field or a step: {checks.first_line(error)}") from error
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
 
 
 def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, about) -> None:
     _need_flatbuffers()
-    validation.count("state_size", state_size)
-    validation.count("input_size", input_size, least=0)
+    checks.count("state_size", state_size)
+    checks.count("input_size", input_size, least=0)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
         raise ValueError(
-            f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {validation.shown(platforms)}"
+            f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.short_repr(platforms)}"
         )
     with jax.enable_x64(False), _nowhere():
         single = jax.tree.map(
@@ -181,7 +181,7 @@ def _program(derivative: Derivative, dt: float | None) -> Derivative:
 
 def _of_rows(field: AbstractVectorField) -> Derivative:
     """The field on a batch, one sample a row."""
-    return lambda x, u: jnp.moveaxis(deploy_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
+    return lambda x, u: jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
 
 
 def _check_calls(exported: jax.export.Exported) -> None:

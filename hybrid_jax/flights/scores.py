@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import rotation, validation
+from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
@@ -68,7 +68,7 @@ def flight_errors(
         ValueError: windows that are malformed, or not of a multirotor.
     """
     check(windows, "windows")
-    validation.count("chunk", chunk)
+    checks.count("chunk", chunk)
     if windows.x.shape[-1] != STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
     check_attitudes(windows, "windows")
@@ -94,7 +94,7 @@ def rmse_at(errors: FlightErrors, horizons: Sequence[int]) -> dict[int, FlightEr
     """
     longest = np.shape(errors.position)[1]
     for steps in horizons:
-        validation.count("horizons", steps)
+        checks.count("horizons", steps)
         if steps > longest:
             raise ValueError(f"horizons must be at most the {longest} intervals of the windows, got {steps}")
 

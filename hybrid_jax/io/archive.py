@@ -14,8 +14,8 @@ import jax
 import numpy as np
 from jaxtyping import PyTree
 
+from hybrid_jax.checks import first_line
 from hybrid_jax.io.files import write_whole
-from hybrid_jax.validation import one_line
 
 HEADER = "header.json"
 NUMERIC = "biufc"  # kinds of NumPy types that are kept
@@ -63,7 +63,9 @@ def load_archive(path: str | Path, form: str) -> tuple[Any, dict[str, np.ndarray
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(f"{path}: truncated, damaged or not a {form.rsplit(' ', 1)[0]}: {one_line(error)}") from error
+        raise ValueError(
+            f"{path}: truncated, damaged or not a {form.rsplit(' ', 1)[0]}: {first_line(error)}"
+        ) from error
     if header.get("sha256") != found:
         raise ValueError(f"{path}: checksum differs from the one recorded: the file is damaged or was altered")
     return header.get("metadata"), arrays

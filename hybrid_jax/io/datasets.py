@@ -9,9 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from hybrid_jax.checks import first_line
 from hybrid_jax.io.archive import digest, encode, load_archive, save_archive
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
-from hybrid_jax.validation import one_line
 
 FORMAT = "hybrid_jax dataset 1"
 ARRAYS = ("x0", "u", "x")
@@ -83,7 +83,7 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
         }
         dataset = Dataset(splits, dict(header["about"]), origin=str(path))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: not a whole dataset: lacks {one_line(error)}") from error
+        raise ValueError(f"{path}: not a whole dataset: lacks {first_line(error)}") from error
     _check_splits(path, dataset)
     if expected_config is not None:
         require_config(path, dataset.config, expected_config)

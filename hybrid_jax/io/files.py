@@ -34,7 +34,7 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         temporary.unlink(missing_ok=True)
 
 
-def aside(path: Path, reason: str) -> Path:
+def backup_path(path: Path, reason: str) -> Path:
     """A free name beside `path` with the reason and the time (UTC), for what must give way and not be deleted."""
     stem = f"{path.name}.{reason}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     names = itertools.chain([stem], (f"{stem}-{i}" for i in itertools.count(2)))

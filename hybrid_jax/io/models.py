@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, Statistics
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.multirotor import Multirotor
@@ -21,10 +21,10 @@ from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.networks.mlp import DeployedNetwork, InputScaling, LinearPath, LinearResidual, ResidualNetwork
+from hybrid_jax.networks.mlp import FusedNetwork, InputScaling, LinearResidual, LinearSkip, ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.networks.rotor_thrust import RotorThrust
-from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly
+from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
 from hybrid_jax.vehicle import Vehicle
 
 FORMAT = "hybrid_jax model 1"
@@ -42,11 +42,11 @@ def portable(kind: Kind) -> Kind:
 
 
 _FIELDS = (
-    *(ConstantDisturbance, DeployedNetwork, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid),
-    *(LinearPath, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust),
+    *(ConstantDisturbance, FusedNetwork, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid),
+    *(LinearSkip, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust),
 )
-_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, NearGround, Placeless, TiltOnly)
-_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, Statistics, Terms, Vehicle)
+_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, GroundDistance, DropXY, DropXYYaw)
+_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, RunningStats, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)
 
@@ -79,7 +79,7 @@ class Model:
         if not callable(self.field):
             name = type(self.field).__name__
             raise ValueError(f"the model is a {name}, which needs more than x0 and u; use the methods of its `field`")
-        x0, u = (validation.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
+        x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
         check_start(self.field, x0)
         predicted = _predict(self.field, x0, u, dt)
@@ -118,9 +118,9 @@ def load(path: str | Path) -> Model:
         field: Any = _decode(metadata["field"], arrays)
         about = dict(metadata["about"])
     except (KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path}: not a whole model: {validation.one_line(error)}") from error
+        raise ValueError(f"{path}: not a whole model: {checks.first_line(error)}") from error
     except ValueError as error:
-        raise ValueError(f"{path}: {validation.one_line(error)}") from error
+        raise ValueError(f"{path}: {checks.first_line(error)}") from error
     if type(field).__name__ not in _KINDS:
         raise ValueError(f"{path}: not a whole model: its field is a {type(field).__name__}")
     return Model(field, about)

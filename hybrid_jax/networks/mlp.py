@@ -10,16 +10,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import (
     AbstractVectorField,
-    Statistics,
-    deploy_batch,
-    deployed,
-    evaluate_batch,
-    observe,
-    pushed,
-    pushforward,
+    RunningStats,
+    fuse_for_inference,
+    infer_batch,
+    jvp_columns,
+    linearize,
+    train_batch,
+    update_running_stats,
 )
 from hybrid_jax.networks.normalisation import (
     FEW,
@@ -44,8 +44,8 @@ class InputScaling(eqx.Module):
     scale: float = eqx.field(static=True, default=1.0)
 
     def __check_init__(self):
-        validation.number("offset", self.offset)
-        validation.positive("scale", self.scale)
+        checks.number("offset", self.offset)
+        checks.positive("scale", self.scale)
 
     def __call__(self, u: Float[Array, " m *b"]) -> Float[Array, " m *b"]:
         return (u - self.offset) / self.scale
@@ -92,7 +92,7 @@ class LinearResidual(AbstractVectorField):
         return product + beside(self.bias, product)
 
 
-class LinearPath(AbstractVectorField):
+class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear map past a network, which is left what is not linear.
 
     Linear drag is one, which units that bend can only approach; and where no data were, a line goes on as it was.
@@ -105,10 +105,10 @@ class LinearPath(AbstractVectorField):
         return self.weight @ self.field.inputs(x, u) + self.field(x, u)
 
 
-class DeployedNetwork(AbstractVectorField):
+class FusedNetwork(AbstractVectorField):
     """ẋ = W₂ relu(W₁ z + c) + A z + b, z = [x, scaled u]: a network as it is flown, and a linear map past it.
 
-    The same map as `ResidualNetwork`, or `LinearPath` around one, in another order of memory: a controller asks for few
+    The same map as `ResidualNetwork`, or `LinearSkip` around one, in another order of memory: a controller asks for few
     samples at a time, and products so thin are faster where the weights of an input lie side by side. One product
     serves W₁ and A, since it costs less than to begin another.
 
@@ -154,13 +154,13 @@ def residual_network(
         ValueError: another norm, sizes that are no positive integers, or no random key.
     """
     if norm not in tuple(NORMS):
-        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {validation.shown(norm)}")
+        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {checks.short_repr(norm)}")
     outputs = state_size if outputs is None else outputs
     sizes = {"state_size": state_size, "hidden": hidden, "outputs": outputs}
     for name, size in sizes.items():
-        validation.count(name, size)
-    validation.count("input_size", input_size, least=0)
-    validation.key("key", key)
+        checks.count(name, size)
+    checks.count("input_size", input_size, least=0)
+    checks.key("key", key)
     key_in, key_out, key_bias = jax.random.split(key, 3)
     fan_in = state_size + input_size
     return ResidualNetwork(
@@ -173,7 +173,7 @@ def residual_network(
 
 
 def _batch_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> BatchNorm:
-    return BatchNorm(jnp.ones(hidden), jnp.zeros(hidden), Statistics(jnp.zeros(hidden), jnp.ones(hidden)))
+    return BatchNorm(jnp.ones(hidden), jnp.zeros(hidden), RunningStats(jnp.zeros(hidden), jnp.ones(hidden)))
 
 
 def _layer_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> LayerNorm:
@@ -195,7 +195,7 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
     return jax.random.uniform(key, shape, minval=-1.0, maxval=1.0) / fan_in**0.5
 
 
-def silenced(field: AbstractVectorField) -> AbstractVectorField:
+def zero_output(field: AbstractVectorField) -> AbstractVectorField:
     """The field with the output layer, and the linear path, of every network in it at zero: training begins at what
     physics says.
 
@@ -207,52 +207,52 @@ def silenced(field: AbstractVectorField) -> AbstractVectorField:
         return isinstance(node, ResidualNetwork)
 
     if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
-        raise ValueError(f"field: there is no ResidualNetwork in {validation.shown(field)}")
+        raise ValueError(f"field: there is no ResidualNetwork in {checks.short_repr(field)}")
 
     def silent(node):
-        if isinstance(node, LinearPath):
-            return LinearPath(jnp.zeros_like(node.weight), silent(node.field))
+        if isinstance(node, LinearSkip):
+            return LinearSkip(jnp.zeros_like(node.weight), silent(node.field))
         if not is_network(node):
             return node
         zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
         return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
 
-    return jax.tree.map(silent, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearPath))
+    return jax.tree.map(silent, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearSkip))
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: ResidualNetwork, x, u) -> Array:
     """Training: where the norm is the batch's, each evaluation normalises by its own minibatch."""
     return field.norm.layers(field.weight_in, field.weight_out, field.bias_out, field.inputs(x, u))
 
 
-@deploy_batch.register(ResidualNetwork)
-@deploy_batch.register(LinearResidual)
-@deploy_batch.register(LinearPath)
-@deploy_batch.register(DeployedNetwork)
+@infer_batch.register(ResidualNetwork)
+@infer_batch.register(LinearResidual)
+@infer_batch.register(LinearSkip)
+@infer_batch.register(FusedNetwork)
 def _(field, x, u):
     return field(x, u)
 
 
-@evaluate_batch.register
-def _(field: LinearPath, x, u):
-    return field.weight @ field.field.inputs(x, u) + evaluate_batch(field.field, x, u)
+@train_batch.register
+def _(field: LinearSkip, x, u):
+    return field.weight @ field.field.inputs(x, u) + train_batch(field.field, x, u)
 
 
-@deployed.register
+@fuse_for_inference.register
 def _(field: ResidualNetwork):
     none = jnp.zeros((len(field.weight_out), field.weight_in.shape[1]), field.weight_in.dtype)
     return _laid_out(field, field.norm, none) if isinstance(field.norm, AffineNorm) else field
 
 
-@deployed.register
-def _(field: LinearPath):
+@fuse_for_inference.register
+def _(field: LinearSkip):
     return _laid_out(field.field, field.field.norm, field.weight) if isinstance(field.field.norm, AffineNorm) else field
 
 
-def _laid_out(network: ResidualNetwork, norm: AffineNorm, past: Float[Array, "d m"]) -> DeployedNetwork:
+def _laid_out(network: ResidualNetwork, norm: AffineNorm, past: Float[Array, "d m"]) -> FusedNetwork:
     weight, bias = norm.fold(network.weight_in)
-    return DeployedNetwork(
+    return FusedNetwork(
         weight_in=jnp.concatenate([weight, past]).T,
         bias=jnp.concatenate([bias, network.bias_out]),
         weight_out=network.weight_out.T,
@@ -260,27 +260,27 @@ def _laid_out(network: ResidualNetwork, norm: AffineNorm, past: Float[Array, "d 
     )
 
 
-@pushforward.register
-def _(field: DeployedNetwork, x, u, dx, du):
+@linearize.register
+def _(field: FusedNetwork, x, u, dx, du):
     """By one product of the layers: hundreds of hidden units are gone before any direction is met."""
-    z, directions = pushed(field.scaling.beside, (x, u), (dx, du))
+    z, directions = jvp_columns(field.scaling.beside, (x, u), (dx, du))
     hidden, past = field.layer(z)
     weight, linear = field.weight_in[:, : len(hidden)], field.weight_in[:, len(hidden) :]
     jacobian = jnp.where(hidden > 0, field.weight_out.T, 0) @ weight.T + linear.T
     return jax.nn.relu(hidden) @ field.weight_out + past, jacobian @ directions
 
 
-@observe.register
-def _(field: LinearPath, x, u):
-    return eqx.tree_at(lambda path: path.field, field, observe(field.field, x, u))
+@update_running_stats.register
+def _(field: LinearSkip, x, u):
+    return eqx.tree_at(lambda path: path.field, field, update_running_stats(field.field, x, u))
 
 
-@observe.register
+@update_running_stats.register
 def _(field: ResidualNetwork, x, u):
     hidden = field.weight_in @ field.inputs(x, u)
     return eqx.tree_at(lambda network: network.norm, field, field.norm.observed(hidden))
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: LinearResidual, x, u):
     return field(x, u)

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import Batch, Statistics
+from hybrid_jax.dynamics.base import Batch, RunningStats
 from hybrid_jax.networks.batchnorm_vjp import normalised_layer, row_means
 
 FEW = 2  # inputs
@@ -57,7 +57,7 @@ class BatchNorm(AffineNorm):
 
     gain: Float[Array, " h"]
     shift: Float[Array, " h"]
-    running: Statistics
+    running: RunningStats
     momentum: float = eqx.field(static=True, default=0.1)
     epsilon: float = eqx.field(static=True, default=1e-5)
 
@@ -71,7 +71,7 @@ class BatchNorm(AffineNorm):
     def observed(self, hidden):
         """The running statistics moved towards the batch's by the momentum."""
         mean = row_means(hidden)
-        batch = Statistics(mean, row_means(jnp.square(hidden - mean[:, None])))
+        batch = RunningStats(mean, row_means(jnp.square(hidden - mean[:, None])))
         running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
 

@@ -9,8 +9,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import rotation, validation
-from hybrid_jax.dynamics.base import AbstractVectorField, deploy_batch, deployed, evaluate_batch, pushed, pushforward
+from hybrid_jax import checks, rotation
+from hybrid_jax.dynamics.base import (
+    AbstractVectorField,
+    fuse_for_inference,
+    infer_batch,
+    jvp_columns,
+    linearize,
+    train_batch,
+)
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -35,7 +42,7 @@ class RotorThrust(AbstractVectorField):
     vehicle: Vehicle = eqx.field(static=True)
 
     def __check_init__(self):
-        validation.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
+        checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         return self.write(x, u, self.share(self.read(x), u))
@@ -75,22 +82,22 @@ def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: V
     return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)
 
 
-@evaluate_batch.register(RotorThrust)
-@deploy_batch.register(RotorThrust)
+@train_batch.register(RotorThrust)
+@infer_batch.register(RotorThrust)
 def _(field, x, u):
     return field(x, u)
 
 
-@deployed.register
+@fuse_for_inference.register
 def _(field: RotorThrust):
-    return RotorThrust(deployed(field.field), field.vehicle)
+    return RotorThrust(fuse_for_inference(field.field), field.vehicle)
 
 
-@pushforward.register
+@linearize.register
 def _(field: RotorThrust, x, u, dx, du):
     """Each rotor asks the network for two derivatives, whatever the number of directions."""
-    near, nearing = pushed(field.read, (x,), (dx,))
+    near, nearing = jvp_columns(field.read, (x,), (dx,))
     share, pulled = jax.vjp(field.share, near, u)
     by_near, by_u = pulled(jnp.ones_like(share))
     sharing = by_near[:, None] * nearing + by_u[:, None] * du
-    return pushed(field.write, (x, u, share), (dx, du, sharing))
+    return jvp_columns(field.write, (x, u, share), (dx, du, sharing))

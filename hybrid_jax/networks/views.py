@@ -17,18 +17,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import rotation, validation
+from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import (
     AbstractVectorField,
     Hybrid,
-    deploy_batch,
-    deployed,
-    evaluate_batch,
-    observe,
-    pushed,
-    pushforward,
+    fuse_for_inference,
+    infer_batch,
+    jvp_columns,
+    linearize,
+    train_batch,
+    update_running_stats,
 )
-from hybrid_jax.networks.mlp import InputScaling, LinearPath, residual_network, silenced
+from hybrid_jax.networks.mlp import InputScaling, LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.rotor_thrust import RotorThrust, nearness
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -53,7 +53,7 @@ class View(AbstractVectorField):
         return self.write(x, self.field(self.read(x), u))
 
 
-class Placeless(View):
+class DropXY(View):
     """Blind to p_x and p_y: the field inside reads [p_z, q, v, ω] (11)."""
 
     field: AbstractVectorField
@@ -65,7 +65,7 @@ class Placeless(View):
         return inside
 
 
-class TiltOnly(View):
+class DropXYYaw(View):
     """Blind to p_x, p_y and yaw, in the axes of the world: a wind keeps its direction, whichever way the nose points.
 
     The field inside reads p_z [m], the direction of the world's up in the body, Rᵀe_z (3), the velocity [m/s, world]
@@ -82,8 +82,8 @@ class TiltOnly(View):
         return inside
 
 
-class NearGround(View):
-    """`TiltOnly` that also feels the ground: after p_z the field inside reads R / h of each rotor (14).
+class GroundDistance(View):
+    """`DropXYYaw` that also feels the ground: after p_z the field inside reads R / h of each rotor (14).
 
     What the ground does to a rotor falls with its altitude h over its radius R (Cheeseman and Bennett 1955): in R / h
     it is nearly a line, in p_z a cliff, which moves as the vehicle tilts.
@@ -99,7 +99,7 @@ class NearGround(View):
     vehicle: Vehicle = eqx.field(static=True)
 
     def __check_init__(self):
-        validation.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
+        checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
     def read(self, x):
         up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
@@ -183,31 +183,31 @@ class Motion(View):
         return jnp.concatenate([inside[:3], turning, inside[6:]])
 
 
-@evaluate_batch.register
+@train_batch.register
 def _(field: View, x, u):
-    return field.write(x, evaluate_batch(field.field, field.read(x), u))
+    return field.write(x, train_batch(field.field, field.read(x), u))
 
 
-@deploy_batch.register
+@infer_batch.register
 def _(field: View, x, u):
-    return field.write(x, deploy_batch(field.field, field.read(x), u))
+    return field.write(x, infer_batch(field.field, field.read(x), u))
 
 
-@deployed.register
+@fuse_for_inference.register
 def _(field: View):
-    return eqx.tree_at(lambda view: view.field, field, deployed(field.field))
+    return eqx.tree_at(lambda view: view.field, field, fuse_for_inference(field.field))
 
 
-@pushforward.register
+@linearize.register
 def _(field: View, x, u, dx, du):
-    seen, seeing = pushed(field.read, (x,), (dx,))
-    inside, moving = pushforward(field.field, seen, u, seeing, du)
-    return pushed(field.write, (x, inside), (dx, moving))
+    seen, seeing = jvp_columns(field.read, (x,), (dx,))
+    inside, moving = linearize(field.field, seen, u, seeing, du)
+    return jvp_columns(field.write, (x, inside), (dx, moving))
 
 
-@observe.register
+@update_running_stats.register
 def _(field: View, x, u):
-    return eqx.tree_at(lambda view: view.field, field, observe(field.field, field.read(x), u))
+    return eqx.tree_at(lambda view: view.field, field, update_running_stats(field.field, field.read(x), u))
 
 
 def _as_it_is(field: AbstractVectorField) -> AbstractVectorField:
@@ -219,9 +219,9 @@ Wrapper = Callable[..., AbstractVectorField]
 # Name → how many numbers the network reads beside u, or returns, and the view around it.
 INPUTS: dict[str, tuple[int, Wrapper]] = {
     "all": (STATE_SIZE, _as_it_is),
-    "no_xy": (STATE_SIZE - 2, Placeless),
-    "no_xy_yaw": (10, TiltOnly),
-    "near_ground": (14, NearGround),
+    "no_xy": (STATE_SIZE - 2, DropXY),
+    "no_xy_yaw": (10, DropXYYaw),
+    "near_ground": (14, GroundDistance),
     "body": (10, BodyFrame),
     "body_motion": (9, BodyMotion),
 }
@@ -252,15 +252,15 @@ def restricted(
     """A network that reads and writes only part of a multirotor's state; by default all of it, as the paper's.
 
     Args:
-        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `TiltOnly`);
-            "near_ground", that and how near the rotors are to it (see `NearGround`); "body", seen from the body (see
-            `BodyFrame`); "body_motion", that without the height.
+        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `DropXYYaw`);
+            "near_ground", that and how near the rotors are to it (see `GroundDistance`); "body", seen from the body
+            (see `BodyFrame`); "body_motion", that without the height.
         outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "rotors", these beside the thrust of each rotor by
             a network of its own (`RotorThrust`), silent until it has learned; the "angular_acceleration" ω̇ alone;
             "motion", v̇ and ω̇ with ṗ and body rates as well (`Motion`).
         hidden: units of each network.
         norm: as in `residual_network`.
-        linear: a linear map goes past the hidden layer (see `LinearPath`), and both are silent until they have learned.
+        linear: a linear map goes past the hidden layer (see `LinearSkip`), and both are silent until they have learned.
         vehicle: which "near_ground" and "rotors" need, and nothing else.
 
     Raises:
@@ -276,8 +276,8 @@ def restricted(
     if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
         raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
-    both = silenced(LinearPath(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
-    seeing = partial(seen, vehicle=vehicle) if seen is NearGround else seen
+    both = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
+    seeing = partial(seen, vehicle=vehicle) if seen is GroundDistance else seen
     view = seeing(written(both))
     return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
 
@@ -285,4 +285,4 @@ def restricted(
 def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
     assert vehicle is not None
     network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
-    return silenced(RotorThrust(network, vehicle))
+    return zero_output(RotorThrust(network, vehicle))

@@ -3,7 +3,7 @@
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.vehicle import IRIS, Vehicle
@@ -24,10 +24,10 @@ class Domain:
 
     def __post_init__(self):
         if not isinstance(self.vehicle, Vehicle):
-            raise ValueError(f"vehicle must be a Vehicle, got {validation.shown(self.vehicle)}")
-        validation.not_negative("drag_coefficient", self.drag_coefficient)
+            raise ValueError(f"vehicle must be a Vehicle, got {checks.short_repr(self.vehicle)}")
+        checks.not_negative("drag_coefficient", self.drag_coefficient)
         if not isinstance(self.forces, tuple) or not all(callable(force) for force in self.forces):
-            raise ValueError(f"forces must be a tuple of functions, got {validation.shown(self.forces)}")
+            raise ValueError(f"forces must be a tuple of functions, got {checks.short_repr(self.forces)}")
 
     def parameters(self) -> Parameters:
         """Its numbers, in the precision that is on when this is called."""

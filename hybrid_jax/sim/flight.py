@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
-from hybrid_jax import validation
-from hybrid_jax.runtime import SOONEST
+from hybrid_jax import checks
+from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -48,11 +48,11 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
     Raises:
         ValueError: no flights, no time or no key.
     """
-    validation.count("flights", flights)
-    validation.positive("seconds", seconds)
-    validation.key("key", key)
+    checks.count("flights", flights)
+    checks.positive("seconds", seconds)
+    checks.key("key", key)
     steps = round(seconds / DT)
-    validation.count(f"intervals of {DT} s in seconds={seconds}", steps)
+    checks.count(f"intervals of {DT} s in seconds={seconds}", steps)
     cpu = jax.devices("cpu")[0]
     with jax.enable_x64(True), jax.default_device(cpu):
         truth = domain.quadrotor()
@@ -62,7 +62,7 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(jax.jit, static_argnames="steps", compiler_options=SOONEST)
+@partial(jax.jit, static_argnames="steps", compiler_options=FASTEST_COMPILE)
 def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int) -> Flights:
     return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps))(keys)
 

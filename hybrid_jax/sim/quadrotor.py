@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 from mujoco import mjx
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import Force, Parameters, Scalar
@@ -77,20 +77,20 @@ class Quadrotor(eqx.Module):
             ValueError: as `rollout`.
         """
         x0, u = self._checked(x0, u, dt, windows=jnp.shape(t0))
-        validation.count("chunk", chunk)
+        checks.count("chunk", chunk)
         return jax.lax.map(lambda one: self.rollout(one[0], one[1], one[2], dt), (x0, u, t0), batch_size=chunk)
 
     def _checked(self, x0, u, dt, windows: tuple[int, ...]) -> tuple[Float[Array, "*n 13"], Float[Array, "*n t 4"]]:
         """x0 and u as JAX arrays, of so many windows."""
-        x0, u = validation.floating("x0", x0), validation.floating("u", u)
+        x0, u = checks.floating("x0", x0), checks.floating("u", u)
         if (
             x0.shape != (*windows, STATE_SIZE)
             or u.ndim != x0.ndim + 1
             or u.shape != (*windows, u.shape[-2], INPUT_SIZE)
         ):
             raise ValueError(f"x0 (13,) and u (t, 4), or n of each and of t0, expected, got {x0.shape} and {u.shape}")
-        validation.positive("dt", dt, "a positive number of seconds")
-        validation.unit_quaternions("x0", x0)
+        checks.positive("dt", dt, "a positive number of seconds")
+        checks.unit_quaternions("x0", x0)
         return x0, u
 
     def _acceleration(self, x: State, u: Input, t: Scalar) -> Float[Array, "6"]:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.io.datasets import Dataset, versions
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, Flights, fly, gone_wrong
@@ -30,8 +30,8 @@ class SplitSpec:
     steps: int
 
     def __post_init__(self):
-        validation.count("windows", self.windows)
-        validation.count("steps", self.steps)
+        checks.count("windows", self.windows)
+        checks.count("steps", self.steps)
         if self.steps > round(SECONDS / DT):
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
@@ -137,7 +137,7 @@ def make_dataset(
     Raises:
         ValueError: a negative seed, or a domain whose flights all go wrong.
     """
-    validation.count("seed", seed, least=0)
+    checks.count("seed", seed, least=0)
     windows, tallies = record(domain, splits, jax.random.key(seed), progress)
     metadata = {
         "config": configuration(domain, splits, seed),

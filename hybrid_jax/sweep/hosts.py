@@ -21,11 +21,11 @@ AXIS = "processes"
 Arrays = Mapping[str, np.ndarray]
 
 
-class Gone(ConnectionError):
+class PeerLost(ConnectionError):
     """Another process of this run has ended before its work was done."""
 
 
-def join(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
+def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
     """Become one of the processes of a run; call it before the first array is made.
 
     Args:
@@ -42,7 +42,7 @@ def join(coordinator: str | None = None, processes: int | None = None, process: 
     except ValueError as error:
         raise ValueError(f"--distributed: {error}") from error
     except RuntimeError as error:
-        raise Gone(f"the processes did not find each other: {error}") from error
+        raise PeerLost(f"the processes did not find each other: {error}") from error
     devices = gather(np.array([jax.local_device_count()]))
     if len(set(devices.tolist())) > 1:
         raise ValueError(f"all processes must have the same number of devices, got {devices.tolist()}")
@@ -52,7 +52,7 @@ def join(coordinator: str | None = None, processes: int | None = None, process: 
         jax.distributed.shutdown()
 
 
-def first() -> bool:
+def is_main_process() -> bool:
     """Whether this is process 0, the one that reads, writes and reports; a process on its own is."""
     return jax.process_index() == 0
 
@@ -110,9 +110,9 @@ def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
     """
     if jax.process_count() == 1:
         return make()
-    message = np.frombuffer(_pack(*make()), np.uint8) if first() else np.zeros(0, np.uint8)
+    message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)
     size = agreed(len(message))
-    return _unpack(_exchange(_sum, (message if first() else np.zeros(size, np.uint8))[None])[0])
+    return _unpack(_exchange(_sum, (message if is_main_process() else np.zeros(size, np.uint8))[None])[0])
 
 
 def _pack(about: Any, arrays: Arrays) -> bytes:
@@ -161,7 +161,7 @@ def _noticing() -> Iterator[None]:
     try:
         yield
     except (RuntimeError, ValueError) as error:  # of the launch, or of a result that never came
-        raise Gone(
+        raise PeerLost(
             "another process of this run has ended; the same command goes on from what process 0 has saved, with any "
             f"number of processes ({str(error).splitlines()[0]})"
         ) from error

@@ -15,12 +15,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.runtime import SOONER
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import FitState, Plan
+from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.training.preparation import check_minibatch
 from hybrid_jax.trajectories import Trajectories
@@ -69,7 +69,7 @@ class Progress:
 
 def sweep(
     states: FitState,
-    plans: Plan,
+    plans: RunConfig,
     train: Trajectories,
     validation: Trajectories,
     settings: Settings,
@@ -114,7 +114,7 @@ def sweep(
 
 def compile_sweep(
     states: FitState,
-    plans: Plan,
+    plans: RunConfig,
     train: Trajectories,
     validation: Trajectories,
     settings: Settings,
@@ -151,8 +151,14 @@ def _errors(fields, windows, every: int, settings: Settings, room: Room, active)
 
 
 def _ready(
-    states: FitState, plans: Plan, train: PyTree, validation: PyTree, settings: Settings, room: Room, width: int | None
-) -> tuple[Plan, LaneMap, tuple, np.ndarray]:
+    states: FitState,
+    plans: RunConfig,
+    train: PyTree,
+    validation: PyTree,
+    settings: Settings,
+    room: Room,
+    width: int | None,
+) -> tuple[RunConfig, LaneMap, tuple, np.ndarray]:
     """Plans and shared data as the compiled block takes them, that block, and what an epoch of each lane costs."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
@@ -168,7 +174,7 @@ def _ready(
     return plans, block, shared, costs
 
 
-def _padded(plans: Plan, train: PyTree, windows: int) -> tuple[Plan, PyTree]:
+def _padded(plans: RunConfig, train: PyTree, windows: int) -> tuple[RunConfig, PyTree]:
     """Plans and data as if there were so many windows; no plan asks for what is added."""
     listed = plans.subset.shape[-1]
     subset = np.pad(plans.subset, ((0, 0), (0, max(windows, listed) - listed)))
@@ -186,7 +192,7 @@ def _shapes(*trees: PyTree) -> tuple:
 # A sweep of the same shapes, later in the same process, compiles nothing; one map a shape, so that old programs go.
 @lru_cache(PROGRAMS)
 def _block(settings: Settings, width: int | None, places: int, shapes: tuple) -> LaneMap:
-    def block(lane: tuple[FitState, Plan, Int[Array, ""]], train, validation) -> FitState:
+    def block(lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:
         state, plan, epochs = lane
         return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)
 
@@ -196,9 +202,9 @@ def _block(settings: Settings, width: int | None, places: int, shapes: tuple) ->
 @lru_cache(PROGRAMS)
 def _evaluation(settings: Settings, every: int, places: int, shapes: tuple) -> LaneMap:
     def errors(field: AbstractVectorField, windows: Trajectories) -> Float[Array, ""]:
-        return deployed_mse(field, windows, every, settings.solver)
+        return rollout_mse(field, windows, every, settings.solver)
 
-    return LaneMap(errors, room=places, compiler=SOONER)
+    return LaneMap(errors, room=places, compiler=FAST_COMPILE)
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
@@ -213,7 +219,7 @@ def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
     return eqx.combine(jax.tree.map(put, arrays, after), rest)
 
 
-def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
+def _progress(states: FitState, plans: RunConfig, seconds: float) -> Progress:
     running: Bool[Array, " lanes"] = states.status == fitting.RUNNING
     at_most = plans.max_epochs - states.epoch
     at_least = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
@@ -228,7 +234,7 @@ def _progress(states: FitState, plans: Plan, seconds: float) -> Progress:
     )
 
 
-def _check(plans: Plan, train: PyTree, settings: Settings) -> None:
+def _check(plans: RunConfig, train: PyTree, settings: Settings) -> None:
     listed = plans.subset.shape[-1]
     for size in np.unique(plans.n_train):
         if not settings.batch_size <= size <= min(listed, len(train)):

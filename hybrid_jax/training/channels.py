@@ -12,13 +12,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import rollout_batch, rollout_minibatch
 from hybrid_jax.metrics import mean_over
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.training.loss import Minibatch
-from hybrid_jax.training.objective import Prediction, Settings
+from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
 
 MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
@@ -37,13 +37,13 @@ class Channel:
     scale: float
 
     def __post_init__(self):
-        validation.count("start", self.start, least=0)
-        validation.count("stop", self.stop, least=self.start + 1)
-        validation.positive("scale", self.scale)
+        checks.count("start", self.start, least=0)
+        checks.count("stop", self.stop, least=self.start + 1)
+        checks.positive("scale", self.scale)
 
 
 @dataclass(frozen=True)
-class ChannelPrediction:
+class ChannelLoss:
     """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg; judged without the latter.
 
     ρ(r) = r² up to `huber`, and 2 huber r − huber² beyond (Huber 1964, doubled); of the length of a channel's error, so
@@ -58,9 +58,9 @@ class ChannelPrediction:
 
     def __post_init__(self):
         if not isinstance(self.channels, tuple) or not self.channels:
-            raise ValueError(f"channels must be a tuple of some Channel, got {validation.shown(self.channels)}")
+            raise ValueError(f"channels must be a tuple of some Channel, got {checks.short_repr(self.channels)}")
         if self.huber is not None:
-            validation.positive("huber", self.huber)
+            checks.positive("huber", self.huber)
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
         widest = max(channel.stop for channel in self.channels)
@@ -69,7 +69,7 @@ class ChannelPrediction:
         return windows
 
     def batch(self, picked: Trajectories, settings: Settings) -> Minibatch:
-        return Prediction().batch(picked, settings)
+        return TrajectoryLoss().batch(picked, settings)
 
     def loss(self, field: AbstractVectorField, batch: Minibatch, settings: Settings, weight: Float[Array, ""]):
         predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
@@ -79,7 +79,7 @@ class ChannelPrediction:
         return value, predicted
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
-        return Prediction().observe(field, batch, seen)
+        return TrajectoryLoss().observe(field, batch, seen)
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: Settings) -> Float[Array, ""]:
         def errors(windows: Trajectories) -> Float[Array, " n"]:

@@ -10,9 +10,9 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.training.objective import Learner, Prediction, Settings
+from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss
 from hybrid_jax.training.preparation import prepared
 from hybrid_jax.trajectories import Trajectories
 
@@ -22,7 +22,7 @@ FEW = 8  # one in so many of the listed windows
 STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
 
 
-class Plan(eqx.Module):
+class RunConfig(eqx.Module):
     """What may differ between the lanes of a sweep.
 
     Attributes:
@@ -73,7 +73,7 @@ def start(field: Learner, key: PRNGKeyArray) -> FitState:
 
 def run(
     state: FitState,
-    plan: Plan,
+    plan: RunConfig,
     train: PyTree,
     validation: PyTree,
     settings: Settings,
@@ -98,7 +98,7 @@ def run(
     return eqx.combine(arrays, rest)
 
 
-def epoch(state: FitState, plan: Plan, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
+def epoch(state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
     """One pass over the lane's training windows in a new order, then a validation."""
     key, order_key = jax.random.split(state.key)
     order = _shuffled(plan, order_key)
@@ -119,7 +119,7 @@ def epoch(state: FitState, plan: Plan, train: PyTree, validation: PyTree, settin
 
 
 def gradient_step(
-    field: Learner, adam: PyTree, plan: Plan, picked: PyTree, settings: Settings
+    field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
     """One step of Adam on one minibatch, and what the field observes in it."""
     learned = trainable(field)
@@ -169,10 +169,10 @@ def fit(
         jax.tree.map(lambda *_: None, rates, eqx.filter(field, trainable(field)))
     except (TypeError, ValueError) as error:
         raise ValueError(
-            f"rates must be a number, or a tree of them that begins as the field does, got {validation.shown(rates)}"
+            f"rates must be a number, or a tree of them that begins as the field does, got {checks.short_repr(rates)}"
         ) from error
     weight = _weight(regulariser_weight, settings)
-    plan = make_plan(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
+    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     return _fit(start(field, key), plan, data, judged_on, settings)
 
 
@@ -180,22 +180,22 @@ def _weight(asked: float | None, settings: Settings) -> float:
     """λ, or what another objective weighs by it."""
     if asked is None:
         return WEIGHT
-    if settings.regulariser is None and isinstance(settings.objective, Prediction):
+    if settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
         raise ValueError(
-            f"regulariser_weight is {validation.shown(asked)} but settings.regulariser is None; leave it out, or "
+            f"regulariser_weight is {checks.short_repr(asked)} but settings.regulariser is None; leave it out, or "
             "take one of hybrid_jax.training.loss.REGULARISERS"
         )
     return asked
 
 
-def make_plan(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> Plan:
+def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
     """A plan with every number as an array, as `vmap` wants it.
 
     Raises:
         ValueError: a number that makes no sense, by its name.
     """
     for rate in jax.tree.leaves(rates):
-        validation.not_negative("rates", rate)
+        checks.not_negative("rates", rate)
     counts = {
         "n_train": (n_train, 0),
         "min_epochs": (min_epochs, 0),
@@ -203,13 +203,13 @@ def make_plan(rates, subset, n_train, min_epochs, patience, max_epochs, regulari
         "max_epochs": (max_epochs, 1),
     }
     for name, (value, least) in counts.items():
-        validation.count(name, value, least)
-    validation.not_negative("regulariser_weight", regulariser_weight)
+        checks.count(name, value, least)
+    checks.not_negative("regulariser_weight", regulariser_weight)
 
     def integer(number) -> Int[Array, "..."]:
         return jnp.asarray(number, jnp.int32)
 
-    return Plan(
+    return RunConfig(
         rates=jax.tree.map(jnp.asarray, rates),
         subset=integer(subset),
         n_train=integer(n_train),
@@ -225,7 +225,7 @@ def _fit(state, plan, train, validation, settings):
     return run(state, plan, train, validation, settings, plan.max_epochs)
 
 
-def _shuffled(plan: Plan, key: PRNGKeyArray) -> Int[Array, " n"]:
+def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
     """The first n_train of the lane's windows in random order, then the rest."""
     listed = plan.subset.shape[0]
 

@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, evaluate_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, train_batch
 from hybrid_jax.integrate import RK4, along, rollout_minibatch
 from hybrid_jax.trajectories import Trajectories
 
@@ -97,7 +97,7 @@ def loss(
 
 def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]):
     x, u = along(batch.x0, predicted, batch.u)
-    return evaluate_batch(field.physics, x, u), evaluate_batch(field.residual, x, u)
+    return train_batch(field.physics, x, u), train_batch(field.residual, x, u)
 
 
 def _unit(columns: Float[Array, "d b"]) -> Float[Array, "d b"]:

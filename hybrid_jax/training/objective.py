@@ -6,10 +6,10 @@ from typing import Any, Protocol
 import diffrax
 from jaxtyping import Array, Float, PyTree
 
-from hybrid_jax import validation
-from hybrid_jax.dynamics.base import AbstractVectorField, observe
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, update_running_stats
 from hybrid_jax.integrate import RK4, along, rollout_minibatch
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.training.loss import Minibatch, Regulariser, loss, minibatch
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -47,7 +47,7 @@ class Objective(Protocol):
 
 
 @dataclass(frozen=True)
-class Prediction:
+class TrajectoryLoss:
     """L_MSE + λ L_reg of the predicted trajectories of a vector field (paper, Sec. 3.3); judged by L_MSE alone."""
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
@@ -62,10 +62,10 @@ class Prediction:
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
         x, u = along(batch.x0, seen, batch.u)
-        return observe(field, x, u)
+        return update_running_stats(field, x, u)
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: "Settings") -> Float[Array, ""]:
-        return deployed_mse(field, data, solver=settings.solver)
+        return rollout_mse(field, data, solver=settings.solver)
 
 
 @dataclass(frozen=True)
@@ -79,11 +79,11 @@ class Settings:
     batch_size: int = 100
     regulariser: Regulariser | None = None
     solver: diffrax.AbstractSolver = field(default_factory=RK4)
-    objective: Objective = Prediction()
+    objective: Objective = TrajectoryLoss()
 
     def __post_init__(self):
         if self.regulariser is not None and not callable(self.regulariser):
-            said = validation.shown(self.regulariser)
+            said = checks.short_repr(self.regulariser)
             raise ValueError(
                 f"regulariser must be a function, such as one of hybrid_jax.training.loss.REGULARISERS, got {said}"
             )

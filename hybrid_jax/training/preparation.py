@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, trainable
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import checked
@@ -27,8 +28,8 @@ def prepared(
     _check_learns(field)
     for name, windows in (("train", train), ("validation", validation)):
         _check_match(field, windows, name, settings)
-    validation.key("key", key)
-    validation.count("settings.batch_size", settings.batch_size)
+    checks.key("key", key)
+    checks.count("settings.batch_size", settings.batch_size)
     check_minibatch(field, settings)
     if len(data) < settings.batch_size:
         raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")

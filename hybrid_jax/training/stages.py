@@ -12,10 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray, PyTree
 
-from hybrid_jax import validation
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
-from hybrid_jax.training.fitting import FitState, Plan, make_plan, run, start
+from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config, run, start
 from hybrid_jax.training.objective import Learner, Settings
 from hybrid_jax.training.preparation import prepared
 from hybrid_jax.trajectories import Trajectories
@@ -44,11 +44,11 @@ class Stage:
 
     def __post_init__(self):
         for rate in self.rates.values():
-            validation.not_negative("rates", rate)
+            checks.not_negative("rates", rate)
         for name in ("epochs", "patience"):
-            validation.count(name, getattr(self, name))
+            checks.count(name, getattr(self, name))
         if self.steps is not None:
-            validation.count("steps", self.steps)
+            checks.count("steps", self.steps)
 
 
 def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
@@ -79,7 +79,7 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
     """
     if steps is None:
         return windows
-    validation.count("steps", steps)
+    checks.count("steps", steps)
     if steps > windows.horizon:
         raise ValueError(f"steps must be at most the {windows.horizon} intervals of the windows, got {steps}")
     return Trajectories(windows.x0, windows.u[..., :steps, :], windows.x[..., :steps, :], windows.dt)
@@ -119,7 +119,7 @@ def fit_in_stages(
         raise ValueError("stages must be some Stage, got none")
     states = []
     for stage, stage_key in zip(stages, jax.random.split(key, len(stages)), strict=True):
-        plan = make_plan(
+        plan = make_run_config(
             rates_by_group(field, stage.rates),
             jnp.arange(len(data)),
             len(data),
@@ -134,7 +134,7 @@ def fit_in_stages(
 
 
 @eqx.filter_jit
-def _fit(state: FitState, plan: Plan, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
+def _fit(state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
     return run(judged(state, validation, settings), plan, train, validation, settings, plan.max_epochs)
 
 

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.least_squares import fit_physics
-from hybrid_jax.dynamics.base import deploy_batch, evaluate_batch
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.views import restricted
@@ -37,7 +37,7 @@ def flights(field, count=20, steps=10):
 
 def test_parameters_and_push_are_found_together_and_the_network_stays():
     truth = hj.Hybrid(disturbed(body(**RATIOS), PUSH), network())
-    found = fit_physics(with_disturbance(hj.Hybrid(body(), network())), flights(truth))
+    found = fit_least_squares(with_disturbance(hj.Hybrid(body(), network())), flights(truth))
     assert found.converged
     for name, ratio in RATIOS.items():
         np.testing.assert_allclose(found.field.physics.physics.log_ratios[name], ratio, atol=2e-3)
@@ -49,8 +49,8 @@ def test_without_one_the_parameters_pay_for_the_push():
     """What it is for: were the push within reach of θ_p, nobody would need it."""
     truth = hj.Hybrid(disturbed(body(**RATIOS), PUSH), network())
     windows = flights(truth)
-    alone = fit_physics(hj.Hybrid(body(), network()), windows)
-    assert alone.mse > 100 * fit_physics(with_disturbance(hj.Hybrid(body(), network())), windows).mse
+    alone = fit_least_squares(hj.Hybrid(body(), network()), windows)
+    assert alone.mse > 100 * fit_least_squares(with_disturbance(hj.Hybrid(body(), network())), windows).mse
 
 
 def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
@@ -58,7 +58,7 @@ def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
     field = disturbed(body(), PUSH)
     one = jax.vmap(body())(x, u).at[:, 7:].add(PUSH)
     np.testing.assert_allclose(jax.vmap(field)(x, u), one, rtol=1e-6)
-    for many in (evaluate_batch, deploy_batch):
+    for many in (train_batch, infer_batch):
         np.testing.assert_allclose(many(field, x.T, u.T).T, one, rtol=1e-5, atol=1e-5)
 
 

@@ -10,7 +10,7 @@ from pendulum import LENGTH, pendulum, swings
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.adaptation.expert_augmentation import REAL, Augmentation, expert_augmented, prediction_mse
 from hybrid_jax.integrate import rollout
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import split
 
 PAST = 6
@@ -59,7 +59,7 @@ def test_the_length_is_recovered_on_augmented_flights(trained):
 def test_what_is_read_moves_to_a_changed_vehicle_and_predicts_it(trained, factor):
     target = flights(200, seed=4, length=factor * LENGTH)
     assert np.median(lengths(trained, target)) == pytest.approx(factor * LENGTH, rel=0.1)
-    alone = deployed_mse(trained.expert.field, split(target, PAST)[1])
+    alone = rollout_mse(trained.expert.field, split(target, PAST)[1])
     assert prediction_mse(trained, target, PAST) < 0.5 * alone
 
 

@@ -8,15 +8,15 @@ import pytest
 from jaxtyping import Array, Float
 from pendulum import LENGTH, pendulum, swings
 
-from hybrid_jax.adaptation.least_squares import fit_physics, parametrise
+from hybrid_jax.adaptation.least_squares import fit_least_squares, parametrise
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
-_mse, _flown = eqx.filter_jit(deployed_mse), eqx.filter_jit(rollout_batch)
+_mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
 EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the model has it, and of one with damping
 
 
@@ -67,7 +67,7 @@ def test_exact_flight_gives_back_the_rigid_body():
     u = np.asarray(IRIS.hover_speed + 40 * rng.normal(size=(50, 10, 4)), np.float32)
     truth = body(Ix=1.4, Iy=0.7, k=1.0)
     flown = Trajectories(x0, u, _flown(truth, x0, u, 0.01), 0.01)
-    found = fit_physics(body(Ix=1.4 * 1.25, Iy=0.7 * 0.75, k=1.25), flown)
+    found = fit_least_squares(body(Ix=1.4 * 1.25, Iy=0.7 * 0.75, k=1.25), flown)
     assert found.converged
     for name, value in truth.theta().items():
         # Round-off of the states, 1e-7 of 1, against effects of θ_p of 1e-1 and more, over 500 states.
@@ -78,12 +78,12 @@ def test_in_double_precision_the_fit_is_exact_to_more_digits():
     with jax.enable_x64(True):
         x0, u = (jnp.asarray(a, float) for a in (EXACT.x0, EXACT.u))
         windows = Trajectories(x0, u, _flown(pendulum(), x0, u, EXACT.dt), EXACT.dt)
-        found = fit_physics(pendulum(LENGTH * 1.25), windows)
+        found = fit_least_squares(pendulum(LENGTH * 1.25), windows)
         assert found.converged
         np.testing.assert_allclose(jnp.exp(found.field.log_length), LENGTH, rtol=1e-12)  # of 640 states at 1e-16
         # A single-precision field stays one where JAX computes in double precision.
         single = eqx.tree_at(lambda field: field.log_length, pendulum(), jnp.log(jnp.float32(LENGTH * 1.25)))
-        found = fit_physics(single, EXACT)
+        found = fit_least_squares(single, EXACT)
         assert found.converged
         assert found.field.log_length.dtype == jnp.float32
 
@@ -92,7 +92,7 @@ def test_in_double_precision_the_fit_is_exact_to_more_digits():
 def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
     windows, design = pushes(30, 0.1, unit)
     gains = np.linalg.lstsq(design.reshape(-1, 2), np.asarray(windows.x, float).ravel())[0]
-    found = fit_physics(Push(unit * jnp.array([1.0, 1.0])), windows)
+    found = fit_least_squares(Push(unit * jnp.array([1.0, 1.0])), windows)
     assert found.converged
     # Half a step of float32 in each of some hundred terms.
     np.testing.assert_allclose(found.field.gains, gains, rtol=1e-5)
@@ -104,7 +104,7 @@ def test_the_residual_of_a_hybrid_is_held():
     brake = Brake(jnp.array(0.8))
     truth = Hybrid(pendulum(LENGTH), brake)
     windows = eqx.tree_at(lambda w: w.x, EXACT, _flown(truth, EXACT.x0, EXACT.u, EXACT.dt))
-    found = fit_physics(Hybrid(pendulum(LENGTH * 0.75), brake), windows)
+    found = fit_least_squares(Hybrid(pendulum(LENGTH * 0.75), brake), windows)
     assert found.converged
     np.testing.assert_allclose(jnp.exp(found.field.physics.log_length), LENGTH, rtol=1e-5)  # float32 states
     assert eqx.tree_equal(found.field.residual, brake)
@@ -112,7 +112,7 @@ def test_the_residual_of_a_hybrid_is_held():
 
 def test_it_is_the_minimum_of_l_mse():
     """Of the very number that training and its validation report, with a model that cannot reach zero."""
-    found = fit_physics(pendulum(0.8), DAMPED)
+    found = fit_least_squares(pendulum(0.8), DAMPED)
     assert found.converged
     np.testing.assert_allclose(found.mse, _mse(found.field, DAMPED), rtol=1e-6)  # another order of sums
     best = found.field.log_length
@@ -123,10 +123,10 @@ def test_it_is_the_minimum_of_l_mse():
 
 def test_a_lane_is_the_run_alone_and_a_lost_lane_harms_no_other():
     lengths = (0.4, 0.6, np.nan, 0.9)
-    together = eqx.filter_jit(eqx.filter_vmap(lambda field: fit_physics(field, DAMPED)))(log_lengths(*lengths))
+    together = eqx.filter_jit(eqx.filter_vmap(lambda field: fit_least_squares(field, DAMPED)))(log_lengths(*lengths))
     np.testing.assert_array_equal(together.converged, [True, True, False, True])
     for i in (0, 1, 3):
-        alone = fit_physics(pendulum(lengths[i]), DAMPED)
+        alone = fit_least_squares(pendulum(lengths[i]), DAMPED)
         # Another program for the same sums; one step below the tolerance of 6e-6 may be taken or not.
         np.testing.assert_allclose(together.field.log_length[i], alone.field.log_length, rtol=1e-5)
         np.testing.assert_allclose(together.mse[i], alone.mse, rtol=1e-5)
@@ -134,7 +134,7 @@ def test_a_lane_is_the_run_alone_and_a_lost_lane_harms_no_other():
 
 def test_a_run_that_is_cut_short_says_so_and_has_come_nearer():
     start = pendulum(0.8)
-    found = fit_physics(start, DAMPED, max_steps=2)
+    found = fit_least_squares(start, DAMPED, max_steps=2)
     assert not found.converged
     assert found.steps == 2
     assert found.mse < _mse(start, DAMPED)
@@ -143,8 +143,8 @@ def test_a_run_that_is_cut_short_says_so_and_has_come_nearer():
 def test_windows_that_are_not_finite_are_refused_or_leave_the_start_where_nothing_can_be_raised():
     spoiled = eqx.tree_at(lambda w: w.x, EXACT, EXACT.x.at[3, 1, 0].set(jnp.nan))
     with pytest.raises(ValueError, match=r"windows: x\[3, 1, 0\] is not finite"):
-        fit_physics(pendulum(0.8), spoiled)
-    found = eqx.filter_jit(fit_physics)(pendulum(0.8), spoiled)
+        fit_least_squares(pendulum(0.8), spoiled)
+    found = eqx.filter_jit(fit_least_squares)(pendulum(0.8), spoiled)
     assert not found.converged
     assert found.field.log_length == pendulum(0.8).log_length
 
@@ -159,7 +159,7 @@ def test_a_parameter_without_effect_stays_where_it_is():
         def __call__(self, x, u):
             return self.push(x, u).at[1].set(0.0)  # b then acts through u₁ alone, which is off
 
-    found = fit_physics(First(Push(jnp.array([1.0, 1.0]))), still)
+    found = fit_least_squares(First(Push(jnp.array([1.0, 1.0]))), still)
     assert found.converged
     assert found.field.push.gains[1] == 1.0
 
@@ -175,7 +175,7 @@ def test_a_field_with_nothing_to_fit_is_refused():
     windows, _ = pushes(5, 0.1)
     for field in (Drift(), Hybrid(Drift(), Push(jnp.ones(2)))):
         with pytest.raises(ValueError, match="Drift, has no parameter to fit"):
-            fit_physics(field, windows)
+            fit_least_squares(field, windows)
 
 
 def test_parameters_as_a_vector_and_back():

@@ -21,8 +21,8 @@ from hybrid_jax.adaptation.ridge import (
     standard,
 )
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import guess
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.dynamics.rigid_body import perturbed
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import lane, stack
@@ -31,14 +31,14 @@ from hybrid_jax.vehicle import IRIS
 
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 # Compiled once for all tests: fields and windows here have few shapes, and a penalty is an array.
-_rolled, _defects, _adapted, _mse = map(eqx.filter_jit, (rollout_batch, defects, adapted, deployed_mse))
+_rolled, _defects, _adapted, _mse = map(eqx.filter_jit, (rollout_batch, defects, adapted, rollout_mse))
 _last_layer, _linear_residual = map(eqx.filter_jit, (last_layer, linear_residual))
 
 
 def source(seed=0):
     """A hybrid whose physics is a guess and whose network is anything."""
     key = jax.random.key(seed)
-    return Hybrid(guess(IRIS, key), residual_network(13, 4, key, hidden=6, scaling=HOVER))
+    return Hybrid(perturbed(IRIS, key), residual_network(13, 4, key, hidden=6, scaling=HOVER))
 
 
 def flown(truth, count=100, seed=0, dt=0.01, steps=3):

@@ -8,13 +8,13 @@ import pytest
 from test_least_squares import Push, pushes
 
 from hybrid_jax import rotation
-from hybrid_jax.adaptation.least_squares import fit_physics, parametrise, residual
-from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance
+from hybrid_jax.adaptation.least_squares import fit_least_squares, parametrise, residual
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.training.channels import Channel, ChannelPrediction
+from hybrid_jax.training.channels import Channel, ChannelLoss
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
@@ -67,7 +67,7 @@ def inside():
     def one(key):
         windows = eqx.tree_at(lambda w: w.x, clean, clean.x + NOISE * jax.random.normal(key, clean.x.shape))
         field = descended(truth, windows)
-        around = intervals(field, physics_covariance(field, windows))
+        around = intervals(field, covariance_of(field, windows))
         return {name: (ends.low <= true[name]) & (true[name] <= ends.high) for name, ends in around.items()}
 
     def repeats(keys):
@@ -79,7 +79,7 @@ def inside():
 
 
 def descended(field, windows, steps=3):
-    """Least squares by Gauss and Newton's steps from near the minimum: `fit_physics` takes long to compile."""
+    """Least squares by Gauss and Newton's steps from near the minimum: `fit_least_squares` takes long to compile."""
     theta, rebuild = parametrise(field)
 
     def errors(theta):
@@ -134,24 +134,22 @@ def weighed(windows, design, gains, scales, huber):
 def test_a_loss_of_channels_has_its_own_covariance(huber):
     """In channels of one entry each a linear problem's loss is bent by the data alone, so the formula is exact."""
     windows, design = pushes(40, 0.1)
-    objective = ChannelPrediction((Channel(0, 1, 0.1), Channel(1, 2, 0.05)), huber)
-    gains = np.array([0.7, -0.4]) if huber is None else fit_physics(Push(jnp.ones(2)), windows).field.gains
-    found = physics_covariance(Push(jnp.asarray(gains)), windows, error=objective.error)
+    objective = ChannelLoss((Channel(0, 1, 0.1), Channel(1, 2, 0.05)), huber)
+    gains = np.array([0.7, -0.4]) if huber is None else fit_least_squares(Push(jnp.ones(2)), windows).field.gains
+    found = covariance_of(Push(jnp.asarray(gains)), windows, error=objective.error)
     expected = weighed(windows, design, gains, np.array([0.1, 0.05]), huber)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * abs(expected).max())  # float32 sums
 
 
 def test_equal_scales_are_no_weights():
     windows, _ = pushes(40, 0.1)
-    field = fit_physics(Push(jnp.ones(2)), windows).field
-    objective = ChannelPrediction((Channel(0, 2, 3.0),))
-    plain = physics_covariance(field, windows)
-    np.testing.assert_allclose(physics_covariance(field, windows, error=objective.error), plain, rtol=1e-5)
+    field = fit_least_squares(Push(jnp.ones(2)), windows).field
+    objective = ChannelLoss((Channel(0, 2, 3.0),))
+    plain = covariance_of(field, windows)
+    np.testing.assert_allclose(covariance_of(field, windows, error=objective.error), plain, rtol=1e-5)
 
 
 def test_white_noise_of_one_size_goes_with_squares_alone():
     windows, _ = pushes(40, 0.1)
     with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
-        physics_covariance(
-            Push(jnp.ones(2)), windows, "homoscedastic", error=ChannelPrediction((Channel(0, 1, 1.0),)).error
-        )
+        covariance_of(Push(jnp.ones(2)), windows, "homoscedastic", error=ChannelLoss((Channel(0, 1, 1.0),)).error)

@@ -16,8 +16,8 @@ from test_least_squares import Brake, Push, log_lengths, pushes
 
 from experiments import coverage as command
 from experiments.coverage import Config, coverage
-from hybrid_jax.adaptation.least_squares import fit_physics
-from hybrid_jax.adaptation.uncertainty import intervals, physics_covariance, standard_errors
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals, standard_errors
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.vehicle import IRIS
@@ -42,17 +42,17 @@ def test_a_linear_problem_meets_its_closed_form(kind):
     windows, design = pushes(30, 0.1)
     offset = 0.2 * np.random.default_rng(1).normal(size=(30, 1, 2))  # an error that a whole window shares
     windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
-    field = fit_physics(Push(jnp.ones(2)), windows).field
+    field = fit_least_squares(Push(jnp.ones(2)), windows).field
     expected = closed_form(windows, design, field.gains, kind)
-    np.testing.assert_allclose(physics_covariance(field, windows, kind), expected, rtol=1e-4)  # float32 sums
+    np.testing.assert_allclose(covariance_of(field, windows, kind), expected, rtol=1e-4)  # float32 sums
     # In pieces that do not divide the windows the sums are the same.
-    np.testing.assert_allclose(physics_covariance(field, windows, kind, chunk=7), expected, rtol=1e-4)
+    np.testing.assert_allclose(covariance_of(field, windows, kind, chunk=7), expected, rtol=1e-4)
 
 
 def test_under_white_noise_the_two_agree():
     windows, _ = pushes(2000, 0.1)
-    field = fit_physics(Push(jnp.ones(2)), windows).field
-    sandwich, plain = (np.diag(physics_covariance(field, windows, kind)) for kind in ("sandwich", "homoscedastic"))
+    field = fit_least_squares(Push(jnp.ones(2)), windows).field
+    sandwich, plain = (np.diag(covariance_of(field, windows, kind)) for kind in ("sandwich", "homoscedastic"))
     # A variance from 2000 scores has a relative error of about √(3/2000) = 4 %; four of these.
     np.testing.assert_allclose(sandwich, plain, rtol=0.16)
 
@@ -65,10 +65,8 @@ def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
     shared = np.repeat(rng.normal(size=(4000, 60, 1, 2)), 6, axis=2).reshape(4000, -1)
     spread = (shared @ solve.T).std(axis=0)
     seen = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(shared[0], np.float32).reshape(60, 6, 2))
-    field = fit_physics(Push(jnp.ones(2)), seen).field
-    sandwich, plain = (
-        np.sqrt(np.diag(physics_covariance(field, seen, kind))) for kind in ("sandwich", "homoscedastic")
-    )
+    field = fit_least_squares(Push(jnp.ones(2)), seen).field
+    sandwich, plain = (np.sqrt(np.diag(covariance_of(field, seen, kind))) for kind in ("sandwich", "homoscedastic"))
     # A standard deviation from 60 scores is good to √(3/60) / 2 = 11 %; three of these.
     np.testing.assert_allclose(sandwich, spread, rtol=0.34)
     assert (plain < 0.7 * spread).all()
@@ -76,15 +74,13 @@ def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
 
 def test_a_lane_is_the_covariance_alone():
     lengths = (0.45, 0.55, 0.6)
-    together = eqx.filter_jit(eqx.filter_vmap(lambda field: physics_covariance(field, SWINGS)))(log_lengths(*lengths))
-    alone = [physics_covariance(pendulum(length), SWINGS) for length in lengths]
+    together = eqx.filter_jit(eqx.filter_vmap(lambda field: covariance_of(field, SWINGS)))(log_lengths(*lengths))
+    alone = [covariance_of(pendulum(length), SWINGS) for length in lengths]
     np.testing.assert_allclose(together, alone, rtol=1e-5)  # another order of float32 sums
 
 
 def test_a_residual_is_taken_as_given():
-    bare, hybrid = (
-        physics_covariance(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0))))
-    )
+    bare, hybrid = (covariance_of(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0)))))
     np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
 
 
@@ -107,9 +103,9 @@ def test_an_interval_is_the_value_times_and_over_a_factor(level, z):
 
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"windows: 1 are too few for a covariance of 1 parameters, at least 2"):
-        physics_covariance(pendulum(), SWINGS[:1])
+        covariance_of(pendulum(), SWINGS[:1])
     with pytest.raises(ValueError, match="kind must be one of sandwich, homoscedastic, got 'plain'"):
-        physics_covariance(pendulum(), SWINGS, "plain")
+        covariance_of(pendulum(), SWINGS, "plain")
     for level in (0.0, 1.0, 95, float("nan")):
         with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
             intervals(rigid_body(IRIS), COVARIANCE, level)

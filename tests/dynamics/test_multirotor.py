@@ -10,10 +10,10 @@ import pytest
 from jax.flatten_util import ravel_pytree
 
 from hybrid_jax import Hybrid, load, rigid_body, rotation, save
-from hybrid_jax.dynamics.base import Frozen, deploy_batch, evaluate_batch, trainable
+from hybrid_jax.dynamics.base import Frozen, infer_batch, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.multirotor import Multirotor, carried_to, multirotor
+from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.integrate import rollout_batch
@@ -129,9 +129,9 @@ def test_a_minibatch_and_its_gradient_are_those_of_its_samples(learn):
     def slope(evaluate):
         return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x, u)
 
-    for evaluate in (evaluate_batch, deploy_batch):
+    for evaluate in (train_batch, infer_batch):
         np.testing.assert_allclose(evaluate(field, x, u), one_by_one(field, x, u), rtol=1e-12, atol=1e-11)
-    for ours, theirs in zip(jax.tree.leaves(slope(evaluate_batch)), jax.tree.leaves(slope(one_by_one)), strict=True):
+    for ours, theirs in zip(jax.tree.leaves(slope(train_batch)), jax.tree.leaves(slope(one_by_one)), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11)
 
 
@@ -167,7 +167,7 @@ def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
         velocity = state[VELOCITY] + rotation.rotate(state[QUATERNION], behind)
         estimator = known + (velocity - state[VELOCITY]) / lag
         push = jnp.concatenate([estimator - field(state, inputs)[VELOCITY], jnp.zeros(3)])
-        for evaluate in (evaluate_batch, deploy_batch, lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]):
+        for evaluate in (train_batch, infer_batch, lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]):
             found = evaluate(disturbed(field, push), state[:, None], inputs[:, None])[:, 0]
             np.testing.assert_allclose(found[POSITION], velocity, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(found[VELOCITY], estimator, rtol=1e-12, atol=1e-12)
@@ -187,7 +187,7 @@ def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
 
 def test_what_is_learned_goes_with_the_vehicle_to_another():
     field = moved(multirotor(IRIS, ALL, KNOWN))
-    heavy = carried_to(field, replace(IRIS, mass=2.0, inertia=(0.03, 0.04, 0.06), thrust_coefficient=9e-6))
+    heavy = with_vehicle(field, replace(IRIS, mass=2.0, inertia=(0.03, 0.04, 0.06), thrust_coefficient=9e-6))
     for name, value in field.theta().items():
         np.testing.assert_allclose(heavy.theta()[name], value, rtol=1e-12, atol=1e-15)
     assert heavy.vehicle.mass == 2.0

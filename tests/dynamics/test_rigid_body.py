@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import HoldState
-from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, guess, rigid_body
+from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, perturbed, rigid_body
 from hybrid_jax.integrate import rollout
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -125,12 +125,12 @@ def test_theta_is_nominal_at_zero_and_positive_everywhere():
 
 
 def test_a_guess_lies_in_its_box_and_follows_its_key():
-    guesses = jax.vmap(lambda key: guess(IRIS, key, low=0.5, high=2.0))(jax.random.split(jax.random.key(0), 500))
+    guesses = jax.vmap(lambda key: perturbed(IRIS, key, low=0.5, high=2.0))(jax.random.split(jax.random.key(0), 500))
     for name in LEARNED:
         factors = np.exp(guesses.log_ratios[name])
         assert 0.5 <= factors.min() < 0.51  # 500 draws leave a gap of about ln 4 / 500 at the ends
         assert 1.96 < factors.max() <= 2.0
-    again = guess(IRIS, jax.random.split(jax.random.key(0), 500)[3], low=0.5, high=2.0)
+    again = perturbed(IRIS, jax.random.split(jax.random.key(0), 500)[3], low=0.5, high=2.0)
     assert all(again.log_ratios[name] == guesses.log_ratios[name][3] for name in LEARNED)
 
 
@@ -152,27 +152,27 @@ def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
             np.testing.assert_allclose(field(x, u), RigidBody(logs, ODD)(x, u) + added, rtol=1e-12, atol=1e-11)
         x, u = (jnp.asarray(part).T for part in samples(3))
         expected = jax.vmap(field, -1, -1)(x, u)
-        for evaluate in (evaluate_batch, deploy_batch):
+        for evaluate in (train_batch, infer_batch):
             np.testing.assert_allclose(evaluate(field, x, u), expected, rtol=1e-12, atol=1e-11)
 
 
 def test_a_batch_is_its_columns():
-    field = guess(IRIS, jax.random.key(1))
+    field = perturbed(IRIS, jax.random.key(1))
     x, u = (jnp.asarray(part) for part in samples(6, seed=1))
-    columns = evaluate_batch(field, x.T, u.T)
+    columns = train_batch(field, x.T, u.T)
     np.testing.assert_allclose(columns.T, jax.vmap(field)(x, u), rtol=1e-13, atol=1e-12)  # another order of sums
 
 
 def test_the_gradient_of_a_minibatch_is_that_of_its_samples():
     """With respect to θ_p, states and inputs alike."""
-    field, (x, u) = guess(IRIS, jax.random.key(1)), (jnp.asarray(part) for part in samples(6, seed=1))
+    field, (x, u) = perturbed(IRIS, jax.random.key(1)), (jnp.asarray(part) for part in samples(6, seed=1))
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
 
     def slope(evaluate):
         return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x.T, u.T)
 
     plain = slope(lambda field, x, u: jax.vmap(field, -1, -1)(x, u))
-    for ours, theirs in zip(jax.tree.leaves(slope(evaluate_batch)), jax.tree.leaves(plain), strict=True):
+    for ours, theirs in zip(jax.tree.leaves(slope(train_batch)), jax.tree.leaves(plain), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
 
 

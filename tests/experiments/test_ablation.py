@@ -54,8 +54,8 @@ def test_the_source_flights_that_were_asked_for_are_the_most_that_are_tried(most
 
 
 def test_the_start_in_a_range_of_factors_is_that_whatever_the_others_are_off_by():
-    config = replace(PRESETS["paper"], guess_off=0.3)
-    assert [other.guess_off for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
+    config = replace(PRESETS["paper"], perturbed_by=0.3)
+    assert [other.perturbed_by for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
 
 
 def test_values_that_do_not_go_with_the_other_options_are_refused_before_anything_is_flown(tmp_path):

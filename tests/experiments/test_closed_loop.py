@@ -23,7 +23,7 @@ from experiments.closed_loop.rows import FlightRow, Flyer
 from experiments.closed_loop.timing import confined
 from experiments.paper.config import SMOKE
 from hybrid_jax.control import Controller, fly, performance, sample
-from hybrid_jax.dynamics.base import pushforward
+from hybrid_jax.dynamics.base import linearize
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import ForcedBody
 from hybrid_jax.networks.mlp import InputScaling
@@ -100,7 +100,7 @@ def test_the_common_form_knows_its_own_derivative(name):
     field = common(MODELS[name], hj.IRIS, 8, SCALING)
     dx, du = jnp.eye(17)[:13], jnp.eye(17)[13:]
     for x, u in zip(*samples(), strict=True):
-        value, slope = pushforward(field, x, u, dx, du)
+        value, slope = linearize(field, x, u, dx, du)
         expected = jnp.concatenate(jax.jacfwd(field, argnums=(0, 1))(x, u), axis=1)
         np.testing.assert_allclose(value, field(x, u), rtol=1e-5, atol=1e-5 * float(jnp.abs(value).max()))
         np.testing.assert_allclose(slope, expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max()))

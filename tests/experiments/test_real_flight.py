@@ -28,7 +28,7 @@ from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout
 from hybrid_jax.rotation import angle_between
 from hybrid_jax.state import QUATERNION
-from hybrid_jax.training.channels import ChannelPrediction, channels_from
+from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.vehicle import IRIS
 
 ROOT = Path(__file__).parents[2]
@@ -148,7 +148,7 @@ def test_parameters_of_a_lane_have_intervals_around_them():
     craft = replace(CRAFT, learn=("Ix", "k_rotors"))
     noisy = windows.windows.x + np.random.default_rng(0).normal(0, 1e-3, windows.windows.x.shape).astype(np.float32)
     noisy = Windows(eqx.tree_at(lambda w: w.x, windows.windows, noisy), windows.sizes, windows.stride)
-    objective = ChannelPrediction(channels_from(CRAFT.thrust(), noisy.windows), 1.0)
+    objective = ChannelLoss(channels_from(CRAFT.thrust(), noisy.windows), 1.0)
     for found in parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 2), lanes, noisy, objective):
         assert set(found["theta"]) == {"Ix", *(f"k_rotors[{i}]" for i in range(4))}
         for name, (low, high) in found["theta_interval"].items():

@@ -14,7 +14,7 @@ from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import PROGRAMS, _block, evaluate, sweep
-from hybrid_jax.training.fitting import make_plan, start
+from hybrid_jax.training.fitting import make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 0
@@ -34,7 +34,7 @@ def soak(sizes):
     for i in range(SWEEPS):
         size = sizes[i % len(sizes)]
         states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for length in (0.8, 0.6)])
-        plans = stack([make_plan(rate, np.arange(size), size, 1, 2, 6, 0.0) for rate in (0.03, 0.01)])
+        plans = stack([make_run_config(rate, np.arange(size), size, 1, 2, 6, 0.0) for rate in (0.03, 0.01)])
         final = sweep(states, plans, swings(40)[:size], validation, settings)
         evaluate(final.best, validation, 2, settings)
         if i + 1 == WARM:

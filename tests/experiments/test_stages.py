@@ -16,13 +16,13 @@ from experiments.runner.stages import Stages
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane, stack
-from hybrid_jax.training.fitting import make_plan, start
+from hybrid_jax.training.fitting import make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 SETTINGS = Settings(batch_size=10)
 DATA = Dataset({"train": swings(20), "validation": swings(10, seed=1)}, {"config": {}})
 STATES = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.6))])
-PLANS = stack([make_plan(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rate in (0.03, 0.01)])
+PLANS = stack([make_run_config(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rate in (0.03, 0.01)])
 
 
 def stages(folder):
@@ -83,7 +83,7 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
     "other",
     [
         {"settings": replace(SETTINGS, batch_size=5)},
-        {"plans": stack([make_plan(0.02, np.arange(20), 20, 1, 1, 2, 0.0)] * 2)},
+        {"plans": stack([make_run_config(0.02, np.arange(20), 20, 1, 1, 2, 0.0)] * 2)},
         {"data": Dataset({"train": swings(20, seed=7), "validation": swings(10, seed=1)}, {"config": {}})},
         {"states": stack([start(pendulum(length, 2 * DAMPING), jax.random.key(0)) for length in (0.8, 0.6)])},
     ],

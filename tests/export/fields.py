@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, guess
+from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.networks.views import GO_WITH, INPUTS, OUTPUTS, restricted
@@ -49,7 +49,7 @@ def plain(x, u):
     return jnp.tanh(x) * jnp.where(x[2] > 0, 1.0, jnp.sum(u) / 2500)
 
 
-BODY = guess(IRIS, KEY)
+BODY = perturbed(IRIS, KEY)
 PER_ROTOR = moved(multirotor(IRIS, tuple(name for name in SHAPES if name != "k"), TERMS))
 FIELDS = {
     "rigid body": BODY,

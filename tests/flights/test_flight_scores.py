@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax import Trajectories, rigid_body, rotation
-from hybrid_jax.dynamics.base import deploy_batch, evaluate_batch
+from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.flights.scores import FlightErrors, errors_between, flight_errors, mean_by_step, rmse_at, summed_mean
 from hybrid_jax.integrate import rollout_batch
@@ -68,7 +68,7 @@ def test_windows_of_something_else_are_refused():
 def test_baselines_do_what_they_are_called():
     x, u = jnp.asarray(states(5).T), jnp.full((4, 5), 650.0)
     plain = rigid_body(IRIS)
-    for evaluate in (evaluate_batch, deploy_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u)):
+    for evaluate in (train_batch, infer_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u)):
         assert (evaluate(HoldState(), x, u) == 0).all()
         frozen, whole = evaluate(FrozenRates(plain), x, u), evaluate(plain, x, u)
         assert (frozen[BODY_RATES] == 0).all()

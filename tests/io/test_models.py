@@ -12,13 +12,13 @@ from pendulum import pendulum
 
 from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import guess
+from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.io import models
 from hybrid_jax.io.archive import save_archive
 from hybrid_jax.networks.mlp import InputScaling
 
 KEY = jax.random.key(0)
-PHYSICS = guess(IRIS, KEY)
+PHYSICS = perturbed(IRIS, KEY)
 NETWORK = residual_network(13, 4, KEY, hidden=6, scaling=InputScaling(IRIS.hover_speed, 65.6))
 FIELDS = {"physics": PHYSICS, "network": NETWORK, "hybrid": Hybrid(PHYSICS, NETWORK)}
 _direct = eqx.filter_jit(rollout_batch)

@@ -13,14 +13,14 @@ from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, sav
 from hybrid_jax.dynamics.base import (
     AbstractVectorField,
     Frozen,
-    Statistics,
-    deploy_batch,
-    evaluate_batch,
-    observe,
+    RunningStats,
+    infer_batch,
+    train_batch,
     trainable,
+    update_running_stats,
 )
 from hybrid_jax.networks import views
-from hybrid_jax.networks.mlp import InputScaling, silenced
+from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import BodyFrame, BodyMotion, restricted
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -173,31 +173,31 @@ def test_motion_is_not_written_in_the_world():
 
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
 def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
-    field, (x, u) = silenced(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
+    field, (x, u) = zero_output(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
     np.testing.assert_array_equal(deployed(field, x, u), deployed(rigid_body(IRIS), x, u))
     slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field.residual)
     assert (network_of(slope).weight_out != 0).any()
     with pytest.raises(ValueError, match="no ResidualNetwork"):
-        silenced(rigid_body(IRIS))
+        zero_output(rigid_body(IRIS))
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
 def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
     field, (x, u) = view(inputs, outputs, linear=True), samples()
-    assert (evaluate_batch(field, x, u) == 0).all()
+    assert (train_batch(field, x, u) == 0).all()
     slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field)
     path = network_of(slope)
     assert (path.weight != 0).any()
     assert (path.field.weight_out != 0).any()
     moved = jax.tree.map(lambda leaf: leaf + 1, field)
-    assert (deployed(silenced(moved), x, u) == 0).all()
+    assert (deployed(zero_output(moved), x, u) == 0).all()
 
 
 @pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])
 @pytest.mark.parametrize("inputs", views.INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
-    for evaluate in (deployed, evaluate_batch):
+    for evaluate in (deployed, train_batch):
         derivative = evaluate(field, x, u)
         assert (derivative[:-written] == 0).all()
         assert (jnp.abs(derivative[-written:]).max(1) > 1e-3).all()
@@ -225,7 +225,7 @@ def test_isotropic_drag_is_the_same_seen_from_the_body():
 def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
     field, (x, u) = view(inputs, outputs), samples(20)
-    trained = evaluate_batch(field, x, u)
+    trained = train_batch(field, x, u)
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
     def seen(node, x):
@@ -233,10 +233,10 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
 
     network = network_of(field)
     hidden = network.weight_in @ jnp.concatenate([seen(field, x), network.scaling(u)])
-    here = Statistics(hidden.mean(1), hidden.var(1))
+    here = RunningStats(hidden.mean(1), hidden.var(1))
     exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
     np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
-    running = network_of(observe(field, x, u)).norm.running
+    running = network_of(update_running_stats(field, x, u)).norm.running
     np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
 
@@ -247,8 +247,8 @@ def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
         one_by_one = jax.vmap(field, -1, -1)(x, u)
-        np.testing.assert_allclose(deploy_batch(field, x, u), one_by_one, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(deploy_batch(Frozen(field), x, u), one_by_one, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(infer_batch(field, x, u), one_by_one, rtol=0, atol=1e-11)
+        np.testing.assert_allclose(infer_batch(Frozen(field), x, u), one_by_one, rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax import load, rotation, save
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, deploy_batch, evaluate_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.mlp import InputScaling, residual_network
 from hybrid_jax.networks.rotor_thrust import RotorThrust
@@ -61,7 +61,7 @@ def test_with_their_formula_it_is_the_simulator_s_ground_effect():
     np.testing.assert_array_equal(found[: VELOCITY.start], 0)
 
 
-@pytest.mark.parametrize("many", [evaluate_batch, deploy_batch])
+@pytest.mark.parametrize("many", [train_batch, infer_batch])
 def test_a_batch_is_its_samples(many):
     x, u = samples()
     np.testing.assert_allclose(many(shared(), x, u), deployed(shared(), x, u), rtol=1e-4, atol=1e-4)
@@ -85,7 +85,7 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     (x, u), field = samples(), restricted(KEY, outputs="rotors", **known)
     alone = restricted(KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
-    slope = eqx.filter_grad(lambda residual: jnp.sum(evaluate_batch(residual, x, u)))(field)
+    slope = eqx.filter_grad(lambda residual: jnp.sum(train_batch(residual, x, u)))(field)
     assert (slope.physics.field.weight_out != 0).any()
     moved = Hybrid(rigid_body(IRIS), jax.tree.map(lambda leaf: leaf + 0.1, field))
     save(tmp_path / "model.npz", moved)

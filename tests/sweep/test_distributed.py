@@ -37,10 +37,10 @@ from hybrid_jax.io.archive import digest, named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.training.objective import Settings
-from hybrid_jax.training.fitting import make_plan, start
+from hybrid_jax.training.fitting import make_run_config, start
 progress.FIRST = 0.0
 states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.7, 0.6))])
-plans = stack([make_plan(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
+plans = stack([make_run_config(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
                ((0.03, 6000), (0.01, 4000), (0.02, 5000))])
 data = Dataset({"train": swings(40), "validation": swings(20, seed=1)}, {"config": {}})
 stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.first()))

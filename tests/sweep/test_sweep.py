@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from pendulum import DAMPING, pendulum, swings
 
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.sweep.training import Room, evaluate, sweep
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, start
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 BATCH = 10
@@ -29,7 +29,7 @@ LENGTHS = (0.8, 0.7, 0.6)
 
 def plan(rate=0.03, n_train=20, minimum=5, patience=3, cap=12, seed=0):
     subset = np.random.default_rng(seed).permutation(40)
-    return make_plan(rate, subset, n_train, minimum, patience, cap, 0.0)
+    return make_run_config(rate, subset, n_train, minimum, patience, cap, 0.0)
 
 
 def starts(lengths=LENGTHS):
@@ -133,7 +133,7 @@ def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
     subset, key = np.random.default_rng(0).permutation(listed), jax.random.key_data(jax.random.key(1))
     for n in {1, listed // 8, listed // 8 + 1, listed} - {0}:
         orders = [
-            fitting._shuffled(make_plan(0.1, padded, n, 1, 1, 1, 0.0), key)
+            fitting._shuffled(make_run_config(0.1, padded, n, 1, 1, 1, 0.0), key)
             for padded in (subset, np.pad(subset, (0, 10 * listed)))
         ]
         np.testing.assert_array_equal(*(order[:listed] for order in orders))
@@ -208,7 +208,7 @@ def test_evaluate_is_the_error_of_each_lane(final):
     test = swings(15, seed=2)
     errors = evaluate(final.best, test, 2, SETTINGS)
     for i in range(3):
-        alone = deployed_mse(lane(final.best, i), test, 2)
+        alone = rollout_mse(lane(final.best, i), test, 2)
         np.testing.assert_allclose(errors[i], alone, rtol=1e-4)  # another program for the same float32 sums
 
 

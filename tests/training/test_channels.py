@@ -12,13 +12,13 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Settings, fit
 from hybrid_jax.dynamics.baselines import HoldState
-from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.training.channels import Channel, ChannelPrediction, channels_from
-from hybrid_jax.training.objective import Prediction
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.training.channels import Channel, ChannelLoss, channels_from
+from hybrid_jax.training.objective import TrajectoryLoss
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 PARTS = {"angle": slice(0, 1), "rate": slice(1, 2)}
-PLAIN = ChannelPrediction((Channel(0, 2, 1.0),))
+PLAIN = ChannelLoss((Channel(0, 2, 1.0),))
 FIELD = pendulum(0.8)
 
 
@@ -27,25 +27,23 @@ def loss(objective, windows, field=FIELD):
 
 
 def test_with_a_scale_of_one_it_is_the_plain_loss():
-    np.testing.assert_allclose(loss(PLAIN, TRAIN), loss(Prediction(), TRAIN), rtol=1e-6)
-    np.testing.assert_allclose(
-        PLAIN.validate(FIELD, VALIDATION, Settings()), deployed_mse(FIELD, VALIDATION), rtol=1e-6
-    )
+    np.testing.assert_allclose(loss(PLAIN, TRAIN), loss(TrajectoryLoss(), TRAIN), rtol=1e-6)
+    np.testing.assert_allclose(PLAIN.validate(FIELD, VALIDATION, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-6)
 
 
 def test_validation_in_chunks_is_that_of_all():
     many = jax.tree.map(lambda leaf: np.tile(leaf, (26, *(1,) * (leaf.ndim - 1))), VALIDATION)
-    np.testing.assert_allclose(PLAIN.validate(FIELD, many, Settings()), deployed_mse(FIELD, VALIDATION), rtol=1e-5)
+    np.testing.assert_allclose(PLAIN.validate(FIELD, many, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5)
 
 
 def test_scales_are_the_baseline_s_errors_at_the_horizon():
     """So the baseline counts 1 in each channel there, whatever the units."""
     channels = channels_from(HoldState(), TRAIN, PARTS)
     last = (TRAIN.x - TRAIN.x0[:, None])[:, -1]
-    counted = ChannelPrediction(channels).error(last)
+    counted = ChannelLoss(channels).error(last)
     np.testing.assert_allclose(counted.mean(), 2.0, rtol=1e-5)
     degrees = jax.tree.map(lambda leaf: leaf * np.array([57.3, 1.0]), eqx.tree_at(lambda w: w.u, TRAIN, TRAIN.x))
-    same = ChannelPrediction(channels_from(HoldState(), degrees, PARTS))
+    same = ChannelLoss(channels_from(HoldState(), degrees, PARTS))
     np.testing.assert_allclose(same.error(last * np.array([57.3, 1.0])), counted, rtol=1e-5)
 
 
@@ -55,7 +53,7 @@ def test_a_baseline_without_error_is_no_measure():
 
 
 def test_beyond_its_threshold_a_robust_loss_grows_with_the_error_and_not_its_square():
-    robust = ChannelPrediction((Channel(0, 2, 2.0),), huber=1.5)
+    robust = ChannelLoss((Channel(0, 2, 2.0),), huber=1.5)
 
     def count(x):
         return robust.error(jnp.array([0.6, 0.8]) * 2.0 * x)  # a length of x scales
@@ -71,7 +69,7 @@ def test_a_robust_loss_does_not_follow_outliers():
     wild = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[::10].add(20.0))
     found = {}
     for name, huber in (("square", None), ("robust", 0.05)):
-        objective = ChannelPrediction(channels_from(HoldState(), TRAIN, PARTS), huber)
+        objective = ChannelLoss(channels_from(HoldState(), TRAIN, PARTS), huber)
         settings = Settings(batch_size=60, objective=objective)
         state = fit(pendulum(0.8, DAMPING), wild, VALIDATION, KEY, rates=0.03, max_epochs=60, settings=settings)
         found[name] = abs(float(jnp.exp(state.field.log_length)) - LENGTH)
@@ -81,9 +79,9 @@ def test_a_robust_loss_does_not_follow_outliers():
 
 @pytest.mark.parametrize(
     "wrong",
-    [lambda: Channel(0, 0, 1.0), lambda: Channel(0, 1, 0.0), lambda: ChannelPrediction(()),
-     lambda: ChannelPrediction((Channel(0, 1, 1.0),), huber=-1.0),
-     lambda: ChannelPrediction((Channel(0, 3, 1.0),)).prepare(TRAIN, "train")],
+    [lambda: Channel(0, 0, 1.0), lambda: Channel(0, 1, 0.0), lambda: ChannelLoss(()),
+     lambda: ChannelLoss((Channel(0, 1, 1.0),), huber=-1.0),
+     lambda: ChannelLoss((Channel(0, 3, 1.0),)).prepare(TRAIN, "train")],
 )  # fmt: skip
 def test_what_makes_no_sense_is_refused(wrong):
     with pytest.raises(ValueError, match=r"stop|scale|channels|huber|train: states"):
@@ -92,6 +90,6 @@ def test_what_makes_no_sense_is_refused(wrong):
 
 def test_it_can_be_found_by_what_it_is():
     """A cache keeps an objective as JSON values, a program by its hash."""
-    objective = ChannelPrediction(channels_from(HoldState(), TRAIN, PARTS), huber=1.0)
+    objective = ChannelLoss(channels_from(HoldState(), TRAIN, PARTS), huber=1.0)
     assert hash(objective) == hash(dataclasses.replace(objective))
     json.dumps(dataclasses.asdict(objective), allow_nan=False)

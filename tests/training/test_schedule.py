@@ -10,15 +10,15 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 from hybrid_jax import Hybrid, Settings, residual_network
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.metrics import deployed_mse
-from hybrid_jax.networks.mlp import silenced
-from hybrid_jax.training.fitting import make_plan
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.networks.mlp import zero_output
+from hybrid_jax.training.fitting import make_run_config
 from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 from hybrid_jax.vehicle import IRIS
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
-FIELD = Hybrid(pendulum(0.6), silenced(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none")))
+FIELD = Hybrid(pendulum(0.6), zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none")))
 
 
 def trained(stages, field=FIELD, train=TRAIN, **options):
@@ -47,9 +47,9 @@ def test_the_longest_group_that_fits_counts():
 def test_stages_go_on_from_each_other_and_never_get_worse():
     stages = [Stage({"physics": 0.03}, steps=2, epochs=30), Stage({"": 0.01}, epochs=60)]
     first, second = trained(stages)
-    start = float(deployed_mse(FIELD, VALIDATION))
+    start = float(rollout_mse(FIELD, VALIDATION))
     assert second.best_mse < first.best_mse < start
-    np.testing.assert_allclose(first.best_mse, deployed_mse(first.best, VALIDATION), rtol=1e-5)
+    np.testing.assert_allclose(first.best_mse, rollout_mse(first.best, VALIDATION), rtol=1e-5)
     assert second.best_mse < 0.5 * first.best_mse  # the damping is the network's
 
 
@@ -98,5 +98,5 @@ def test_what_a_fit_refuses_stages_refuse(field, size, said):
 
 def test_rates_by_group_are_those_of_a_plan():
     """What a sweep takes: the tree begins as the field does."""
-    plan = make_plan(rates_by_group(FIELD, {"": 1e-3}), jnp.arange(3), 3, 0, 1, 1, 0.0)
+    plan = make_run_config(rates_by_group(FIELD, {"": 1e-3}), jnp.arange(3), 3, 0, 1, 1, 0.0)
     assert all(rate == np.float32(1e-3) for rate in jax.tree.leaves(plan.rates))

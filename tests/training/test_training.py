@@ -11,12 +11,12 @@ from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.metrics import deployed_mse
+from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_plan, run, start
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, run, start
 from hybrid_jax.training.loss import residual_norm, trajectory_correlation
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -34,12 +34,12 @@ def trained(field, rates=0.03, key=KEY, train=TRAIN, validation=VALIDATION, sett
 
 
 def planned(field, subset, n_train, train=TRAIN, epochs=4):
-    plan = make_plan(0.03, subset, n_train, 100, 100, epochs, 0.0)
+    plan = make_run_config(0.03, subset, n_train, 100, 100, epochs, 0.0)
     return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)
 
 
 def validated(field):
-    return float(eqx.filter_jit(deployed_mse)(field, VALIDATION))
+    return float(eqx.filter_jit(rollout_mse)(field, VALIDATION))
 
 
 @pytest.fixture(scope="module")
@@ -128,7 +128,7 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
     """Epoch by epoch by hand: the best field is the one kept, and its error is what validation says."""
     whole = trained(pendulum(0.8, DAMPING), max_epochs=15)
     state = start(pendulum(0.8, DAMPING), KEY)
-    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
+    plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
     errors, fields = [], []
     for until in range(1, 16):
         state = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
@@ -161,7 +161,7 @@ def test_the_cap_is_marked():
 
 
 def test_a_run_that_is_not_over_is_marked_running():
-    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
+    plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
     assert _run(start(pendulum(), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3)).status == RUNNING
 
 
@@ -188,7 +188,7 @@ def test_each_epoch_sees_every_window_once():
     field = pendulum(0.8, DAMPING)
     for key in (KEY, jax.random.key(1)):
         state = trained(field, 0.0, key=key, max_epochs=1)
-        np.testing.assert_allclose(state.train_loss, deployed_mse(field, TRAIN), rtol=1e-5)  # float32 sums
+        np.testing.assert_allclose(state.train_loss, rollout_mse(field, TRAIN), rtol=1e-5)  # float32 sums
 
 
 class Learned(AbstractVectorField):
@@ -221,7 +221,7 @@ def test_double_precision_trains_alone_and_in_a_sweep():
             lambda leaf: jnp.asarray(leaf, float), (pendulum(0.8), TRAIN, VALIDATION)
         )
         alone = trained(field, train=train, validation=validation, max_epochs=3)
-        plans = stack([make_plan(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
+        plans = stack([make_run_config(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
         lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
     assert (alone.status.dtype, int(alone.status)) == (np.int32, CAPPED)
     assert alone.best.log_length.dtype == alone.best_mse.dtype == np.float64
@@ -230,7 +230,7 @@ def test_double_precision_trains_alone_and_in_a_sweep():
 
 
 def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
-    plan = make_plan(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
+    plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
     good = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
     spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x * jnp.nan)
     bad = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
@@ -285,7 +285,7 @@ def test_one_window_is_not_normalised_by_itself(alone):
         field = Hybrid(pendulum(), wrap(residual_network(2, 1, KEY, hidden=4, norm=norm)))
         if alone:
             return trained(field, settings=Settings(1), max_epochs=1)
-        plan = make_plan(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
+        plan = make_run_config(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
         return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
 
     with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):

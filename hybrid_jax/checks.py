@@ -35,7 +35,7 @@ def real_array(name: str, value: Any) -> Numbers:
     try:
         array = value if isinstance(value, Numbers) else np.asarray(value)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"{name} must be an array of real numbers: {one_line(error)}") from error
+        raise ValueError(f"{name} must be an array of real numbers: {first_line(error)}") from error
     numeric = jnp.issubdtype(array.dtype, jnp.floating) or jnp.issubdtype(array.dtype, jnp.integer)
     if not numeric or array.dtype.itemsize > 8:  # JAX has no long double
         raise ValueError(f"{name} must be an array of real numbers, got {type(value).__name__} of {array.dtype}")
@@ -105,7 +105,7 @@ def number(name: str, value: Any) -> None:
     """
     found = real(value)
     if not is_traced(value) and (found is None or not abs(found) <= LARGEST):
-        raise ValueError(f"{name} must be a finite number, got {shown(value)}")
+        raise ValueError(f"{name} must be a finite number, got {short_repr(value)}")
 
 
 def positive(name: str, value: Any, what: str = "a positive finite number") -> None:
@@ -116,7 +116,7 @@ def positive(name: str, value: Any, what: str = "a positive finite number") -> N
     """
     found = real(value)
     if not is_traced(value) and (found is None or not SMALLEST <= found <= LARGEST):
-        raise ValueError(f"{name} must be {what}, got {shown(value)}")
+        raise ValueError(f"{name} must be {what}, got {short_repr(value)}")
 
 
 def not_negative(name: str, value: Any) -> None:
@@ -139,7 +139,7 @@ def count(name: str, value: Any, least: int = 1) -> None:
         return
     found = value.item() if isinstance(value, Numbers) and value.ndim == 0 else value
     if not isinstance(found, int | np.integer) or isinstance(found, bool) or not least <= found <= MOST:
-        raise ValueError(f"{name} must be an integer of at least {least}, got {shown(value)}")
+        raise ValueError(f"{name} must be an integer of at least {least}, got {short_repr(value)}")
 
 
 def key(name: str, value: Any) -> None:
@@ -152,14 +152,14 @@ def key(name: str, value: Any) -> None:
         new = jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.ndim == 0
         if new or (value.dtype == np.uint32 and value.shape == (2,)):
             return
-    raise ValueError(f"{name} must be a random key, such as jax.random.key(0), got {shown(value)}")
+    raise ValueError(f"{name} must be a random key, such as jax.random.key(0), got {short_repr(value)}")
 
 
-def shown(value: Any) -> str:
+def short_repr(value: Any) -> str:
     """The beginning of a value's own description, in one line."""
     return " ".join(repr(value)[:80].split())
 
 
-def one_line(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
     """The first line of what an error says, or the name of its kind."""
     return (str(error).strip() or type(error).__name__).splitlines()[0]
