@@ -32,7 +32,7 @@ class Report:
     Attributes:
         experiment: "param_shift", "external_force", "comparison", or a name of one's own.
         config: the configuration as JSON values.
-        environment: see `experiments.reporting.environment.environment`.
+        environment: see `experiments.runner.environment.environment`.
         rows: one per trained model.
         claims: see `experiments.paper.claims.claims`.
         truth_theta: the target vehicle's Ix, Iy [kg m²], k [N/(rad/s)²], if known; by domain where there are several.
