@@ -11,8 +11,7 @@ from typing import Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from benchmarks.timing import Ratio, ratio_table
-from experiments.runner.command import BAD_INPUT, check_folder
+from benchmarks.timing import BAD_INPUT, Ratio, check_folder, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_whole
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]

@@ -6,10 +6,12 @@ median. A ratio of two calls is the median of the ratios within each turn. Set t
 
 import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,14 +24,13 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from experiments.paper.figures import save_figure
-from experiments.runner.command import BAD_INPUT, check_folder
-from experiments.runner.environment import environment
+from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import json_text, write_whole
-from hybrid_jax.runtime import PROGRAMS, configure, cores
+from hybrid_jax.runtime import PROGRAMS, configure, cores, hardware
 
 Call = Callable[[], Any]
-DISAGREEMENT = 1  # exit code
+DISAGREEMENT, BAD_INPUT = 1, 2  # exit codes
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 
 
 class Disagreement(RuntimeError):
@@ -146,6 +147,25 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     return worst
 
 
+def run_together(what: str, commands: Sequence[Sequence[str]], variables: Mapping[str, str] | None = None) -> list[str]:
+    """Run Python processes at the same time; the standard output of each.
+
+    Args:
+        commands: the arguments of each interpreter.
+        variables: of their environment; by default those of this process.
+
+    Raises:
+        RuntimeError: a process failed; the end of its standard error.
+    """
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": variables}
+    started = [subprocess.Popen([sys.executable, *command], **pipes) for command in commands]
+    outputs = [process.communicate() for process in started]
+    for process, (_, error) in zip(started, outputs, strict=True):
+        if process.returncode:
+            raise RuntimeError(f"{what} failed: {error[-500:]}")
+    return [output for output, _ in outputs]
+
+
 def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Callable[[Any], Findings]) -> None:
     """The command line: measure a preset, print, write. Bad input ends in one line on stderr and exit code 2."""
     options = tyro.cli(Options, prog=f"python -m benchmarks.{name}", description=about)
@@ -167,7 +187,23 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
         report = _report(name, options.preset, findings, time.perf_counter() - began)
         write_whole(options.out, json_text(report))
         if findings.figure is not None:
-            save_figure(findings.figure, options.out.with_suffix(""))
+            findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
+            findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Create a folder and check that it can be written, before work begins.
+
+    Raises:
+        ValueError: it cannot be created or written.
+    """
+    probe = folder / f".writable.{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
 
 
 def _check(options: Options, presets: Mapping[str, Any]) -> None:
@@ -207,7 +243,12 @@ def _report(name: str, preset: str, findings: Findings, seconds: float) -> dict[
     return {
         "benchmark": name,
         "preset": preset,
-        "environment": environment({name: seconds}),
+        "environment": {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "versions": versions(*PACKAGES),
+            "hardware": hardware(),
+            "seconds": {name: round(seconds, 3)},
+        },
         "cores_used": cores(),
         "rows": findings.rows,
         "ratios": [asdict(ratio) | {"holds": ratio.holds} for ratio in findings.ratios],

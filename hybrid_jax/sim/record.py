@@ -16,6 +16,7 @@ from hybrid_jax.sim.flight import DT, Flights, fly, gone_wrong
 from hybrid_jax.sim.quadrotor import CHUNK
 from hybrid_jax.sim.survey import survey
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 RECIPE = 1  # raise it when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
@@ -93,7 +94,7 @@ def record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Tr
     tally, parts = Tally(), []
     while tally.windows < SPARE * spec.windows:
         flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally.flights))
-        parts += cut(flights, spec.steps, tally)
+        parts += cut(flights, spec.steps, tally, domain.nominal)
         if not parts:
             raise ValueError(f"domain {domain.name}: none of {tally.flights} flights stayed in bounds")
     windows = concatenate(parts)
@@ -101,10 +102,10 @@ def record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Tr
     return windows[order], tally
 
 
-def cut(flights: Flights, steps: int, tally: Tally) -> list[Trajectories]:
+def cut(flights: Flights, steps: int, tally: Tally, vehicle: Vehicle = IRIS) -> list[Trajectories]:
     """The sound windows of the sound flights, float32; counts in the tally what was flown and left out."""
     parts = []
-    wrong = gone_wrong(flights.states)
+    wrong = gone_wrong(flights.states, vehicle)
     for states, inputs, lowest in zip(*(leaf[~wrong] for leaf in flights[:3]), strict=True):
         windows = windows_of(states.astype(np.float32), inputs.astype(np.float32), DT, steps=steps)
         # A tilted rotor below ground is no flight that ground effect describes.
