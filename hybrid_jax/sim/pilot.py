@@ -140,9 +140,8 @@ def _draw_waypoints(key: PRNGKeyArray, steps: int, scale: Scale) -> tuple[Float[
     count = int(steps * PERIOD / (HOLD[0] * scale.time)) + 2
     # One draw for all, because each call of a random function takes a third of a second to compile.
     draw = jax.random.uniform(key, (9, count))
-    altitude = jnp.where(
-        draw[2] < LOW_SHARE, _between(LOW, draw[3], scale.length), _between(HIGH, draw[3], scale.length)
-    )
+    low, high = (_between(bounds, draw[3], scale.length) for bounds in (LOW, HIGH))
+    altitude = jnp.where(draw[2] < LOW_SHARE, low, high)
     arena = ARENA * scale.length
     place = [arena * (2 * draw[0] - 1), arena * (2 * draw[1] - 1), altitude, HEADING * (2 * draw[4] - 1)]
     limit = [
@@ -205,8 +204,8 @@ def _limit_tilt(
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
     sideways = jnp.linalg.norm(lift[:2]) + 1e-9
-    scale = jnp.minimum(1.0, up * jnp.tan(jnp.minimum(lowest, MAX_TILT)) / sideways)
-    return jnp.concatenate([lift[:2] * scale, up[None]])
+    factor = jnp.minimum(1.0, up * jnp.tan(jnp.minimum(lowest, MAX_TILT)) / sideways)
+    return jnp.concatenate([lift[:2] * factor, up[None]])
 
 
 def _angular_acceleration(
