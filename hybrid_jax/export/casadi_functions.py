@@ -61,8 +61,6 @@ def casadi_step(
 def _function(
     field, whole, state_size: int | None, input_size: int | None, name: str, output: str
 ) -> "casadi.Function":
-    field, whole, state_size: int | None, input_size: int | None, name: str, output: str
-) -> "casadi.Function":
     try:
         import casadi as ca
 
