@@ -88,7 +88,7 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
     arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
     save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about or {})}, arrays)
     if structure.problem is not None:
-        warnings.warn(f"{path}: to load this model pass like=: {structure.problem}", stacklevel=2)
+        warnings.warn(f"{path}: this model can only be loaded with like=: {structure.problem}", stacklevel=2)
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:

@@ -9,6 +9,7 @@ import inspect
 import math
 import sys
 from collections.abc import Callable, Mapping
+from dataclasses import is_dataclass
 from functools import partial
 from types import ModuleType
 from typing import Any, TypeVar, overload
@@ -42,9 +43,9 @@ Item = TypeVar("Item", bound=Callable)
 
 
 @overload
-def portable(item: Item) -> Item: ...
+def portable(item: Item, *, name: str | None = None) -> Item: ...
 @overload
-def portable(*, name: str) -> Callable[[Item], Item]: ...
+def portable(item: None = None, *, name: str | None = None) -> Callable[[Item], Item]: ...
 def portable(item: Any = None, *, name: str | None = None) -> Any:
     """Decorator: saved models refer to this class or function by a name that does not depend on its module.
 
@@ -110,7 +111,7 @@ class Structure:
             return {"dtype": value.name}
         if (name := _name_of(value)) is not None:
             return {"named": name}
-        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        if is_dataclass(value) and not isinstance(value, type):
             return self._encode_fields(value, path, static)
         return self._unknown(value, path, static)
 
@@ -120,7 +121,7 @@ class Structure:
             if find_class(name) is not type(value):
                 self._note(f"{path} is of a class that {name} no longer refers to")
         except ValueError as error:
-            self._note(f"{path}: {error}")
+            self._note(f"{path}: {str(error).partition(';')[0]}")  # without the remedy
         static |= not isinstance(value, eqx.Module)
         parts = {
             f.name: self._encode(getattr(value, f.name), f"{path}/{f.name}", static or f.metadata.get("static", False))
@@ -174,7 +175,9 @@ def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
         case {"named": str() as name} if name in _ALLOWED or name in _PORTABLE:
             return _ALLOWED[name] if name in _ALLOWED else _PORTABLE[name]
         case {"named": str() as name}:
-            raise ValueError(f"function {name} is unknown: import the module that makes it portable, or pass like=")
+            raise ValueError(
+                f"function {name} is not known here; import the module that makes it portable first, or pass like="
+            )
         case {"unknown": str() as reason}:
             raise ValueError(f"{reason}; pass like=")
     raise ValueError("an entry of its structure is malformed")
@@ -190,14 +193,12 @@ def find_class(name: str) -> type:
     found: Any = _PORTABLE.get(name, sys.modules.get(module))
     if found is None:
         what = f"the module that makes {name[1:]} portable" if name.startswith("@") else module
-        raise ValueError(f"class {name} is not known here: import {what} first, or pass like=")
+        raise ValueError(f"class {name} is not known here; import {what} first, or pass like=")
     for part in qualname.split(".") if qualname else ():
         # Not getattr: a module's or class's own __getattr__ could run code.
         found = vars(found).get(part) if isinstance(found, type | ModuleType) else None
-    is_own = name in _PORTABLE or module.startswith("hybrid_jax.")
-    if not (
-        isinstance(found, type) and (issubclass(found, eqx.Module) or (is_own and dataclasses.is_dataclass(found)))
-    ):
+    trusted = name in _PORTABLE or module.startswith("hybrid_jax.")  # such as Vehicle, a frozen dataclass
+    if not isinstance(found, type) or not (issubclass(found, eqx.Module) or (trusted and is_dataclass(found))):
         raise ValueError(f"{name} is not an Equinox module at the top level of a Python module; pass like=")
     if qualname and _address(found) != name:
         raise ValueError(f"{name} is another name of {_address(found)}; pass like=")
