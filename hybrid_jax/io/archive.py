@@ -36,7 +36,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
         OSError: the file cannot be written.
     """
     for name, array in arrays.items():
-        if array.dtype not in NUMERIC:
+        if array.dtype.newbyteorder("=") not in NUMERIC:
             raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
     header = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}
     buffer = io.BytesIO()
@@ -187,7 +187,7 @@ def _read_array(name: str, entry: bytes) -> np.ndarray:
         raise ValueError(f"entry {name!r} is a .npy of an unknown version")
     shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
     declared = math.prod(shape) * dtype.itemsize if min(shape, default=0) >= 0 else None
-    if dtype not in NUMERIC or declared != len(entry) - file.tell():
+    if dtype.newbyteorder("=") not in NUMERIC or declared != len(entry) - file.tell():
         raise ValueError(f"entry {name!r} is not numeric, or its size is not that of {dtype}{list(shape)}")
     order = "F" if in_fortran_order else "C"
     return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)

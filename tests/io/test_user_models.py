@@ -15,12 +15,12 @@ import numpy as np
 import pytest
 import user_modules
 from pendulum import pendulum
-from user_modules import Perceptron, fields, prediction
+from user_modules import fields, prediction
 
 import hybrid_jax as hj
 import hybrid_jax.adaptation.expert_augmentation  # defines two of the old classes
 from hybrid_jax.io import describe, structure
-from hybrid_jax.io.archive import save_archive
+from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.models import FORMAT
 
 KEY = jax.random.key(1)
@@ -57,10 +57,8 @@ def test_a_loaded_model_is_the_saved_one(name, tmp_path):
     with warnings.catch_warnings(action="error"):
         hj.save(path, field)
     for loaded in (hj.load(path).field, hj.load(path, like=fields()[name]).field):
-        assert jax.tree.structure(eqx.filter(loaded, eqx.is_array)) == jax.tree.structure(
-            eqx.filter(field, eqx.is_array)
-        )
-        assert eqx.tree_equal(eqx.filter(loaded, eqx.is_array), eqx.filter(field, eqx.is_array))
+        assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
+        assert describe(loaded) == describe(field)
 
 
 def test_two_runs_of_a_script_share_its_classes(tmp_path):
@@ -132,7 +130,7 @@ def test_a_portable_name_outlives_its_module_and_is_unique(tmp_path, monkeypatch
     assert type(hj.load(tmp_path / "model.npz").field) is new.Linear
 
 
-def local_field(gain=np.float32(2), size=3):
+def local_field(gain=2.0, size=3, dtype=np.float32):
     class Local(hj.AbstractVectorField):
         net: eqx.Module
         gain: jax.Array
@@ -140,7 +138,7 @@ def local_field(gain=np.float32(2), size=3):
         def __call__(self, x, u):
             return self.gain * self.net(x)
 
-    return Local(eqx.nn.Linear(size, size, key=KEY), jnp.asarray(gain))
+    return Local(eqx.nn.Linear(size, size, key=KEY), jnp.asarray(gain, dtype))
 
 
 def with_activation(function):
@@ -149,7 +147,7 @@ def with_activation(function):
 
 # Name → model that a file cannot rebuild, the same with other weights, and the part that is the reason.
 SKELETONS = {
-    "local class": (local_field(), local_field(np.float32(5)), r"field: .*<locals>\.Local"),
+    "local class": (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
     "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/net/activation"),
     "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/net/activation"),
     "own function": (with_activation(prediction), FIELDS["perceptron"], "field/net/activation.*prediction"),
@@ -166,7 +164,7 @@ def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
     with pytest.raises(ValueError, match=rf"model\.npz: .*{reason if name != 'local class' else ''}.*pass like="):
         hj.load(path)
     loaded = hj.load(path, like=like).field
-    assert eqx.tree_equal(eqx.filter(loaded, eqx.is_array), eqx.filter(field, eqx.is_array))
+    assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
     assert type(loaded) is type(like)
     with pytest.raises(ValueError, match="field"):
         describe(field)
@@ -178,7 +176,7 @@ def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
     with pytest.raises(ValueError, match=r"'field/net/bias' is float32\[3\], expected float32\[4\]$"):
         hj.load(tmp_path / "model.npz", like=local_field(size=4))
     with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected int32\[\]$"):
-        hj.load(tmp_path / "model.npz", like=local_field(gain=np.int32(2)))
+        hj.load(tmp_path / "model.npz", like=local_field(dtype=np.int32))
     with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected none$"):
         hj.load(tmp_path / "model.npz", like=pendulum())
 
@@ -245,9 +243,5 @@ def test_a_description_names_classes_and_static_values_but_holds_no_arrays():
     one = describe(FIELDS["nested"])
     assert one["class"] == "user_modules:Nested"
     assert one["fields"]["options"] == {"class": "@Options", "fields": {"gain": 0.7, "steps": {"tuple": [1, 2]}}}
-    assert one == describe(
-        jax.tree.map(lambda leaf: leaf * 2 if eqx.is_inexact_array(leaf) else leaf, FIELDS["nested"])
-    )
+    assert one == describe(user_modules.Nested(KEY))
     assert one != describe(eqx.tree_at(lambda field: field.limits, FIELDS["nested"], (-1.0, 5.0)))
-    assert describe(Perceptron(3, KEY)) == describe(FIELDS["perceptron"])
-    assert user_modules.Options() != FIELDS["nested"].options
