@@ -115,7 +115,7 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
     return dict(zip(paths, map(to_numpy, leaves), strict=True))
 
 
-def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
+def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
     """The tree `like` with each array replaced by that of the same path.
 
     Raises:
@@ -127,7 +127,8 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
         if want is None or have is None or (want.shape, want.dtype) != (have.shape, have.dtype):
             found = "absent" if have is None else f"{have.dtype}{list(have.shape)}"
             wanted = "none" if want is None else f"{want.dtype}{list(want.shape)}"
-            raise ValueError(f"{origin}: array {name!r} is {found}, expected {wanted}")
+            where = "" if origin is None else f"{origin}: "
+            raise ValueError(f"{where}array {name!r} is {found}, expected {wanted}")
     dynamic, rest = eqx.partition(like, eqx.is_array)
     paths, leaves, structure = _flatten(dynamic)
     filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(paths, leaves, strict=True)]

@@ -17,7 +17,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.rigid_body import check_start
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import load_archive, named_leaves, save_archive, to_numpy, with_leaves
-from hybrid_jax.io.structure import Structure, decode
+from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"
 FORMAT_1 = "hybrid_jax model 1"
@@ -95,38 +95,47 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     """Read a model that `save` wrote.
 
     Args:
-        like: a field of the same structure, whose arrays are replaced by those of the file; everything else is taken
-            from `like`. Needed for classes and functions that the file cannot name, such as local classes and lambdas.
-            Without it, the modules that define the model's classes must have been imported.
+        like: a field of the same structure, whose arrays are replaced by those of the file. Needed for classes and
+            functions that the file cannot name, such as local classes and lambdas. Without it, the modules that define
+            the model's classes must have been imported.
 
     Raises:
         ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
-            its arrays do not fit `like`.
+            it does not fit `like`.
     """
     metadata, arrays = load_archive(path, FORMAT, FORMAT_1)
     try:
         about, tree = dict(metadata["about"]), metadata["field"]
-        field = decode(tree, arrays) if like is None else None
+        field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
-    if like is not None:
-        dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
-        filled = with_leaves({"field": like}, dynamic, path)["field"]
-        field = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, filled)
     if not isinstance(field, eqx.Module):
         raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
     return Model(field, about)
 
 
-def check_savable(field: eqx.Module) -> str | None:
-    """Why a file alone could not rebuild this field, or None if it can.
+def _filled(like: eqx.Module, tree: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+    """`like` with the arrays of a file."""
+    dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
+    filled = with_leaves({"field": like}, dynamic)["field"]
+    saved = static_values(tree)
+    for key, value in static_values(_structure(like).tree).items():
+        if saved.get(key, value) != value:
+            raise ValueError(f"{key} is {saved[key]!r}, but {value!r} in `like`")
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, filled)
 
-    Raises:
-        ValueError: the field cannot be saved at all.
+
+def check_savable(field: Any) -> str | None:
+    """Why `load` could not rebuild this field from a file alone, in one line, or None if it can.
+
+    In most cases `save` still works, and `load` needs `like`.
     """
-    return _structure(field).problem
+    try:
+        return _structure(field).problem
+    except ValueError as error:
+        return str(error)
 
 
 def describe(field: eqx.Module) -> Any:

@@ -39,6 +39,7 @@ _ALLOWED: dict[str, Any] = {
 }
 _ALLOWED["equinox.identity"] = inspect.signature(eqx.nn.MLP).parameters["final_activation"].default
 _PORTABLE: dict[str, Any] = {}  # "@name" → class or function
+_NAMES = {"class", "kind", "named", "unknown", "array", "static", "key", "dtype"}  # tags of entries that hold no value
 Item = TypeVar("Item", bound=Callable)
 
 
@@ -103,10 +104,10 @@ class Structure:
         if kind is dict and all(type(key) in (str, int) for key in value):
             return {"items": [[key, self._encode(item, f"{path}/{key}", static)] for key, item in value.items()]}
         if eqx.is_array(value):
-            if not static:
-                return {"array": path, **array_type(value)}
-            self.static_arrays[f"static/{path}"] = value
-            return {"static": f"static/{path}", **array_type(value)}
+            tag, place = ("static", f"static/{path}") if static else ("array", path)
+            if static:
+                self.static_arrays[place] = value
+            return {tag: place, **array_type(value)}
         if isinstance(value, np.dtype):
             return {"dtype": value.name}
         if (name := _name_of(value)) is not None:
@@ -172,15 +173,28 @@ def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
             return complex(text)
         case {"dtype": str() as name}:
             return np.dtype(name)
-        case {"named": str() as name} if name in _ALLOWED or name in _PORTABLE:
-            return _ALLOWED[name] if name in _ALLOWED else _PORTABLE[name]
         case {"named": str() as name}:
-            raise ValueError(
-                f"function {name} is not known here; import the module that makes it portable first, or pass like="
-            )
+            if name not in (known := _ALLOWED | _PORTABLE):
+                raise ValueError(f"function {name} is not known here; import the module that defines it, or pass like=")
+            return known[name]
         case {"unknown": str() as reason}:
             raise ValueError(f"{reason}; pass like=")
     raise ValueError("an entry of its structure is malformed")
+
+
+def static_values(tree: Any, path: str = "field") -> dict[str, Any]:
+    """The numbers, text and None in a structure, by path."""
+    match tree:
+        case dict():
+            tags = {"fields", "items", "tuple", "list", "float", "complex"}
+            parts = [
+                (path if key in tags else f"{path}/{key}", item) for key, item in tree.items() if key not in _NAMES
+            ]
+        case list():
+            parts = [(f"{path}/{index}", item) for index, item in enumerate(tree)]
+        case _:
+            return {path: tree}
+    return {key: value for place, item in parts for key, value in static_values(item, place).items()}
 
 
 def find_class(name: str) -> type:

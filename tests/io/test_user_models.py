@@ -2,6 +2,7 @@
 
 import functools
 import os
+import re
 import subprocess
 import sys
 import warnings
@@ -158,7 +159,7 @@ SKELETONS = {
 def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
     path, (field, like, reason) = tmp_path / "model.npz", SKELETONS[name]
     like = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_inexact_array(leaf) else leaf, like)
-    assert "\n" not in (hj.check_savable(field) or "\n")
+    assert re.fullmatch(rf"{reason}.*", hj.check_savable(field))
     with pytest.warns(UserWarning, match=rf"like=.*{reason}"):
         hj.save(path, field)
     with pytest.raises(ValueError, match=rf"model\.npz: .*{reason if name != 'local class' else ''}.*pass like="):
@@ -181,14 +182,21 @@ def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
         hj.load(tmp_path / "model.npz", like=pendulum())
 
 
+def test_a_skeleton_with_other_static_values_is_refused(tmp_path):
+    hj.save(tmp_path / "model.npz", FIELDS["wrapper"])
+    other = user_modules.Scaled(FIELDS["wrapper"].inner, (1.0, 3.0))
+    with pytest.raises(ValueError, match=r"field/scale/1 is 2\.0, but 3\.0 in `like`$"):
+        hj.load(tmp_path / "model.npz", like=other)
+
+
 def test_what_cannot_be_saved_is_refused_with_its_path(tmp_path):
+    reason = r"field/layers/1 is of type .*TextIOWrapper, which cannot be saved"
     with Path(__file__).open() as file:
         field = eqx.tree_at(lambda field: field.layers[1], FIELDS["convolution"], file)
-        for refuse in (hj.check_savable, lambda field: hj.save(tmp_path / "model.npz", field)):
-            with pytest.raises(ValueError, match=r"field/layers/1 is of type .*TextIOWrapper, which cannot be saved"):
-                refuse(field)
-    with pytest.raises(ValueError, match="field must be an Equinox module"):
-        hj.check_savable(len)
+        assert re.match(reason, hj.check_savable(field))
+        with pytest.raises(ValueError, match=reason):
+            hj.save(tmp_path / "model.npz", field)
+    assert hj.check_savable(len).startswith("field must be an Equinox module")
     assert not list(tmp_path.iterdir())
 
 
