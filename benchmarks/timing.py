@@ -25,7 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import json_text, write_whole
+from hybrid_jax.io.files import json_text, write_atomic
 from hybrid_jax.runtime import PROGRAMS, configure, cores, hardware
 
 Call = Callable[[], Any]
@@ -185,7 +185,7 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     _print(findings, Console())
     if options.out is not None:
         report = _report(name, options.preset, findings, time.perf_counter() - began)
-        write_whole(options.out, json_text(report))
+        write_atomic(options.out, json_text(report))
         if findings.figure is not None:
             findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
             findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
