@@ -21,7 +21,8 @@ from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.networks.mlp import FusedNetwork, InputScaling, LinearResidual, LinearSkip, ResidualNetwork
+from hybrid_jax.networks.fused import FusedNetwork
+from hybrid_jax.networks.mlp import InputScaling, LinearResidual, LinearSkip, ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.networks.rotor_thrust import RotorThrust
 from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
