@@ -1,7 +1,7 @@
-"""Trajectories of a vector field under inputs that are held over each interval, by any diffrax solver.
+"""Trajectories of a vector field under inputs that are held over each interval, by any diffrax solver for ODEs.
 
-One long solve that looks its input up by time is silently wrong: a stage at the end of a step reads the next input.
-So an interval is a step of its own, with its input as `args`, and a `scan` goes over the intervals.
+A single solve that looks up its input by time would be wrong: a stage at the end of a step reads the next input. So
+each interval is a solver step of its own, with its input as `args`, and a `scan` goes over the intervals.
 """
 
 import dataclasses
@@ -13,16 +13,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_batch, train_batch
+from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 
 
-# A program is traced once for all stages of a step, not once for each; the compiler puts it in line again.
-_evaluate, _deploy = eqx.filter_jit(train_batch), eqx.filter_jit(infer_batch)
+# Traced once for all stages of a step, not once for each; the compiler inlines it again.
+_train, _infer = eqx.filter_jit(train_batch), eqx.filter_jit(infer_batch)
+_evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
 
 
 class RK4(diffrax.AbstractSolver):
@@ -59,7 +62,7 @@ def integrate(
     substeps: int = 1,
 ) -> Float[Array, "t d *b"]:
     """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
-    solver = _bounded(solver)
+    solver = _prepared(solver, jnp.result_type(x0))
     term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
     begin, end = 0.0, dt / substeps
     if isinstance(solver, diffrax.AbstractImplicitSolver):
@@ -88,12 +91,17 @@ def rk4_step(
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
 
 
-def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
-    """The solver with its stages in a loop of bounded length.
+def _prepared(solver: diffrax.AbstractSolver, dtype) -> diffrax.AbstractSolver:
+    """The solver with tolerances for its root finder, and with its stages in a loop of bounded length.
 
-    Diffrax's default, a checkpointed loop, compares shardings and refuses to be differentiated inside `shard_map`,
-    which is where the lanes of a sweep run.
+    Diffrax takes tolerances from an adaptive step size controller, which fixed steps have not. Its default, a
+    checkpointed loop, cannot be differentiated inside `shard_map`, where the runs of a sweep are.
     """
+    if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
+        tolerance = 1e-5 if jnp.finfo(dtype).bits < 64 else 1e-10
+        tolerances = tolerance, tolerance, optimistix.max_norm
+        found = eqx.tree_at(lambda finder: (finder.rtol, finder.atol, finder.norm), solver.root_finder, tolerances)
+        solver = eqx.tree_at(lambda solver: solver.root_finder, solver, found)
     if isinstance(solver, diffrax.AbstractRungeKutta) and solver.scan_kind is None:
         return dataclasses.replace(solver, scan_kind="bounded")
     return solver
@@ -107,13 +115,19 @@ def rollout(
     solver: diffrax.AbstractSolver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "t d"]:
-    """The trajectory of a field as deployed: x[i] is the state (i + 1) dt [s] after x0; u[i] is held until then.
+    """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input until then.
 
-    One that diverges goes on as infinity or NaN, here as in compiled code; `Model.predict` raises.
+    A trajectory that diverges continues as infinity or NaN, here as in compiled code; `Model.predict` raises.
+
+    Args:
+        dt: length of an interval [s].
+        solver: of diffrax, for ODEs; by default `RK4`.
+        substeps: solver steps of equal length in each interval.
 
     Raises:
         ValueError: an argument of the wrong shape or type, or, where its numbers are known, one that is not finite; dt
-            or substeps that are not positive; or a field that cannot take x0 and u, or returns no ẋ of the shape of x0.
+            or substeps that are not positive; a solver for other equations; or a field that does not accept x0 and u,
+            or does not return ẋ of the shape of x0.
     """
     x0, u, solver = checked(field, x0, u, dt, solver, substeps)
     return integrate(field, x0, u, dt, solver, substeps)
@@ -133,10 +147,10 @@ def rollout_batch(
         ValueError: as `rollout`.
     """
     x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
-    if isinstance(solver, diffrax.AbstractImplicitSolver):  # all windows at once would be one large system to it
+    if isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field):
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
-    states = integrate(lambda x, held: _deploy(field, x, held), columns, held, dt, solver, substeps)
+    states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, substeps)
     return jnp.moveaxis(states, -1, 0)
 
 
@@ -157,6 +171,8 @@ def checked(
     solver = RK4() if solver is None else solver
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
+    if solver.term_structure is not diffrax.AbstractTerm:
+        raise ValueError(f"solver must be one for ODEs; {type(solver).__name__} needs several terms or noise")
     slope = check_field(
         field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
     )
@@ -164,16 +180,16 @@ def checked(
 
 
 def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    """Shape and type of ẋ = field(x, u), for a state and an input of which nothing else is known.
+    """Shape and type of ẋ = field(x, u).
 
     Raises:
-        ValueError: the field cannot take them, or returns no ẋ of the shape of x.
+        ValueError: the field does not accept them, or does not return ẋ of the shape of x.
     """
     name = getattr(field, "__name__", type(field).__name__)
     given = f"a state {x.shape} and an input {u.shape}"
     try:
         slope = eqx.filter_eval_shape(field, x, u)
-    except Exception as error:  # the field may be anybody's code
+    except Exception as error:  # a user's code may raise anything
         said = f"{type(error).__name__}: {checks.first_line(error)}"
         raise ValueError(f"field: {name} does not take {given}: {said}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
@@ -190,12 +206,25 @@ def rollout_minibatch(
     solver: diffrax.AbstractSolver,
     substeps: int = 1,
 ) -> Float[Array, "t d b"]:
-    """The trajectories of a minibatch as in training, features first: each evaluation sees the whole minibatch."""
-    return integrate(lambda x, held: _evaluate(field, x, held), x0, u, dt, solver, substeps)
+    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
+
+    A field that is written for one sample is integrated samples first: to transpose its arrays in each evaluation
+    would cost up to half of the step.
+    """
+    coupled = isinstance(solver, diffrax.AbstractImplicitSolver) and batch_norms(field)  # one system of equations
+    apart = isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field)
+    if apart and not coupled:
+        alone = training_mode(field)
+
+        def one_window(x0, u):
+            return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
+
+        return over_samples(one_window)(x0, u)
+    return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
 
 
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
-    """The (state, input) pairs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
+    """The states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
     starts = jnp.concatenate([x0[None], x[:-1]])
     return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], -1) for a in (starts, u))
 

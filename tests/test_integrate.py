@@ -176,5 +176,5 @@ def test_along_pairs_each_input_with_the_state_it_found():
 
 
 def test_the_error_of_a_solver_by_name_says_where_the_names_are():
-    with pytest.raises(ValueError, match=r"`from hybrid_jax\.rollout import SOLVERS`, got 'rk4'"):
+    with pytest.raises(ValueError, match=r"one of diffrax or of hybrid_jax\.SOLVERS, got 'rk4'"):
         path_of("rk4")

@@ -51,13 +51,11 @@ class CommonField(AbstractVectorField):
         """What of ẋ is not f_p, from what the residual returned."""
         return apply_residual(self.body, x, self.steady.of_all + residual)
 
-
-@linearize.register
-def _(field: CommonField, x, u, dx, du):
-    alone, slope = linearize(field.body, x, u, dx, du)
-    more = linearize(field.residual, x, u, dx, du)
-    added, further = jvp_columns(field.acting, (x, more[0]), (dx, more[1]))
-    return field.share * alone + added, field.share * slope + further
+    def linearize(self, x, u, dx, du):
+        alone, slope = linearize(self.body, x, u, dx, du)
+        more = linearize(self.residual, x, u, dx, du)
+        added, further = jvp_columns(self.acting, (x, more[0]), (dx, more[1]))
+        return self.share * alone + added, self.share * slope + further
 
 
 @portable

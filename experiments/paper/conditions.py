@@ -13,8 +13,8 @@ from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.networks.views import restricted
 from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
@@ -25,7 +25,10 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
-FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # what f_d as a force and a torque is called in `restricted`
+FORCED = {
+    "wrench": "accelerations",
+    "rotors": "rotors",
+}  # the name for `make_residual` of f_d as a force and a torque
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
 
 
@@ -121,7 +124,7 @@ def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBo
 
 
 def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
-    return restricted(
+    return make_residual(
         key,
         inputs=config.residual_inputs,
         outputs=FORCED.get(config.residual_outputs, config.residual_outputs),

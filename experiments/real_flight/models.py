@@ -21,8 +21,8 @@ from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import restricted
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.channels import ChannelLoss, channels_from
@@ -70,7 +70,7 @@ def fresh(model: str, craft: Craft, recipe: Recipe, hidden: int, seeds: int) -> 
 
     def network(key: PRNGKeyArray) -> AbstractVectorField:
         seen: dict[str, Any] = {"inputs": "body_motion", "outputs": outputs, "norm": "none", "scaling": hover}
-        return zero_output(restricted(key, hidden=hidden, **seen))
+        return zero_output(make_residual(key, hidden=hidden, **seen))
 
     def build(seed):
         match model:

@@ -45,7 +45,7 @@ class Recipe:
         scratch: what is done with N windows of the target, from the nominal vehicle.
         physics: of the hybrid and of physics-only.
         learn: names of `multirotor.SHAPES` in place of the vehicle's own; none keeps those.
-        outputs: what a hybrid's network adds to; see `hybrid_jax.networks.views.restricted`.
+        outputs: what a hybrid's network adds to; see `hybrid_jax.networks.factory.make_residual`.
         position: how many times a simple baseline's error in position counts as 1. Position is the integral of velocity
             and says of the motion nothing else; where an estimator's two disagree, it would teach wrong accelerations.
         huber: from how many times a simple baseline's error on an error counts linearly.

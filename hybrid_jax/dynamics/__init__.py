@@ -1,0 +1,37 @@
+"""Vector fields ẋ = f(x, u) and the physics of a multirotor.
+
+`base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` and
+`multirotor` (with `terms`) the equations of motion, `disturbance` a constant disturbance, `baselines` reference models,
+and `vehicle_file` reads all of them from a TOML file.
+"""
+
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable, unfreeze
+from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
+from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
+from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, rigid_body
+from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics.vehicle_file import VehicleDescription, load_description
+
+__all__ = [
+    "AbstractVectorField",
+    "ConstantDisturbance",
+    "ForcedBody",
+    "Frozen",
+    "FrozenRates",
+    "HoldState",
+    "Hybrid",
+    "Multirotor",
+    "RigidBody",
+    "Terms",
+    "VehicleDescription",
+    "disturbed",
+    "load_description",
+    "multirotor",
+    "perturbed",
+    "rigid_body",
+    "trainable",
+    "unfreeze",
+    "with_disturbance",
+    "with_vehicle",
+]

@@ -1,29 +1,110 @@
-"""Vector fields ẋ = f(x, u): what a model is. Physics, a network, their sum and a user's own are all values of it.
+"""Vector fields ẋ = f(x, u). Physics, a network, their sum and a user's own module are all vector fields.
 
-A field is any Equinox module that maps one state x (d,) and one input u (m,) to ẋ (d,). Many samples are evaluated at
-once, features first: x (d, b), u (m, b); by `train_batch` in training, by `infer_batch` in deployment. Both do it
-by `vmap`, so a user writes code for one sample and is done. A field registers its own version when the batch means
-something to it (batch normalisation), or when its code, in terms of x[0], x[1], …, serves a batch as it stands and is
-twice as fast without the transposes.
+A field maps one state x (d,) and one input u (m,) to ẋ (d,). Any function or Equinox module of this signature will do.
+The functions below evaluate it on a batch, features first: x (d, b), u (m, b). They call the method of the same name
+of an `AbstractVectorField`, whose defaults serve code for one sample; a subclass overrides what it can do faster.
 """
 
 from abc import abstractmethod
-from functools import singledispatch
+from typing import ClassVar, Self
 
 import equinox as eqx
 import jax
 from jaxtyping import Array, Float
 
-Batch = Float[Array, "d b"]
+from hybrid_jax.dynamics.batching import (
+    AbstractInferenceOnly,
+    Batch,
+    RunningStats,
+    batch_norms,
+    moments_of,
+    over_samples,
+    training_mode,
+    with_moved_stats,
+)
+
 Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
 
 class AbstractVectorField(eqx.Module):
-    """ẋ = f(x, u) for one sample, as in deployment; every inexact array inside is learned (see `trainable`)."""
+    """ẋ = f(x, u). Every inexact array inside is learned (see `trainable`).
+
+    Attributes:
+        accepts_batch: whether `__call__` also accepts x (d, b) and u (m, b), for instance since it reads x[0], x[1], …
+    """
+
+    accepts_batch: ClassVar[bool] = False
 
     @abstractmethod
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        """The derivative of the state at state x under input u."""
+        """ẋ of one sample, in inference mode."""
+
+    def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
+        """See the function `train_batch`, as for the methods that follow."""
+        direct = self.accepts_batch and not batch_norms(self)
+        return self(x, u) if direct else over_samples(training_mode(self))(x, u)
+
+    def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
+        return self(x, u) if self.accepts_batch else over_samples(self)(x, u)
+
+    def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
+        return with_moved_stats(self, x, u)
+
+    def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
+        return residual
+
+    def linearize(self, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns):
+        return jvp_columns(self, (x, u), (dx, du))
+
+    def fuse_for_inference(self) -> "AbstractVectorField":
+        return self
+
+
+def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+    """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
+    if isinstance(field, AbstractVectorField):
+        return field.train_batch(x, u)
+    return over_samples(training_mode(field))(x, u)
+
+
+def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
+    """ẋ of many samples in inference mode."""
+    return field.infer_batch(x, u) if isinstance(field, AbstractVectorField) else over_samples(field)(x, u)
+
+
+def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
+    """The field after one training batch: running statistics move, learned parameters do not."""
+    own = isinstance(field, AbstractVectorField)
+    return field.update_running_stats(x, u) if own else with_moved_stats(field, x, u)
+
+
+def apply_residual(
+    field: AbstractVectorField, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]
+) -> Float[Array, " d *b"]:
+    """Map a residual ẋ onto the state derivative of this physics. Identity by default.
+
+    `Multirotor` also propagates residual forces to the position when it models the lag of a velocity estimator.
+    """
+    return field.apply_residual(x, residual) if isinstance(field, AbstractVectorField) else residual
+
+
+def linearize(
+    field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
+) -> tuple[Float[Array, " d"], Columns]:
+    """ẋ of one sample in inference mode, and its derivative along each pair of columns of dx (d, c) and du (m, c)."""
+    own = isinstance(field, AbstractVectorField)
+    return field.linearize(x, u, dx, du) if own else jvp_columns(field, (x, u), (dx, du))
+
+
+def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
+    """The same map in inference mode, in a layout that is faster for few samples at a time. Identity by default."""
+    return field.fuse_for_inference() if isinstance(field, AbstractVectorField) else field
+
+
+def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
+    """`function(*values)` and its derivatives along the columns of `columns`: shapes (e,) and (e, c)."""
+    value, slope = jax.linearize(function, *values)
+    return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
 
 
 class Hybrid(AbstractVectorField):
@@ -35,14 +116,63 @@ class Hybrid(AbstractVectorField):
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
         return self.physics(x, u) + apply_residual(self.physics, x, self.residual(x, u))
 
+    def train_batch(self, x, u):
+        return train_batch(self.physics, x, u) + apply_residual(self.physics, x, train_batch(self.residual, x, u))
 
-class Frozen(AbstractVectorField):
-    """A field that training leaves as it is: no parameter and no running statistic moves (see `unfreeze`)."""
+    def infer_batch(self, x, u):
+        return infer_batch(self.physics, x, u) + apply_residual(self.physics, x, infer_batch(self.residual, x, u))
+
+    def update_running_stats(self, x, u):
+        return Hybrid(update_running_stats(self.physics, x, u), update_running_stats(self.residual, x, u))
+
+    def apply_residual(self, x, residual):
+        return apply_residual(self.physics, x, residual)
+
+    def linearize(self, x, u, dx, du):
+        physics, d_physics = linearize(self.physics, x, u, dx, du)
+        values, columns = zip((x, dx), linearize(self.residual, x, u, dx, du), strict=True)
+        added, d_added = jvp_columns(self.apply_residual, values, columns)
+        return physics + added, d_physics + d_added
+
+    def fuse_for_inference(self):
+        return Hybrid(fuse_for_inference(self.physics), fuse_for_inference(self.residual))
+
+
+class Frozen(AbstractVectorField, AbstractInferenceOnly):
+    """A field in inference mode that training does not change: neither parameters nor running statistics move."""
 
     field: AbstractVectorField
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
         return self.field(x, u)
+
+    def train_batch(self, x, u):
+        return infer_batch(self.field, x, u)
+
+    def infer_batch(self, x, u):
+        return infer_batch(self.field, x, u)
+
+    def update_running_stats(self, x, u):
+        return self
+
+    def apply_residual(self, x, residual):
+        return apply_residual(self.field, x, residual)
+
+    def linearize(self, x, u, dx, du):
+        return linearize(self.field, x, u, dx, du)
+
+    def fuse_for_inference(self):
+        return fuse_for_inference(self.field)
+
+
+def features_first(field: AbstractVectorField) -> bool:
+    """Whether some part of a sum has a batched form, so that the batch is best kept on the last axis."""
+    match field:
+        case Hybrid():
+            return features_first(field.physics) or features_first(field.residual)
+        case Frozen():
+            return features_first(field.field)
+    return getattr(field, "accepts_batch", False)
 
 
 def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
@@ -52,119 +182,6 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
         return isinstance(node, Frozen)
 
     return jax.tree.map(lambda node: unfreeze(node.field) if frozen(node) else node, field, is_leaf=frozen)
-
-
-@singledispatch
-def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
-    """ẋ on a minibatch, as in training: features first, one column a sample."""
-    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
-
-
-@train_batch.register
-def _(field: Hybrid, x, u):
-    return train_batch(field.physics, x, u) + apply_residual(field.physics, x, train_batch(field.residual, x, u))
-
-
-@singledispatch
-def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
-    """ẋ of many samples, each as in deployment: features first, one column a sample."""
-    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
-
-
-@infer_batch.register
-def _(field: Hybrid, x, u):
-    return infer_batch(field.physics, x, u) + apply_residual(field.physics, x, infer_batch(field.residual, x, u))
-
-
-@infer_batch.register
-def _(field: Frozen, x, u):
-    return infer_batch(field.field, x, u)
-
-
-@singledispatch
-def apply_residual(
-    field: AbstractVectorField, x: Float[Array, " d *b"], more: Float[Array, " d *b"]
-) -> Float[Array, " d *b"]:
-    """What another field's derivative at x adds when it acts on what this field describes: itself, unless a force shows
-    in more than an acceleration, as where an estimator is slow to see it (`multirotor`).
-    """
-    return more
-
-
-@apply_residual.register
-def _(field: Hybrid, x, more):
-    return apply_residual(field.physics, x, more)
-
-
-@apply_residual.register
-def _(field: Frozen, x, more):
-    return apply_residual(field.field, x, more)
-
-
-def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
-    """The value of a function of some vectors, and its derivative in each direction of which they have a column."""
-    value, slope = jax.linearize(function, *values)
-    return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
-
-
-@singledispatch
-def linearize(
-    field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
-) -> tuple[Float[Array, " d"], Columns]:
-    """ẋ of one sample as in deployment, and its derivative in the directions dx (d, c), du (m, c): a pair of columns
-    for each. A field that knows a shorter way than one direction after the other registers its own.
-    """
-    return jvp_columns(field, (x, u), (dx, du))
-
-
-@linearize.register
-def _(field: Hybrid, x, u, dx, du):
-    alone, slope = linearize(field.physics, x, u, dx, du)
-    more = linearize(field.residual, x, u, dx, du)
-    added, further = jvp_columns(lambda x, more: apply_residual(field.physics, x, more), (x, more[0]), (dx, more[1]))
-    return alone + added, slope + further
-
-
-@linearize.register
-def _(field: Frozen, x, u, dx, du):
-    return linearize(field.field, x, u, dx, du)
-
-
-@singledispatch
-def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
-    """The same map as in deployment, laid out to be asked for few samples at a time, hundreds of times in a row.
-
-    The field itself, unless a faster one is registered.
-    """
-    return field
-
-
-@fuse_for_inference.register
-def _(field: Hybrid):
-    return Hybrid(fuse_for_inference(field.physics), fuse_for_inference(field.residual))
-
-
-@fuse_for_inference.register
-def _(field: Frozen):
-    return fuse_for_inference(field.field)
-
-
-@singledispatch
-def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
-    """The field after it has seen a training batch: running statistics move, learned parameters do not."""
-    return field
-
-
-@update_running_stats.register
-def _(field: Hybrid, x, u):
-    return Hybrid(update_running_stats(field.physics, x, u), update_running_stats(field.residual, x, u))
-
-
-class RunningStats(eqx.Module):
-    """Running mean and variance of hidden units: state that training observes and the optimiser leaves alone."""
-
-    mean: Float[Array, " h"]
-    variance: Float[Array, " h"]
 
 
 def trainable(field: AbstractVectorField) -> AbstractVectorField:
@@ -177,3 +194,26 @@ def trainable(field: AbstractVectorField) -> AbstractVectorField:
         return False if fixed(node) else eqx.is_inexact_array(node)
 
     return jax.tree.map(leaves, field, is_leaf=fixed)
+
+
+def check_batch_norm(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> None:
+    """Refuse a field whose batch normalisation would be trained, but whose running statistics could not be.
+
+    Args:
+        x, u: any samples, such as the starts of two windows.
+
+    Raises:
+        ValueError: the field does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
+    """
+    if _is_wrapped(field) and any(bool((seen[0] == 0).any()) for seen in moments_of(field, x, u)):
+        raise ValueError(
+            f"field: {type(field).__name__} holds a BatchNorm whose minibatch statistics cannot be recorded, as under "
+            "stop_gradient or jax.grad; use norm='layer' or 'none', or wrap it in Frozen"
+        )
+
+
+def _is_wrapped(field) -> bool:
+    """Whether a module of which the library knows nothing stands around a batch normalisation."""
+    if getattr(type(field), "update_running_stats", None) in (None, AbstractVectorField.update_running_stats):
+        return bool(batch_norms(field))
+    return any(_is_wrapped(part) for part in vars(field).values() if isinstance(part, AbstractVectorField))

@@ -9,13 +9,15 @@ taught by plenty of flight would forget some of it:
 Whether there is such a push the windows tell as well: see `disturbance_fit.fit_with_selected_disturbance`.
 """
 
+from typing import ClassVar
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 SIZE = STATE_SIZE - VELOCITY.start
@@ -29,6 +31,8 @@ class ConstantDisturbance(AbstractVectorField):
     Attributes:
         acceleration: a [m/s², world] and α [rad/s², body].
     """
+
+    accepts_batch: ClassVar[bool] = True
 
     acceleration: Float[Array, "6"]
 
@@ -56,9 +60,3 @@ def with_disturbance(field: Hybrid) -> Hybrid:
         raise ValueError(f"field must be a Hybrid, got {checks.short_repr(field)}")
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(field.physics, eqx.is_inexact_array)))
     return Hybrid(disturbed(field.physics, jnp.zeros(SIZE, jnp.result_type(*dtypes, jnp.float32))), field.residual)
-
-
-@train_batch.register(ConstantDisturbance)
-@infer_batch.register(ConstantDisturbance)
-def _(field, x, u):
-    return field(x, u)

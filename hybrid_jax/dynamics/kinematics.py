@@ -1,10 +1,12 @@
 """Kinematics of a free body: the part of ẋ that holds without any knowledge of forces."""
 
+from typing import ClassVar
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 
 
@@ -14,12 +16,8 @@ class Kinematics(AbstractVectorField):
     x (13,) and u (4,) may have trailing batch axes.
     """
 
+    accepts_batch: ClassVar[bool] = True
+
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         accelerations = jnp.zeros((6, *x.shape[1:]), x.dtype)
         return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), accelerations])
-
-
-@train_batch.register(Kinematics)
-@infer_batch.register(Kinematics)
-def kinematics_batch(field, x, u):
-    return field(x, u)

@@ -21,16 +21,16 @@ would start each window unknown, and a window is about as long as the lag. A log
 `hybrid_jax.flights.rotor_lag`.
 """
 
+from collections.abc import Callable
 from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.dynamics.base import apply_residual, infer_batch, train_batch
-from hybrid_jax.dynamics.rigid_body import LEARNED, AbstractRigidBody, euler
+from hybrid_jax.dynamics.rigid_body import LEARNED, AbstractRigidBody, euler, evaluate_columns
 from hybrid_jax.dynamics.terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -54,6 +54,8 @@ class Multirotor(AbstractRigidBody):
     Raises:
         ValueError: parameters of another name, k beside k_rotors, or no vehicle or terms.
     """
+
+    accepts_batch: ClassVar[bool] = True
 
     deviations: dict[str, Float[Array, "..."]]
     vehicle: Vehicle = eqx.field(static=True)
@@ -81,18 +83,26 @@ class Multirotor(AbstractRigidBody):
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         return self.of_rows(self.entries(), tuple(x), tuple(u))
 
+    def train_batch(self, x, u):
+        return evaluate_columns(self.of_rows, self.entries(), x, u)
+
+    def apply_residual(self, x, residual):
+        """A residual force, too, moves the position before the log's velocity has seen it."""
+        lag = _constants(self.vehicle, self.terms, self.entries())["velocity_lag"]
+        if not _is_present(lag):
+            return residual
+        attitude = _matrix(tuple(x[QUATERNION]))
+        across = [_dot(column, tuple(residual[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
+        return jnp.concatenate([residual[POSITION] + lag[0] * _in_world(attitude, across), residual[POSITION.stop :]])
+
     def entries(self) -> dict[str, Rows]:
         """θ_p number by number."""
         return {name: tuple(jnp.ravel(value)) for name, value in self.theta().items()}
 
-    def of_rows(self, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-        """ẋ from θ_p, x and u entry by entry, so that nothing is put together to be taken apart again."""
-        return _derivative(self.vehicle, self.constants(theta), x, u)
-
-    def constants(self, theta: dict[str, Rows]) -> Constants:
-        """Everything in `SHAPES`, number by number: of θ_p what is learned, nominal what is known."""
-        known = nominal_values(self.vehicle, self.terms)
-        return {name: theta.get(name, known[name]) for name in SHAPES}
+    @property
+    def of_rows(self) -> Callable[[dict[str, Rows], Rows, Rows], Float[Array, " 13 *b"]]:
+        """ẋ as a function of the entries of θ_p, x and u, which it reads one by one without putting them together."""
+        return partial(_of_rows, self.vehicle, self.terms)
 
 
 def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
@@ -119,7 +129,14 @@ def with_vehicle(field: Multirotor, vehicle: Vehicle) -> Multirotor:
     return Multirotor({name: deviation(name, value) for name, value in field.theta().items()}, vehicle, field.terms)
 
 
-def _derivative(vehicle: Vehicle, constants: Constants, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+def _constants(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows]) -> Constants:
+    """Everything in `SHAPES`: the learned value where there is one, else the nominal one."""
+    known = nominal_values(vehicle, terms)
+    return {name: theta.get(name, known[name]) for name in SHAPES}
+
+
+def _of_rows(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+    constants = _constants(vehicle, terms, theta)
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
@@ -205,48 +222,3 @@ def _dot(a, b) -> Array:
 def _is_present(term, absent: float = 0.0) -> bool:
     """Whether a term is learned, or known and does something."""
     return any(not isinstance(number, float) or number != absent for number in term)
-
-
-@apply_residual.register
-def _(field: Multirotor, x, more):
-    """A force beside those of physics, too, moves the position before the log's velocity has seen it."""
-    lag = field.constants(field.entries())["velocity_lag"]
-    if not _is_present(lag):
-        return more
-    attitude = _matrix(tuple(x[QUATERNION]))
-    across = [_dot(column, tuple(more[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
-    return jnp.concatenate([more[POSITION] + lag[0] * _in_world(attitude, across), more[POSITION.stop :]])
-
-
-@infer_batch.register
-def _(field: Multirotor, x, u):
-    return field(x, u)
-
-
-@train_batch.register
-def _(field: Multirotor, x, u):
-    return _columns(field, x, u)
-
-
-@jax.custom_vjp
-def _columns(field: Multirotor, x: Float[Array, "13 b"], u: Float[Array, "4 b"]) -> Float[Array, "13 b"]:
-    """The field on a minibatch; x and u alone are kept, and each parameter is summed once, as in rigid_body.py."""
-    return field(x, u)
-
-
-def _columns_forward(field, x, u):
-    return field(x, u), (field, x, u)
-
-
-def _columns_backward(saved, d_derivative: Float[Array, "13 b"]):
-    field, x, u = saved
-    theta, to_deviations = jax.vjp(Multirotor.entries, field)
-    own = jax.tree.map(lambda number: jnp.broadcast_to(number, x.shape[1:]), theta)  # one for each column
-    d_own, d_x, d_u = jax.vjp(partial(Multirotor.of_rows, field), own, tuple(x), tuple(u))[1](d_derivative)
-    leaves, structure = jax.tree.flatten(d_own)
-    if leaves:
-        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype))
-    return *to_deviations(jax.tree.unflatten(structure, leaves)), jnp.stack(d_x), jnp.stack(d_u)
-
-
-_columns.defvjp(_columns_forward, _columns_backward)

@@ -1,15 +1,19 @@
 """f_p: the Newton–Euler equations of a quadrotor with unknown Ix, Iy and k (paper, Eq. 10)."""
 
 from abc import abstractmethod
+from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -39,6 +43,8 @@ class RigidBody(AbstractRigidBody):
         ValueError: other parameters than Ix, Iy, k, or no vehicle.
     """
 
+    accepts_batch: ClassVar[bool] = True
+
     log_ratios: dict[str, Float[Array, ""]]
     vehicle: Vehicle = eqx.field(static=True)
 
@@ -54,6 +60,9 @@ class RigidBody(AbstractRigidBody):
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         return self.of_rows(tuple(x), tuple(u))
+
+    def train_batch(self, x, u):
+        return evaluate_columns(RigidBody.of_rows, self, x, u)
 
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
         """ẋ from the entries of x and u one by one, so that nothing is put together to be taken apart again."""
@@ -80,10 +89,8 @@ class ForcedBody(RigidBody):
         easier = [jnp.exp(-self.log_ratios[name]) for name in ("Ix", "Iy")]
         return jnp.ones(STATE_SIZE, jnp.result_type(*easier)).at[BODY_RATES.start : -1].set(jnp.stack(easier))
 
-
-@apply_residual.register
-def _(field: ForcedBody, x, more):
-    return jnp.reshape(field.yielding(), (-1,) + (1,) * (more.ndim - 1)) * more
+    def apply_residual(self, x, residual):
+        return expand_trailing(self.yielding(), residual) * residual
 
 
 def rigid_body(vehicle: Vehicle) -> RigidBody:
@@ -150,37 +157,33 @@ def euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     )
 
 
-@infer_batch.register
-def _(field: RigidBody, x, u):
-    return field(x, u)
-
-
-@train_batch.register
-def _(field: RigidBody, x, u):
-    return _columns(field, x, u)
-
-
-@jax.custom_vjp
-def _columns(field: RigidBody, x: Float[Array, "13 b"], u: Float[Array, "4 b"]) -> Float[Array, "13 b"]:
-    """The field on a minibatch.
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def evaluate_columns(
+    of_rows: Callable[[PyTree, Rows, Rows], Float[Array, "13 b"]],
+    theta: PyTree,
+    x: Float[Array, "13 b"],
+    u: Float[Array, "4 b"],
+) -> Float[Array, "13 b"]:
+    """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
 
     Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over
     the minibatch once for each place where it stands. Here x and u are kept, and each parameter is summed once.
     """
-    return field(x, u)
+    return of_rows(theta, tuple(x), tuple(u))
 
 
-def _columns_forward(field, x, u):
-    return field(x, u), (field, x, u)
+def _columns_forward(of_rows, theta, x, u):
+    return of_rows(theta, tuple(x), tuple(u)), (theta, x, u)
 
 
-def _columns_backward(saved, d_derivative: Float[Array, "13 b"]):
-    field, x, u = saved
-    own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), field)  # one for each column
-    d_field, d_x, d_u = jax.vjp(RigidBody.of_rows, own, tuple(x), tuple(u))[1](d_derivative)
-    leaves, structure = jax.tree.flatten(d_field)
-    sums = jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype)
-    return jax.tree.unflatten(structure, tuple(sums)), jnp.stack(d_x), jnp.stack(d_u)
+def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
+    theta, x, u = saved
+    own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), theta)  # one for each column
+    d_own, d_x, d_u = jax.vjp(of_rows, own, tuple(x), tuple(u))[1](d_derivative)
+    leaves, structure = jax.tree.flatten(d_own)
+    if leaves:
+        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype))
+    return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
 
 
-_columns.defvjp(_columns_forward, _columns_backward)
+evaluate_columns.defvjp(_columns_forward, _columns_backward)

@@ -10,7 +10,8 @@ from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.networks.mlp import FusedNetwork, InputScaling, LinearResidual, LinearSkip, ResidualNetwork
+from hybrid_jax.networks.fused import FusedNetwork
+from hybrid_jax.networks.mlp import InputScaling, LinearResidual, LinearSkip, ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.networks.rotor_thrust import RotorThrust
 from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion

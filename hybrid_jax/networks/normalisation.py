@@ -1,58 +1,66 @@
-"""What is done to hidden units before the ReLU: batch normalisation (paper, App. A.1), layer normalisation, a bias.
+"""Normalisation of hidden units before the ReLU: batch normalisation (paper, App. A.1), layer normalisation, a bias.
 
-Layer normalisation, or none, stands in for batch normalisation where a network should be the same map in training and
-in deployment.
+With layer normalisation or none, a network is the same map in training and in inference.
 """
 
 from abc import abstractmethod
 from functools import reduce
+from typing import Self
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import Batch, RunningStats
+from hybrid_jax.dynamics.batching import (
+    SAMPLES,
+    AbstractBatchNorm,
+    Batch,
+    Moments,
+    RunningStats,
+    expand_trailing,
+    record,
+)
 from hybrid_jax.networks.batchnorm_vjp import normalised_layer, row_means
 
-FEW = 2  # inputs
+UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
 
 
-class Normalisation(eqx.Module):
-    """What is done to the hidden pre-activations h = W z before the ReLU."""
-
-    @abstractmethod
-    def deployed(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The normalised W z of each sample, as in deployment."""
+class AbstractNorm(eqx.Module):
+    """Normalisation of the hidden pre-activations h = W z before the ReLU."""
 
     @abstractmethod
-    def layers(
+    def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
+        """The normalised W z of each sample in inference mode."""
+
+    def train_layers(
         self, weight_in: Float[Array, "h m"], weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], z: Batch
     ) -> Batch:
-        """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b), as in training."""
+        """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
+        return affine(weight_out, bias_out, jax.nn.relu(self.infer(weight_in, z)))
 
-    @abstractmethod
-    def observed(self, hidden: Float[Array, "h b"]) -> "Normalisation":
-        """This after it has seen the pre-activations of a training batch."""
+    def observed(self, hidden: Float[Array, "h b"]) -> Self:
+        """This after the pre-activations of a training batch."""
+        return self
 
 
-class AffineNorm(Normalisation):
-    """One that is an affine map of z as deployed, which weights can hold."""
+class AbstractAffineNorm(AbstractNorm):
+    """A normalisation that is an affine map of z in inference mode, so that weights can hold it."""
 
     @abstractmethod
     def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
-        """(W', c) such that W' z + c is the normalised W z, as deployed."""
+        """(W', c) such that W' z + c is the normalised W z in inference mode."""
 
-    def deployed(self, weight, z):
+    def infer(self, weight, z):
         weight, bias = self.fold(weight)
         hidden = product(weight, z)
-        return hidden + beside(bias, hidden)
+        return hidden + expand_trailing(bias, hidden)
 
 
-class BatchNorm(AffineNorm):
+class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
-    In training by the minibatch's mean and variance, in deployment by running ones, which fold into a map of z.
+    In training by the minibatch's mean and variance, in inference by running ones, which fold into a map of z.
     """
 
     gain: Float[Array, " h"]
@@ -65,38 +73,54 @@ class BatchNorm(AffineNorm):
         scale = self.gain * jax.lax.rsqrt(self.running.variance + self.epsilon)
         return weight * scale[:, None], self.shift - scale * self.running.mean
 
-    def layers(self, weight_in, weight_out, bias_out, z):
+    def train_layers(self, weight_in, weight_out, bias_out, z):
         return normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
     def observed(self, hidden):
-        """The running statistics moved towards the batch's by the momentum."""
         mean = row_means(hidden)
-        batch = RunningStats(mean, row_means(jnp.square(hidden - mean[:, None])))
-        running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
-        return eqx.tree_at(lambda norm: norm.running, self, running)
+        return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
+
+    def training_mode(self, seen):
+        return MinibatchNorm(self.gain, self.shift, seen, self.epsilon)
 
 
-class LayerNorm(Normalisation):
+class MinibatchNorm(AbstractNorm):
+    """`BatchNorm` in training mode for one sample of a minibatch under `vmap`; see `batching`."""
+
+    gain: Float[Array, " h"]
+    shift: Float[Array, " h"]
+    seen: Moments
+    epsilon: float = eqx.field(static=True)
+
+    def infer(self, weight, z):
+        hidden = product(weight, z)
+        mean, centred = self._centred(hidden)
+        variance, _ = self._centred(jnp.square(centred))
+        hidden = record(centred, self.seen, jnp.stack([jnp.ones_like(mean), mean, variance]))
+        scale = self.gain * jax.lax.rsqrt(variance + self.epsilon)
+        return expand_trailing(scale, hidden) * hidden + expand_trailing(self.shift, hidden)
+
+    def _centred(self, hidden):
+        """The mean over the minibatch and all axes of the sample but the first, and what exceeds it."""
+        mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
+        return mean, hidden - expand_trailing(mean, hidden)
+
+
+class LayerNorm(AbstractNorm):
     """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016)."""
 
     gain: Float[Array, " h"]
     shift: Float[Array, " h"]
     epsilon: float = eqx.field(static=True, default=1e-5)
 
-    def deployed(self, weight, z):
+    def infer(self, weight, z):
         hidden = weight @ z
         centred = hidden - jnp.mean(hidden, axis=0)
         normal = centred * jax.lax.rsqrt(jnp.mean(jnp.square(centred), axis=0) + self.epsilon)
-        return beside(self.gain, normal) * normal + beside(self.shift, normal)
-
-    def layers(self, weight_in, weight_out, bias_out, z):
-        return output_layer(weight_out, bias_out, self.deployed(weight_in, z))
-
-    def observed(self, hidden):
-        return self
+        return expand_trailing(self.gain, normal) * normal + expand_trailing(self.shift, normal)
 
 
-class Bias(AffineNorm):
+class Bias(AbstractAffineNorm):
     """No normalisation: the pre-activations plus a bias, as in a plain linear layer."""
 
     shift: Float[Array, " h"]
@@ -104,26 +128,15 @@ class Bias(AffineNorm):
     def fold(self, weight):
         return weight, self.shift
 
-    def layers(self, weight_in, weight_out, bias_out, z):
-        return output_layer(weight_out, bias_out, self.deployed(weight_in, z))
 
-    def observed(self, hidden):
-        return self
-
-
-def output_layer(weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], hidden: Float[Array, "h b"]) -> Batch:
-    """W₂ relu(h) + b₂ for each column."""
-    active = jax.nn.relu(hidden)
-    return weight_out @ active + beside(bias_out, active)
+def affine(weight: Float[Array, "d h"], bias: Float[Array, " d"], z: Float[Array, " h *b"]) -> Float[Array, " d *b"]:
+    """W z + b of each sample."""
+    out = weight @ z
+    return out + expand_trailing(bias, out)
 
 
 def product(weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-    """W z of each sample; of one or two inputs as a sum, for on a CPU a product of matrices costs more to begin."""
-    if len(z) > FEW:
+    """W z of each sample."""
+    if len(z) > UNROLLED_INPUTS:
         return weight @ z
-    return reduce(jnp.add, (beside(column, row[None]) * row for column, row in zip(weight.T, z, strict=True)))
-
-
-def beside(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
-    """The values shaped so that they are the same for each column of rows, or for one sample."""
-    return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))
+    return reduce(jnp.add, (expand_trailing(column, z) * row for column, row in zip(weight.T, z, strict=True)))

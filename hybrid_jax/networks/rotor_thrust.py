@@ -1,8 +1,10 @@
-"""What each rotor pushes more than k u²: one network that all of them share, at places that are known.
+"""Thrust of each rotor beyond k u², by one network that all rotors share.
 
-Near the ground a rotor pushes more, and more on the side that is nearer: a force and a torque at once. Learned of the
-rotor, where it acts is told by the vehicle, and every rotor's flight teaches all four.
+Near the ground the rotors have more thrust, and those that are nearer have most: a force and a torque at once. The
+vehicle's geometry says where each thrust acts, so that data of every rotor train the same function.
 """
+
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -10,14 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.dynamics.base import (
-    AbstractVectorField,
-    fuse_for_inference,
-    infer_batch,
-    jvp_columns,
-    linearize,
-    train_batch,
-)
+from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, jvp_columns
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -25,18 +20,18 @@ from hybrid_jax.vehicle import Vehicle
 class RotorThrust(AbstractVectorField):
     """v̇ and ω̇ of a thrust k uᵢ² f(R / hᵢ, uᵢ) of each rotor along the body's z axis, k and inertia the nominal ones.
 
-    By dimension, the share by which the ground changes a rotor's thrust in hover is a function of its radius R over its
-    altitude h (Cheeseman and Bennett 1955); which one is learned. The other derivatives are exactly zero.
-
-    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+    By dimensional analysis, the ground effect on a rotor in hover is a function of its radius R over its altitude h
+    (Cheeseman and Bennett 1955). That function is learned. The other derivatives are exactly zero.
 
     Attributes:
-        field: f, of one state and one input; a batch means nothing to it, and it returns one number.
-        vehicle: whose rotors they are.
+        field: f, from one state and one input to one number, without batch normalisation.
+        vehicle: provides rotor positions, radius, and nominal constants.
 
     Raises:
-        ValueError: nothing is known of the rotors' radius.
+        ValueError: the vehicle's rotor radius is unknown.
     """
+
+    accepts_batch: ClassVar[bool] = True
 
     field: AbstractVectorField
     vehicle: Vehicle = eqx.field(static=True)
@@ -46,6 +41,17 @@ class RotorThrust(AbstractVectorField):
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         return self.write(x, u, self.share(self.read(x), u))
+
+    def fuse_for_inference(self):
+        return RotorThrust(fuse_for_inference(self.field), self.vehicle)
+
+    def linearize(self, x, u, dx, du):
+        """Two derivatives of the network for each rotor, whatever the number of directions."""
+        near, d_near = jvp_columns(self.read, (x,), (dx,))
+        share, pullback = jax.vjp(self.share, near, u)
+        by_near, by_u = pullback(jnp.ones_like(share))
+        d_share = by_near[:, None] * d_near + by_u[:, None] * du
+        return jvp_columns(self.write, (x, u, share), (dx, du, d_share))
 
     def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " 4 *b"]:
         """R / h of each rotor."""
@@ -58,7 +64,7 @@ class RotorThrust(AbstractVectorField):
     def write(
         self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"], share: Float[Array, " 4 *b"]
     ) -> Float[Array, " 13 *b"]:
-        """ẋ from the share of k u² that each rotor pushes more."""
+        """ẋ from the additional thrust of each rotor, as a share of k u²."""
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
         torque_x, torque_y = (
@@ -72,7 +78,7 @@ class RotorThrust(AbstractVectorField):
 
 
 def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
-    """R / h of each rotor, h at least R / 2: nothing is flown below.
+    """R / h of each rotor, h at least R / 2.
 
     Args:
         altitude: of the body [m].
@@ -80,24 +86,3 @@ def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: V
     """
     heights = jnp.stack([altitude + x * up[0] + y * up[1] for x, y in vehicle.rotor_positions])
     return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)
-
-
-@train_batch.register(RotorThrust)
-@infer_batch.register(RotorThrust)
-def _(field, x, u):
-    return field(x, u)
-
-
-@fuse_for_inference.register
-def _(field: RotorThrust):
-    return RotorThrust(fuse_for_inference(field.field), field.vehicle)
-
-
-@linearize.register
-def _(field: RotorThrust, x, u, dx, du):
-    """Each rotor asks the network for two derivatives, whatever the number of directions."""
-    near, nearing = jvp_columns(field.read, (x,), (dx,))
-    share, pulled = jax.vjp(field.share, near, u)
-    by_near, by_u = pulled(jnp.ones_like(share))
-    sharing = by_near[:, None] * nearing + by_u[:, None] * du
-    return jvp_columns(field.write, (x, u, share), (dx, du, sharing))

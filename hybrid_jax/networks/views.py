@@ -1,26 +1,21 @@
-"""What a multirotor's residual may read of the state and what it may write: views around any network.
+"""Views restrict what a multirotor's residual reads of the state and which derivatives it returns.
 
-A view is a vector field that hands features of x to the field inside and turns its answer into ẋ. Views nest: the outer
-one chooses what is read, the inner one what is written. What is not read cannot be overfitted: drag knows no place, and
-neither drag nor ground effect knows north. What is not written stays physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact;
-in a log, where an estimator's p and v disagree, or a gyro has a bias, they need not be (see `Motion`).
-
-The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+A view is a vector field around another one: it passes features of x to it and maps its output to ẋ. Views nest: the
+outer one selects the inputs, the inner one the outputs. A network cannot overfit an input that it does not read: drag
+is independent of position, and drag and ground effect of yaw. Derivatives that it does not return remain those of the
+physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for the estimates in a log (see `Motion`).
 """
 
 from abc import abstractmethod
-from collections.abc import Callable
-from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import (
     AbstractVectorField,
-    Hybrid,
     fuse_for_inference,
     infer_batch,
     jvp_columns,
@@ -28,22 +23,23 @@ from hybrid_jax.dynamics.base import (
     train_batch,
     update_running_stats,
 )
-from hybrid_jax.networks.mlp import InputScaling, LinearSkip, residual_network, zero_output
-from hybrid_jax.networks.rotor_thrust import RotorThrust, nearness
-from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.networks.rotor_thrust import nearness
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 Features = Float[Array, " n *b"]
 
 
-class View(AbstractVectorField):
+class AbstractView(AbstractVectorField):
     """ẋ = write(x, f(read(x), u)) for the field f inside."""
+
+    accepts_batch: ClassVar[bool] = True
 
     field: eqx.AbstractVar[AbstractVectorField]
 
     @abstractmethod
     def read(self, x: Float[Array, " d *b"]) -> Features:
-        """What the field inside sees of the state."""
+        """The features of the state that the field inside reads."""
 
     @abstractmethod
     def write(self, x: Float[Array, " d *b"], inside: Features) -> Features:
@@ -52,9 +48,26 @@ class View(AbstractVectorField):
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " 13"]:
         return self.write(x, self.field(self.read(x), u))
 
+    def train_batch(self, x, u):
+        return self.write(x, train_batch(self.field, self.read(x), u))
 
-class DropXY(View):
-    """Blind to p_x and p_y: the field inside reads [p_z, q, v, ω] (11)."""
+    def infer_batch(self, x, u):
+        return self.write(x, infer_batch(self.field, self.read(x), u))
+
+    def update_running_stats(self, x, u):
+        return eqx.tree_at(lambda view: view.field, self, update_running_stats(self.field, self.read(x), u))
+
+    def linearize(self, x, u, dx, du):
+        features, d_features = jvp_columns(self.read, (x,), (dx,))
+        inside, d_inside = linearize(self.field, features, u, d_features, du)
+        return jvp_columns(self.write, (x, inside), (dx, d_inside))
+
+    def fuse_for_inference(self):
+        return eqx.tree_at(lambda view: view.field, self, fuse_for_inference(self.field))
+
+
+class DropXY(AbstractView):
+    """Invariant to p_x and p_y: the field inside reads [p_z, q, v, ω] (11)."""
 
     field: AbstractVectorField
 
@@ -65,11 +78,11 @@ class DropXY(View):
         return inside
 
 
-class DropXYYaw(View):
-    """Blind to p_x, p_y and yaw, in the axes of the world: a wind keeps its direction, whichever way the nose points.
+class DropXYYaw(AbstractView):
+    """Without p_x, p_y and yaw, but in world axes, in which a wind keeps its direction when the vehicle yaws.
 
-    The field inside reads p_z [m], the direction of the world's up in the body, Rᵀe_z (3), the velocity [m/s, world]
-    and the body rates [rad/s] (10); what it returns is ẋ as it stands.
+    The field inside reads p_z [m], the world's up in the body frame Rᵀe_z (3), the velocity [m/s, world] and the body
+    rates [rad/s] (10), and returns ẋ.
     """
 
     field: AbstractVectorField
@@ -82,17 +95,17 @@ class DropXYYaw(View):
         return inside
 
 
-class GroundDistance(View):
-    """`DropXYYaw` that also feels the ground: after p_z the field inside reads R / h of each rotor (14).
+class GroundDistance(AbstractView):
+    """`DropXYYaw` with the distance to the ground: after p_z the field inside reads R / h of each rotor (14).
 
-    What the ground does to a rotor falls with its altitude h over its radius R (Cheeseman and Bennett 1955): in R / h
-    it is nearly a line, in p_z a cliff, which moves as the vehicle tilts.
+    The ground effect on a rotor is nearly linear in its radius R over its altitude h (Cheeseman and Bennett 1955). As a
+    function of p_z it is steep and depends on the tilt.
 
     Attributes:
-        vehicle: whose rotors they are.
+        vehicle: provides rotor positions and radius.
 
     Raises:
-        ValueError: nothing is known of the rotors' radius.
+        ValueError: the vehicle's rotor radius is unknown.
     """
 
     field: AbstractVectorField
@@ -109,12 +122,11 @@ class GroundDistance(View):
         return inside
 
 
-class BodyFrame(View):
-    """Blind to p_x, p_y and yaw: all is seen from the body, and turned into the world afterwards.
+class BodyFrame(AbstractView):
+    """Equivariant to translation in x and y and to yaw: inputs and outputs are in the body frame.
 
     The field inside reads p_z [m], the direction of gravity (3), the velocity [m/s] (3) and the body rates [rad/s] (3),
-    all in the body frame; it returns ṗ and v̇ in the body frame, q̇ as the quaternion r of q̇ = q ⊗ r, and ω̇. So a
-    vehicle that is turned about the world's vertical has a derivative that is turned with it.
+    and returns ṗ and v̇ in the body frame, q̇ as the quaternion r of q̇ = q ⊗ r, and ω̇.
     """
 
     field: AbstractVectorField
@@ -128,10 +140,10 @@ class BodyFrame(View):
         return _to_world(x[QUATERNION], inside)
 
 
-class BodyMotion(View):
-    """Blind to p and yaw: `BodyFrame` without the height, for flight away from the ground.
+class BodyMotion(AbstractView):
+    """Equivariant to translation and yaw: `BodyFrame` without the height, for flight away from the ground.
 
-    The field inside reads the velocity Rᵀv [m/s], the body rates [rad/s] and the direction of the world's up Rᵀe_z (9).
+    The field inside reads the velocity Rᵀv [m/s], the body rates [rad/s] and the world's up Rᵀe_z (9).
     """
 
     field: AbstractVectorField
@@ -155,7 +167,7 @@ def _to_world(q: Float[Array, " 4 *b"], inside: Features) -> Float[Array, " 13 *
     )
 
 
-class Accelerations(View):
+class Accelerations(AbstractView):
     """The field inside returns v̇ and ω̇ (6), or ω̇ alone (3); the derivatives before them are exactly zero."""
 
     field: AbstractVectorField
@@ -167,10 +179,10 @@ class Accelerations(View):
         return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
 
 
-class Motion(View):
-    """The field inside returns corrections of ṗ, of the body rates that turn q, and v̇ and ω̇ (12), seen from the body.
+class Motion(AbstractView):
+    """The field inside returns corrections of ṗ, of the body rates in q̇, of v̇ and of ω̇ (12), in the body frame.
 
-    Only inside a view that turns it into the world: there r = ½ [0, δω], so that |q| stays 1.
+    To be used inside a view that maps to the world frame: there r = ½ [0, δω], so that |q| stays 1.
     """
 
     field: AbstractVectorField
@@ -181,108 +193,3 @@ class Motion(View):
     def write(self, x, inside):
         turning = jnp.concatenate([jnp.zeros((1, *inside.shape[1:]), inside.dtype), inside[3:6] / 2])
         return jnp.concatenate([inside[:3], turning, inside[6:]])
-
-
-@train_batch.register
-def _(field: View, x, u):
-    return field.write(x, train_batch(field.field, field.read(x), u))
-
-
-@infer_batch.register
-def _(field: View, x, u):
-    return field.write(x, infer_batch(field.field, field.read(x), u))
-
-
-@fuse_for_inference.register
-def _(field: View):
-    return eqx.tree_at(lambda view: view.field, field, fuse_for_inference(field.field))
-
-
-@linearize.register
-def _(field: View, x, u, dx, du):
-    seen, seeing = jvp_columns(field.read, (x,), (dx,))
-    inside, moving = linearize(field.field, seen, u, seeing, du)
-    return jvp_columns(field.write, (x, inside), (dx, moving))
-
-
-@update_running_stats.register
-def _(field: View, x, u):
-    return eqx.tree_at(lambda view: view.field, field, update_running_stats(field.field, field.read(x), u))
-
-
-def _as_it_is(field: AbstractVectorField) -> AbstractVectorField:
-    return field
-
-
-Wrapper = Callable[..., AbstractVectorField]
-
-# Name → how many numbers the network reads beside u, or returns, and the view around it.
-INPUTS: dict[str, tuple[int, Wrapper]] = {
-    "all": (STATE_SIZE, _as_it_is),
-    "no_xy": (STATE_SIZE - 2, DropXY),
-    "no_xy_yaw": (10, DropXYYaw),
-    "near_ground": (14, GroundDistance),
-    "body": (10, BodyFrame),
-    "body_motion": (9, BodyMotion),
-}
-OUTPUTS: dict[str, tuple[int, Wrapper]] = {
-    "all": (STATE_SIZE, _as_it_is),
-    "accelerations": (6, Accelerations),
-    "rotors": (6, Accelerations),
-    "angular_acceleration": (3, Accelerations),
-    "motion": (12, Motion),
-}
-FROM_THE_BODY = ("body", "body_motion")
-OF_ROTORS = ("near_ground", "rotors")
-# Outputs → the inputs that they go with, where these are not all.
-GO_WITH = {"motion": FROM_THE_BODY}
-
-
-def restricted(
-    key: PRNGKeyArray,
-    *,
-    inputs: str = "all",
-    outputs: str = "all",
-    hidden: int = 64,
-    norm: str = "batch",
-    scaling: InputScaling | None = None,
-    linear: bool = False,
-    vehicle: Vehicle | None = None,
-) -> AbstractVectorField:
-    """A network that reads and writes only part of a multirotor's state; by default all of it, as the paper's.
-
-    Args:
-        inputs: "all" of x; "no_xy", without p_x and p_y; "no_xy_yaw", without yaw as well (see `DropXYYaw`);
-            "near_ground", that and how near the rotors are to it (see `GroundDistance`); "body", seen from the body
-            (see `BodyFrame`); "body_motion", that without the height.
-        outputs: "all" 13 derivatives; the "accelerations" v̇ and ω̇; "rotors", these beside the thrust of each rotor by
-            a network of its own (`RotorThrust`), silent until it has learned; the "angular_acceleration" ω̇ alone;
-            "motion", v̇ and ω̇ with ṗ and body rates as well (`Motion`).
-        hidden: units of each network.
-        norm: as in `residual_network`.
-        linear: a linear map goes past the hidden layer (see `LinearSkip`), and both are silent until they have learned.
-        vehicle: which "near_ground" and "rotors" need, and nothing else.
-
-    Raises:
-        ValueError: another name, outputs that do not go with the inputs (see `GO_WITH`), or "near_ground" or "rotors"
-            of an unknown vehicle.
-    """
-    for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
-        if value not in known:
-            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
-    if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
-        raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
-    (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
-    if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
-        raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
-    network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
-    both = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
-    seeing = partial(seen, vehicle=vehicle) if seen is GroundDistance else seen
-    view = seeing(written(both))
-    return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
-
-
-def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
-    assert vehicle is not None
-    network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
-    return zero_output(RotorThrust(network, vehicle))

@@ -11,14 +11,14 @@ from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.networks.views import restricted
+from hybrid_jax.networks.factory import make_residual
 
 PUSH = jnp.array([0.3, 2.7, -0.5, 0.2, -0.1, 0.05])
 RATIOS = {"Ix": 0.6, "Iy": -0.3, "k": 0.05}
 
 
 def network():
-    made = restricted(jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none")
+    made = make_residual(jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none")
     return jax.tree.map(lambda leaf: 0.1 * leaf, made)
 
 

@@ -11,8 +11,8 @@ from hybrid_jax.control.sensitivities import advanced
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import ForcedBody
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
-from hybrid_jax.networks.views import restricted
 
 DT = 0.05
 BODY = hj.RigidBody({"Ix": jnp.asarray(0.1), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.05)}, hj.IRIS)
@@ -23,7 +23,7 @@ SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 def network(inputs="all", outputs="all", norm="batch", linear=False):
     """With every number of it at work."""
     known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
-    made = restricted(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    made = make_residual(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
     return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
 

@@ -26,9 +26,9 @@ from hybrid_jax.control import Controller, fly, performance, sample
 from hybrid_jax.dynamics.base import linearize
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import ForcedBody
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.normalisation import BatchNorm
-from hybrid_jax.networks.views import restricted
 from hybrid_jax.runtime import cores
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 
@@ -42,7 +42,7 @@ SECONDS = 0.6
 def network(inputs="all", outputs="all", norm="batch", linear=False):
     """A network whose statistics, and linear path, are not those that it began with."""
     known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
-    made = restricted(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
+    made = make_residual(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
     if linear:
         made = jax.tree.map(lambda leaf: leaf + jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
@@ -124,7 +124,7 @@ def test_calls_are_timed_by_a_process_that_has_one_core(tmp_path):
 
 
 def test_statistics_are_all_that_is_taken_over():
-    field, source = MODELS["safe"], hj.Hybrid(BODY, restricted(jax.random.key(2), hidden=8, inputs="no_xy_yaw"))
+    field, source = MODELS["safe"], hj.Hybrid(BODY, make_residual(jax.random.key(2), hidden=8, inputs="no_xy_yaw"))
     mixed = with_statistics_of(source, field)
     np.testing.assert_array_equal(mixed.residual.field.field.norm.running.mean, np.zeros(8))
     np.testing.assert_array_equal(mixed.residual.field.field.weight_in, field.residual.field.field.weight_in)

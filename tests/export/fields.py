@@ -11,8 +11,8 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed
 from hybrid_jax.dynamics.terms import SHAPES, Terms
+from hybrid_jax.networks.factory import GO_WITH, INPUTS, OUTPUTS, make_residual
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
-from hybrid_jax.networks.views import GO_WITH, INPUTS, OUTPUTS, restricted
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
@@ -41,7 +41,7 @@ def moved(field, size=0.1):
 
 
 def network(**options):
-    return moved(restricted(KEY, hidden=5, scaling=SCALING, vehicle=IRIS, **options))
+    return moved(make_residual(KEY, hidden=5, scaling=SCALING, vehicle=IRIS, **options))
 
 
 def plain(x, u):

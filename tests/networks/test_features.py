@@ -19,9 +19,10 @@ from hybrid_jax.dynamics.base import (
     trainable,
     update_running_stats,
 )
-from hybrid_jax.networks import views
+from hybrid_jax.networks import factory, views
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.views import BodyFrame, BodyMotion, restricted
+from hybrid_jax.networks.views import BodyFrame, BodyMotion
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -30,10 +31,10 @@ KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 VIEWS = [
     (inputs, outputs)
-    for inputs, outputs in itertools.product(views.INPUTS, views.OUTPUTS)
-    if inputs in views.GO_WITH.get(outputs, views.INPUTS) and outputs != "rotors"  # see test_rotors
+    for inputs, outputs in itertools.product(factory.INPUTS, factory.OUTPUTS)
+    if inputs in factory.GO_WITH.get(outputs, factory.INPUTS) and outputs != "rotors"  # see test_rotors
 ]
-FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in views.FROM_THE_BODY]
+FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in factory.FROM_THE_BODY]
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -45,7 +46,7 @@ def double_precision():
 
 def view(inputs="all", outputs="all", **options):
     known = {"hidden": 9, "scaling": HOVER, "vehicle": IRIS}
-    return restricted(KEY, inputs=inputs, outputs=outputs, **(known | options))
+    return make_residual(KEY, inputs=inputs, outputs=outputs, **(known | options))
 
 
 def samples(count=7, seed=0):
@@ -74,21 +75,21 @@ def turned(x, yaw):
 
 
 def network_of(field):
-    return field if not isinstance(field, views.View) else network_of(field.field)
+    return field if not isinstance(field, views.AbstractView) else network_of(field.field)
 
 
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])
 def test_by_default_the_network_is_the_paper_s(norm):
     plain = residual_network(13, 4, KEY, hidden=20, scaling=HOVER, norm=norm)
-    assert eqx.tree_equal(restricted(KEY, hidden=20, scaling=HOVER, norm=norm), plain)
-    assert eqx.tree_equal(restricted(KEY), residual_network(13, 4, KEY))
+    assert eqx.tree_equal(make_residual(KEY, hidden=20, scaling=HOVER, norm=norm), plain)
+    assert eqx.tree_equal(make_residual(KEY), residual_network(13, 4, KEY))
 
 
 @pytest.mark.parametrize("options", [{"inputs": "world"}, {"outputs": "v"}, {"norm": "group"}], ids=str)
 def test_an_unknown_name_is_refused(options):
     (name, value), *_ = options.items()
     with pytest.raises(ValueError, match=rf"{name} must be one of .*'{value}'"):
-        restricted(KEY, **options)
+        make_residual(KEY, **options)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), [pair for pair in VIEWS if pair[0] != "all"])
@@ -142,7 +143,7 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
 
 def test_near_the_ground_of_an_unknown_vehicle_is_refused():
     with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
-        restricted(KEY, inputs="near_ground")
+        make_residual(KEY, inputs="near_ground")
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
         view("near_ground", vehicle=replace(IRIS, rotor_radius=0.0))
 
@@ -157,7 +158,7 @@ def test_the_body_s_view_of_a_state():
     np.testing.assert_allclose(BodyMotion(rigid_body(IRIS)).read(x), motion, atol=1e-12)
 
 
-@pytest.mark.parametrize("inputs", views.FROM_THE_BODY)
+@pytest.mark.parametrize("inputs", factory.FROM_THE_BODY)
 def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
     """All of ṗ, q̇, v̇ and ω̇ are moved, and q̇ is perpendicular to q."""
     field, (x, u) = view(inputs, "motion"), samples()
@@ -194,7 +195,7 @@ def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
 
 
 @pytest.mark.parametrize(("outputs", "written"), [("accelerations", 6), ("angular_acceleration", 3)])
-@pytest.mark.parametrize("inputs", views.INPUTS)
+@pytest.mark.parametrize("inputs", factory.INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
     for evaluate in (deployed, train_batch):
@@ -229,7 +230,7 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
     def seen(node, x):
-        return seen(node.field, node.read(x)) if isinstance(node, views.View) else x
+        return seen(node.field, node.read(x)) if isinstance(node, views.AbstractView) else x
 
     network = network_of(field)
     hidden = network.weight_in @ jnp.concatenate([seen(field, x), network.scaling(u)])

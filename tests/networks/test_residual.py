@@ -16,17 +16,9 @@ from hybrid_jax.dynamics.base import (
     trainable,
     update_running_stats,
 )
-from hybrid_jax.networks.mlp import (
-    BatchNorm,
-    Bias,
-    FusedNetwork,
-    InputScaling,
-    LayerNorm,
-    LinearResidual,
-    LinearSkip,
-    ResidualNetwork,
-    residual_network,
-)
+from hybrid_jax.networks.fused import FusedNetwork
+from hybrid_jax.networks.mlp import InputScaling, LinearResidual, LinearSkip, ResidualNetwork, residual_network
+from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
 

@@ -11,9 +11,9 @@ import pytest
 from hybrid_jax import load, rotation, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.networks.factory import INPUTS, make_residual
 from hybrid_jax.networks.mlp import InputScaling, residual_network
 from hybrid_jax.networks.rotor_thrust import RotorThrust
-from hybrid_jax.networks.views import INPUTS, restricted
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -82,8 +82,8 @@ def test_rotors_are_alike():
 @pytest.mark.parametrize("inputs", INPUTS)
 def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, tmp_path):
     known = {"inputs": inputs, "hidden": 5, "scaling": HOVER, "vehicle": IRIS}
-    (x, u), field = samples(), restricted(KEY, outputs="rotors", **known)
-    alone = restricted(KEY, outputs="accelerations", **known)
+    (x, u), field = samples(), make_residual(KEY, outputs="rotors", **known)
+    alone = make_residual(KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
     slope = eqx.filter_grad(lambda residual: jnp.sum(train_batch(residual, x, u)))(field)
     assert (slope.physics.field.weight_out != 0).any()
@@ -94,6 +94,6 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
 
 def test_of_an_unknown_vehicle_it_is_refused():
     with pytest.raises(ValueError, match="'rotors' needs the vehicle whose rotors feel the ground, got None"):
-        restricted(KEY, outputs="rotors")
+        make_residual(KEY, outputs="rotors")
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
         shared(replace(IRIS, rotor_radius=0.0))

@@ -1,0 +1,125 @@
+"""Evaluate a field that is written for one sample on a minibatch, and train the batch normalisation inside it.
+
+`jax.vmap` alone would evaluate every `AbstractBatchNorm` in inference mode. So each is first replaced by its training
+mode, which takes mean and variance over the named axis of that `vmap`. This works for any module around a network.
+"""
+
+from abc import abstractmethod
+from typing import Self
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+SAMPLES = "samples"  # the axis of a minibatch
+
+Batch = Float[Array, "d b"]
+Moments = Float[Array, "3 h"]  # number of evaluations, sum of their means, sum of their variances
+
+
+class RunningStats(eqx.Module):
+    """Running mean and variance of hidden units. Training moves them; the optimiser does not."""
+
+    mean: Float[Array, " h"]
+    variance: Float[Array, " h"]
+
+
+class AbstractBatchNorm(eqx.Module):
+    """A layer that normalises by the minibatch in training and by running statistics in inference."""
+
+    running: eqx.AbstractVar[RunningStats]
+    momentum: eqx.AbstractVar[float]
+
+    @abstractmethod
+    def training_mode(self, seen: Moments) -> eqx.Module:
+        """The layer to use for one sample of a minibatch; its moments are recorded by `record(_, seen, _)`."""
+
+    def moved(self, batch: RunningStats) -> Self:
+        """This with the running statistics moved towards the minibatch's by the momentum."""
+        running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
+        return eqx.tree_at(lambda norm: norm.running, self, running)
+
+
+class AbstractInferenceOnly(eqx.Module):
+    """A module that training neither moves nor evaluates in training mode."""
+
+
+def over_samples(function, axis: int = -1):
+    """`function` on all samples of a minibatch, which lie along an axis of its arguments and its result."""
+    return jax.vmap(function, in_axes=axis, out_axes=axis, axis_name=SAMPLES)
+
+
+def expand_trailing(values: Float[Array, " r"], rows: Float[Array, " _ *b"]) -> Float[Array, " r *b"]:
+    """The values with trailing axes of length 1, one for each batch axis of `rows`."""
+    return jnp.reshape(values, values.shape + (1,) * (rows.ndim - 1))
+
+
+def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
+    """All layers of batch normalisation that training evaluates."""
+    return [node for node in jax.tree.leaves(tree, is_leaf=_stops) if isinstance(node, AbstractBatchNorm)]
+
+
+def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
+    """The tree with each `AbstractBatchNorm` in training mode, for use inside `over_samples`."""
+    seen = [_nothing(norm) for norm in batch_norms(tree)] if seen is None else seen
+    return _replaced(tree, [norm.training_mode(one) for norm, one in zip(batch_norms(tree), seen, strict=True)])
+
+
+def moments_of(field, x: Batch, u: Float[Array, "m b"]) -> list[Moments]:
+    """What each `AbstractBatchNorm` records when the field is evaluated on a minibatch.
+
+    The moments are the derivative with respect to an input that does nothing (`record`): they add up through any jit,
+    scan or vmap around the layer, where values stored during tracing would leak.
+    """
+
+    def evaluate(seen):
+        return over_samples(training_mode(field, seen))(x, u)
+
+    slope, pullback = jax.vjp(evaluate, [_nothing(norm) for norm in batch_norms(field)])
+    return pullback(jnp.zeros_like(slope))[0]
+
+
+def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
+    """The field with running statistics moved by an evaluation on a minibatch; itself if it holds none.
+
+    A layer that is evaluated more than once for a sample sees the mean of the moments; one that is not keeps its own.
+    """
+    norms = batch_norms(field)
+    if not norms:
+        return field
+
+    def moved(norm: AbstractBatchNorm, seen: Moments) -> AbstractBatchNorm:
+        means = (jnp.where(seen[0] > 0, part / seen[0], old) for part, old in zip(seen[1:], _rows(norm), strict=True))
+        return norm.moved(RunningStats(*means))
+
+    return _replaced(field, list(map(moved, norms, moments_of(field, x, u))))
+
+
+@jax.custom_vjp
+def record(hidden: Float[Array, " h"], seen: Moments, moments: Moments) -> Float[Array, " h"]:
+    """`hidden` as it is. In reverse mode the moments are added to the derivative with respect to `seen`."""
+    return hidden
+
+
+record.defvjp(
+    lambda hidden, seen, moments: (hidden, moments),
+    lambda moments, d_hidden: (d_hidden, moments, jnp.zeros_like(moments)),
+)
+
+
+def _stops(node) -> bool:
+    return isinstance(node, AbstractBatchNorm | AbstractInferenceOnly)
+
+
+def _replaced(tree: PyTree, norms: list) -> PyTree:
+    left = iter(norms)
+    return jax.tree.map(lambda n: next(left) if isinstance(n, AbstractBatchNorm) else n, tree, is_leaf=_stops)
+
+
+def _rows(norm: AbstractBatchNorm):
+    return norm.running.mean, norm.running.variance
+
+
+def _nothing(norm: AbstractBatchNorm) -> Moments:
+    return jnp.zeros((3, *norm.running.mean.shape), norm.running.mean.dtype)

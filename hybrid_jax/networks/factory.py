@@ -1,0 +1,101 @@
+"""`make_residual`: a residual network for a multirotor by the names of its inputs and outputs."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import PRNGKeyArray
+
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.networks.mlp import InputScaling, LinearSkip, residual_network, zero_output
+from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.views import (
+    Accelerations,
+    BodyFrame,
+    BodyMotion,
+    DropXY,
+    DropXYYaw,
+    GroundDistance,
+    Motion,
+)
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.vehicle import Vehicle
+
+
+def _unchanged(field: AbstractVectorField) -> AbstractVectorField:
+    return field
+
+
+Wrapper = Callable[..., AbstractVectorField]
+
+# Name → number of features that the network reads besides u, or of outputs, and the view around it.
+INPUTS: dict[str, tuple[int, Wrapper]] = {
+    "all": (STATE_SIZE, _unchanged),
+    "no_xy": (STATE_SIZE - 2, DropXY),
+    "no_xy_yaw": (10, DropXYYaw),
+    "near_ground": (14, GroundDistance),
+    "body": (10, BodyFrame),
+    "body_motion": (9, BodyMotion),
+}
+OUTPUTS: dict[str, tuple[int, Wrapper]] = {
+    "all": (STATE_SIZE, _unchanged),
+    "accelerations": (6, Accelerations),
+    "rotors": (6, Accelerations),
+    "angular_acceleration": (3, Accelerations),
+    "motion": (12, Motion),
+}
+FROM_THE_BODY = ("body", "body_motion")
+OF_ROTORS = ("near_ground", "rotors")
+# Outputs → the inputs that they go with, where these are not all.
+GO_WITH = {"motion": FROM_THE_BODY}
+
+
+def make_residual(
+    key: PRNGKeyArray,
+    *,
+    inputs: str = "all",
+    outputs: str = "all",
+    hidden: int = 64,
+    norm: str = "batch",
+    scaling: InputScaling | None = None,
+    linear: bool = False,
+    vehicle: Vehicle | None = None,
+) -> AbstractVectorField:
+    """A residual network that reads and returns part of a multirotor's state; by default all of it (paper).
+
+    Args:
+        inputs: "all" of x; "no_xy", without p_x and p_y (`DropXY`); "no_xy_yaw", also without yaw (`DropXYYaw`);
+            "near_ground", that and the rotors' distance to the ground (`GroundDistance`); "body", in the body frame
+            (`BodyFrame`); "body_motion", that without the height (`BodyMotion`).
+        outputs: "all" 13 derivatives; "accelerations", v̇ and ω̇; "rotors", these and the thrust of each rotor by a
+            second network (`RotorThrust`), which starts at zero; "angular_acceleration", ω̇ alone; "motion", v̇ and ω̇
+            and corrections of ṗ and q̇ (`Motion`).
+        hidden: units of each network.
+        norm: as in `residual_network`.
+        linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
+        vehicle: needed by "near_ground" and "rotors" only.
+
+    Raises:
+        ValueError: an unknown name, outputs that do not go with the inputs (see `GO_WITH`), or no vehicle where one is
+            needed.
+    """
+    for name, value, known in (("inputs", inputs, INPUTS), ("outputs", outputs, OUTPUTS)):
+        if value not in known:
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {value!r}")
+    if inputs not in (needed := GO_WITH.get(outputs, tuple(INPUTS))):
+        raise ValueError(f"outputs {outputs!r} needs inputs of {' or '.join(needed)}, got {inputs!r}")
+    (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
+    if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
+        raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
+    network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
+    both = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
+    seeing = partial(seen, vehicle=vehicle) if seen is GroundDistance else seen
+    view = seeing(written(both))
+    return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
+
+
+def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
+    assert vehicle is not None
+    network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
+    return zero_output(RotorThrust(network, vehicle))
