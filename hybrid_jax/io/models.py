@@ -21,9 +21,10 @@ from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, check_start
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.networks.mlp import FusedNetwork, InputScaling, LinearResidual, LinearSkip, ResidualNetwork
+from hybrid_jax.networks.mlp import FusedNetwork, LinearResidual, LinearSkip, ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.scaling import ChannelScaling, InputScaling
 from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
 from hybrid_jax.vehicle import Vehicle
 
@@ -46,7 +47,7 @@ _FIELDS = (
     *(LinearSkip, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust),
 )
 _VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, GroundDistance, DropXY, DropXYYaw)
-_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, RunningStats, Terms, Vehicle)
+_PARTS = (BatchNorm, Bias, ChannelScaling, InputScaling, LayerNorm, RunningStats, Terms, Vehicle)
 for _kind in _FIELDS + _VIEWS + _PARTS:
     portable(_kind)
 
@@ -124,6 +125,15 @@ def load(path: str | Path) -> Model:
     if type(field).__name__ not in _KINDS:
         raise ValueError(f"{path}: not a whole model: its field is a {type(field).__name__}")
     return Model(field, about)
+
+
+def check_savable(field: AbstractVectorField) -> str | None:
+    """Why a file of this field could not be loaded; None if it can be."""
+    try:
+        describe(field)
+    except ValueError as error:
+        return str(error)
+    return None
 
 
 def describe(field: AbstractVectorField) -> Any:

@@ -31,28 +31,7 @@ from hybrid_jax.networks.normalisation import (
     beside,
     product,
 )
-
-
-class InputScaling(eqx.Module):
-    """Fixed affine scaling of the inputs: u ↦ (u − offset) / scale, so that they are of the size of the states.
-
-    Raises:
-        ValueError: an offset that is not finite, or a scale that is not positive.
-    """
-
-    offset: float = eqx.field(static=True, default=0.0)
-    scale: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        checks.number("offset", self.offset)
-        checks.positive("scale", self.scale)
-
-    def __call__(self, u: Float[Array, " m *b"]) -> Float[Array, " m *b"]:
-        return (u - self.offset) / self.scale
-
-    def beside(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
-        """z = [x, scaled u]."""
-        return jnp.concatenate([x, self(u)])
+from hybrid_jax.networks.scaling import AbstractScaling, ChannelScaling, InputScaling
 
 
 class ResidualNetwork(AbstractVectorField):
@@ -65,12 +44,12 @@ class ResidualNetwork(AbstractVectorField):
     norm: Normalisation
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
-    scaling: InputScaling = eqx.field(default_factory=InputScaling)
+    scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         """Deployment: normalised by the running statistics."""
         product = self.weight_out @ self.activations(x, u)
-        return product + beside(self.bias_out, product)
+        return self.scaling.outputs(product + beside(self.bias_out, product))
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units as deployed: what the output layer is linear in."""
@@ -78,7 +57,7 @@ class ResidualNetwork(AbstractVectorField):
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
         """z = [x, scaled u]."""
-        return self.scaling.beside(x, u)
+        return self.scaling.concatenate(x, u)
 
 
 class LinearResidual(AbstractVectorField):
@@ -121,10 +100,10 @@ class FusedNetwork(AbstractVectorField):
     weight_in: Float[Array, "m h+d"]
     bias: Float[Array, " h+d"]
     weight_out: Float[Array, "h d"]
-    scaling: InputScaling
+    scaling: AbstractScaling
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
-        hidden, past = self.layer(self.scaling.beside(x, u))
+        hidden, past = self.layer(self.scaling.concatenate(x, u))
         return (jax.nn.relu(hidden).T @ self.weight_out).T + past
 
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
@@ -140,13 +119,14 @@ def residual_network(
     key: PRNGKeyArray,
     *,
     hidden: int = 64,
-    scaling: InputScaling | None = None,
+    scaling: AbstractScaling | None = None,
     norm: str = "batch",
     outputs: int | None = None,
 ) -> ResidualNetwork:
     """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
 
     Args:
+        scaling: by default read off the training windows by `hybrid_jax.fit`; see `scaling.with_scaling`.
         norm: what normalises the hidden units: "batch", "layer" or "none".
         outputs: how many numbers it returns, if not one for each of the state.
 
@@ -168,7 +148,7 @@ def residual_network(
         norm=NORMS[norm](hidden, fan_in, jax.random.fold_in(key, 3)),
         weight_out=_uniform(key_out, (outputs, hidden), hidden),
         bias_out=_uniform(key_bias, (outputs,), hidden),
-        scaling=InputScaling() if scaling is None else scaling,
+        scaling=ChannelScaling() if scaling is None else scaling,
     )
 
 
@@ -223,7 +203,8 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
 @train_batch.register
 def _(field: ResidualNetwork, x, u) -> Array:
     """Training: where the norm is the batch's, each evaluation normalises by its own minibatch."""
-    return field.norm.layers(field.weight_in, field.weight_out, field.bias_out, field.inputs(x, u))
+    y = field.norm.layers(field.weight_in, field.weight_out, field.bias_out, field.inputs(x, u))
+    return field.scaling.outputs(y)
 
 
 @infer_batch.register(ResidualNetwork)
@@ -254,8 +235,8 @@ def _laid_out(network: ResidualNetwork, norm: AffineNorm, past: Float[Array, "d 
     weight, bias = norm.fold(network.weight_in)
     return FusedNetwork(
         weight_in=jnp.concatenate([weight, past]).T,
-        bias=jnp.concatenate([bias, network.bias_out]),
-        weight_out=network.weight_out.T,
+        bias=jnp.concatenate([bias, network.scaling.outputs(network.bias_out)]),
+        weight_out=network.scaling.outputs(network.weight_out).T,
         scaling=network.scaling,
     )
 
@@ -263,7 +244,7 @@ def _laid_out(network: ResidualNetwork, norm: AffineNorm, past: Float[Array, "d 
 @linearize.register
 def _(field: FusedNetwork, x, u, dx, du):
     """By one product of the layers: hundreds of hidden units are gone before any direction is met."""
-    z, directions = jvp_columns(field.scaling.beside, (x, u), (dx, du))
+    z, directions = jvp_columns(field.scaling.concatenate, (x, u), (dx, du))
     hidden, past = field.layer(z)
     weight, linear = field.weight_in[:, : len(hidden)], field.weight_in[:, len(hidden) :]
     jacobian = jnp.where(hidden > 0, field.weight_out.T, 0) @ weight.T + linear.T

@@ -28,8 +28,9 @@ from hybrid_jax.dynamics.base import (
     train_batch,
     update_running_stats,
 )
-from hybrid_jax.networks.mlp import InputScaling, LinearSkip, residual_network, zero_output
+from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.rotor_thrust import RotorThrust, nearness
+from hybrid_jax.networks.scaling import AbstractScaling
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -245,7 +246,7 @@ def restricted(
     outputs: str = "all",
     hidden: int = 64,
     norm: str = "batch",
-    scaling: InputScaling | None = None,
+    scaling: AbstractScaling | None = None,
     linear: bool = False,
     vehicle: Vehicle | None = None,
 ) -> AbstractVectorField:
@@ -282,7 +283,7 @@ def restricted(
     return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
 
 
-def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
+def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: AbstractScaling | None, vehicle: Vehicle | None):
     assert vehicle is not None
     network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
     return zero_output(RotorThrust(network, vehicle))
