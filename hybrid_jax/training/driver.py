@@ -200,6 +200,8 @@ def drive(
     progress: Report | bool | None,
 ) -> FitResult:
     """Take a run to its end in blocks of epochs, and report the progress between them."""
+    # Weakly typed numbers would come back typed, and the second block be compiled anew.
+    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most = [np.zeros((0, 2))], 1
     empty = jnp.zeros((BLOCK, 2))
     with _reporting(progress, int(plan.max_epochs)) as report:
