@@ -22,7 +22,7 @@ from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import RK4, rollout, rollout_batch
 from hybrid_jax.io import Model, check_savable, load, portable, save
 from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.training.fitting import fit
+from hybrid_jax.training.driver import fit
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, Vehicle, load_vehicle

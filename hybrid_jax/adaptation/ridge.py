@@ -77,7 +77,8 @@ def last_layer(
     lacking = defects(field, intervals, solver)
     activations = jax.vmap(network.activations)
     middle = (activations(intervals.before, intervals.u) + activations(intervals.after, intervals.u)) / 2
-    weight, bias = ridge(middle, lacking, penalty)
+    scale = network.scaling.outputs(jnp.ones_like(network.bias_out))
+    weight, bias = ridge(middle, lacking / scale, penalty)
     output = (network.weight_out + weight, network.bias_out + bias)
     moved = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, output)
     return Hybrid(field.physics, moved) if isinstance(field, Hybrid) else moved

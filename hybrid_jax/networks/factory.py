@@ -8,8 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.networks.mlp import InputScaling, LinearSkip, residual_network, zero_output
+from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.scaling import AbstractScaling
 from hybrid_jax.networks.views import (
     Accelerations,
     BodyFrame,
@@ -58,7 +59,7 @@ def make_residual(
     outputs: str = "all",
     hidden: int = 64,
     norm: str = "batch",
-    scaling: InputScaling | None = None,
+    scaling: AbstractScaling | None = None,
     linear: bool = False,
     vehicle: Vehicle | None = None,
 ) -> AbstractVectorField:
@@ -95,7 +96,7 @@ def make_residual(
     return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
 
 
-def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: InputScaling | None, vehicle: Vehicle | None):
+def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: AbstractScaling | None, vehicle: Vehicle | None):
     assert vehicle is not None
     network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
     return zero_output(RotorThrust(network, vehicle))

@@ -1,6 +1,5 @@
 """A network in inference mode in a layout for few samples at a time, as a controller evaluates it."""
 
-from collections.abc import Callable
 from typing import ClassVar
 
 import jax
@@ -10,8 +9,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns
 from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.networks.normalisation import UNROLLED_INPUTS, product
-
-Scaling = Callable[[Float[Array, " m *b"]], Float[Array, " m *b"]]
+from hybrid_jax.networks.scaling import AbstractScaling
 
 
 class FusedNetwork(AbstractVectorField):
@@ -31,10 +29,10 @@ class FusedNetwork(AbstractVectorField):
     weight_in: Float[Array, "m h+d"]
     bias: Float[Array, " h+d"]
     weight_out: Float[Array, "h d"]
-    scaling: Scaling
+    scaling: AbstractScaling
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
-        hidden, linear = self.layer(concatenate_inputs(self.scaling, x, u))
+        hidden, linear = self.layer(self.scaling.concatenate(x, u))
         return (jax.nn.relu(hidden).T @ self.weight_out).T + linear
 
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
@@ -45,7 +43,7 @@ class FusedNetwork(AbstractVectorField):
 
     def linearize(self, x, u, dx, du):
         """The Jacobian with respect to z is one product over the hidden units, whatever the number of directions."""
-        z, dz = jvp_columns(lambda x, u: concatenate_inputs(self.scaling, x, u), (x, u), (dx, du))
+        z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
         hidden, linear = self.layer(z)
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
         jacobian = jnp.where(hidden > 0, self.weight_out.T, 0) @ weight.T + skip.T
@@ -58,14 +56,9 @@ def fused(
     weight_out: Float[Array, "d h"],
     bias_out: Float[Array, " d"],
     linear: Float[Array, "d m"],
-    scaling: Scaling,
+    scaling: AbstractScaling,
 ) -> FusedNetwork:
     """W₂ relu(W₁ z + c) + A z + b from W₁, c, W₂, b and A."""
     return FusedNetwork(
         jnp.concatenate([weight_in, linear]).T, jnp.concatenate([bias_in, bias_out]), weight_out.T, scaling
     )
-
-
-def concatenate_inputs(scaling: Scaling, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
-    """z = [x, scaled u]."""
-    return jnp.concatenate([x, scaling(u)])

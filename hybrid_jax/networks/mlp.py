@@ -14,26 +14,9 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import RunningStats
-from hybrid_jax.networks.fused import FusedNetwork, concatenate_inputs, fused
+from hybrid_jax.networks.fused import FusedNetwork, fused
 from hybrid_jax.networks.normalisation import AbstractAffineNorm, AbstractNorm, BatchNorm, Bias, LayerNorm, affine
-
-
-class InputScaling(eqx.Module):
-    """Fixed affine scaling of the inputs: u ↦ (u − offset) / scale, so that they are of the size of the states.
-
-    Raises:
-        ValueError: an offset that is not finite, or a scale that is not positive.
-    """
-
-    offset: float = eqx.field(static=True, default=0.0)
-    scale: float = eqx.field(static=True, default=1.0)
-
-    def __check_init__(self):
-        checks.number("offset", self.offset)
-        checks.positive("scale", self.scale)
-
-    def __call__(self, u: Float[Array, " m *b"]) -> Float[Array, " m *b"]:
-        return (u - self.offset) / self.scale
+from hybrid_jax.networks.scaling import AbstractScaling, ChannelScaling, InputScaling
 
 
 class ResidualNetwork(AbstractVectorField):
@@ -48,10 +31,10 @@ class ResidualNetwork(AbstractVectorField):
     norm: AbstractNorm
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
-    scaling: InputScaling = eqx.field(default_factory=InputScaling)
+    scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
-        return affine(self.weight_out, self.bias_out, self.activations(x, u))
+        return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units in inference mode, in which the output layer is linear."""
@@ -59,10 +42,11 @@ class ResidualNetwork(AbstractVectorField):
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
         """z = [x, scaled u]."""
-        return concatenate_inputs(self.scaling, x, u)
+        return self.scaling.concatenate(x, u)
 
     def train_batch(self, x, u):
-        return self.norm.train_layers(self.weight_in, self.weight_out, self.bias_out, self.inputs(x, u))
+        y = self.norm.train_layers(self.weight_in, self.weight_out, self.bias_out, self.inputs(x, u))
+        return self.scaling.outputs(y)
 
     def update_running_stats(self, x, u):
         norm = self.norm.observed(self.weight_in @ self.inputs(x, u))
@@ -75,7 +59,8 @@ class ResidualNetwork(AbstractVectorField):
         """This and a linear map of z in one, or None if the normalisation is no affine map."""
         if not isinstance(self.norm, AbstractAffineNorm):
             return None
-        return fused(*self.norm.fold(self.weight_in), self.weight_out, self.bias_out, linear, self.scaling)
+        weight_out, bias_out = self.scaling.outputs(self.weight_out), self.scaling.outputs(self.bias_out)
+        return fused(*self.norm.fold(self.weight_in), weight_out, bias_out, linear, self.scaling)
 
 
 class LinearResidual(AbstractVectorField):
@@ -120,13 +105,14 @@ def residual_network(
     key: PRNGKeyArray,
     *,
     hidden: int = 64,
-    scaling: InputScaling | None = None,
+    scaling: AbstractScaling | None = None,
     norm: str = "batch",
     outputs: int | None = None,
 ) -> ResidualNetwork:
     """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
 
     Args:
+        scaling: by default read off the training windows by `hybrid_jax.fit`; see `scaling.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of what it returns, by default `state_size`.
 
@@ -148,7 +134,7 @@ def residual_network(
         norm=NORMS[norm](hidden, fan_in, jax.random.fold_in(key, 3)),
         weight_out=_uniform(key_out, (outputs, hidden), hidden),
         bias_out=_uniform(key_bias, (outputs,), hidden),
-        scaling=InputScaling() if scaling is None else scaling,
+        scaling=ChannelScaling() if scaling is None else scaling,
     )
 
 

@@ -21,8 +21,7 @@ from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig
-from hybrid_jax.training.objective import Settings
-from hybrid_jax.training.preparation import check_minibatch
+from hybrid_jax.training.objective import Settings, check_minibatch
 from hybrid_jax.trajectories import Trajectories
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock

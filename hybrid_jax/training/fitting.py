@@ -1,7 +1,7 @@
-"""One training run as a pure function: minibatches, Adam, validation, the best epoch, early stopping.
+"""One training run as a pure function: minibatches, the optimiser, validation, the best epoch, early stopping.
 
-What is swept over (rates, data size, patience, …) is an argument, `Plan`; what shapes the program is `Settings`
-(objective.py).
+`RunConfig` holds what may differ between runs of one compiled program (rates, data size, patience, …). `Settings`
+(objective.py) holds what the program is compiled for.
 """
 
 import equinox as eqx
@@ -11,27 +11,25 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss
-from hybrid_jax.training.preparation import prepared
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.training.objective import Learner, Settings
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
-WEIGHT = 1e-3  # λ, where none is given
-FEW = 8  # one in so many of the listed windows
+ADAM = optax.scale_by_adam()
+SHORTCUT = 8  # a run that uses at most 1 / SHORTCUT of its listed windows sorts only that part
 STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
 
 
 class RunConfig(eqx.Module):
-    """What may differ between the lanes of a sweep.
+    """Hyper-parameters that may differ between the runs of a sweep.
 
     Attributes:
-        rates: Adam's learning rates, a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
-        subset: indices of training windows in the order in which this lane may use them.
-        n_train: how many of `subset` it does use; nested by construction.
+        rates: learning rates, a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
+        subset: indices of the training windows that the run may use, in order.
+        n_train: the run uses the first n_train of `subset`.
         min_epochs: no early stop before this many epochs.
         patience: stop after this many epochs without a better validation loss.
-        max_epochs: the cap.
+        max_epochs: stop after this many epochs.
         regulariser_weight: λ.
     """
 
@@ -45,9 +43,9 @@ class RunConfig(eqx.Module):
 
 
 class FitState(eqx.Module):
-    """A run between two epochs; all that is needed to go on.
+    """A run between two epochs: all that is needed to continue it.
 
-    `best` is the field of the best validation loss so far: the start itself until an epoch has been completed.
+    `best` is the field with the best validation loss so far, and the initial field before the first epoch.
     """
 
     field: Learner
@@ -61,12 +59,12 @@ class FitState(eqx.Module):
     key: PRNGKeyArray
 
 
-def start(field: Learner, key: PRNGKeyArray) -> FitState:
-    """A run at epoch 0; the key sets the order of minibatches."""
+def start(field: Learner, key: PRNGKeyArray, optimiser: optax.GradientTransformation = ADAM) -> FitState:
+    """A run at epoch 0. The key sets the order of the minibatches."""
     zero = jnp.zeros((), jnp.int32)
     infinity = jnp.array(jnp.inf)
-    adam = optax.scale_by_adam().init(eqx.filter(field, trainable(field)))
-    # Raw key data is an ordinary array: it can be stacked by lane, moved to the host and saved.
+    adam = optimiser.init(eqx.filter(field, trainable(field)))
+    # Raw key data is an ordinary array: it can be stacked, moved to the host and saved.
     key = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
     return FitState(field, adam, field, infinity, zero, zero, zero + RUNNING, infinity, key)
 
@@ -79,49 +77,83 @@ def run(
     settings: Settings,
     until: Int[Array, ""] | int,
 ) -> FitState:
-    """Go on until the run has stopped or has completed `until` epochs.
+    """Continue until the run has stopped or has completed `until` epochs.
 
     Args:
-        train, validation: as the objective has prepared them.
+        train, validation: as prepared by the objective.
     """
+    return run_recorded(state, None, plan, train, validation, settings, until)[0]
 
-    def going(state: FitState) -> Bool[Array, ""]:
+
+def run_recorded(
+    state: FitState,
+    losses: Float[Array, "e 2"] | None,
+    plan: RunConfig,
+    train: PyTree,
+    validation: PyTree,
+    settings: Settings,
+    until: Int[Array, ""] | int,
+    optimiser: optax.GradientTransformation = ADAM,
+) -> tuple[FitState, Float[Array, "e 2"] | None]:
+    """`run` that also records the training and the validation loss of its first epochs in the rows of `losses`."""
+
+    def is_running(state: FitState) -> Bool[Array, ""]:
         return (state.status == RUNNING) & (state.epoch < until)
 
-    # A user's field may hold leaves that are no arrays (an activation function); a loop carries arrays only.
+    first = state.epoch
+    # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)
 
-    def one_epoch(arrays):
-        return eqx.filter(epoch(eqx.combine(arrays, rest), plan, train, validation, settings), eqx.is_array)
+    def one_epoch(carry):
+        state, losses = eqx.combine(carry[0], rest), carry[1]
+        after, error = _epoch(state, plan, train, validation, settings, optimiser)
+        if losses is not None:
+            row = jnp.stack([after.train_loss, error]).astype(losses.dtype)
+            losses = losses.at[state.epoch - first].set(row, mode="drop")
+        return eqx.filter(after, eqx.is_array), losses
 
-    arrays = jax.lax.while_loop(lambda arrays: going(eqx.combine(arrays, rest)), one_epoch, arrays)
-    return eqx.combine(arrays, rest)
+    arrays, losses = jax.lax.while_loop(
+        lambda carry: is_running(eqx.combine(carry[0], rest)), one_epoch, (arrays, losses)
+    )
+    return eqx.combine(arrays, rest), losses
 
 
-def epoch(state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
-    """One pass over the lane's training windows in a new order, then a validation."""
+def _epoch(
+    state: FitState,
+    plan: RunConfig,
+    train: PyTree,
+    validation: PyTree,
+    settings: Settings,
+    optimiser: optax.GradientTransformation,
+) -> tuple[FitState, Float[Array, ""]]:
+    """One pass over the training windows in a new order, then a validation; returns the validation loss too."""
     key, order_key = jax.random.split(state.key)
     order = _shuffled(plan, order_key)
     batches = plan.n_train // settings.batch_size
 
-    arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run`
+    arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run_recorded`
 
     def update(i, carry):
         arrays, adam, total = carry
         picked = jax.lax.dynamic_slice(order, (i * settings.batch_size,), (settings.batch_size,))
-        field, adam, value = gradient_step(eqx.combine(arrays, rest), adam, plan, train[picked], settings)
+        field, adam, value = gradient_step(eqx.combine(arrays, rest), adam, plan, train[picked], settings, optimiser)
         return eqx.filter(field, eqx.is_array), adam, total + value
 
     arrays, adam, total = jax.lax.fori_loop(0, batches, update, (arrays, state.adam, jnp.zeros(())))
     field = eqx.combine(arrays, rest)
     error = settings.objective.validate(field, validation, settings)
-    return _judge(state, plan, field, adam, key, total / batches, error)
+    return _updated(state, plan, field, adam, key, total / batches, error), error
 
 
 def gradient_step(
-    field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings
+    field: Learner,
+    adam: PyTree,
+    plan: RunConfig,
+    picked: PyTree,
+    settings: Settings,
+    optimiser: optax.GradientTransformation = ADAM,
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
-    """One step of Adam on one minibatch, and what the field observes in it."""
+    """One optimiser step on one minibatch; running statistics are updated with the same minibatch."""
     learned = trainable(field)
     parameters, rest = eqx.partition(field, learned)
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
@@ -132,67 +164,16 @@ def gradient_step(
         return settings.objective.loss(candidate, batch, settings, plan.regulariser_weight)
 
     (value, seen), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)
-    direction, adam = optax.scale_by_adam().update(gradient, adam)
+    direction, adam = optimiser.update(gradient, adam, parameters)
     moved = _descend(plan.rates, parameters, direction)
     return settings.objective.observe(eqx.combine(moved, rest), batch, seen), adam, value
 
 
-def fit(
-    field: AbstractVectorField,
-    train: Trajectories,
-    validation: Trajectories,
-    key: PRNGKeyArray,
-    *,
-    rates: PyTree,
-    min_epochs: int = 100,
-    patience: int = 20,
-    max_epochs: int = 2000,
-    regulariser_weight: float | None = None,
-    settings: Settings | None = None,
-) -> FitState:
-    """Train one field on all windows of `train`; `result.best` is the field of the best validation epoch.
-
-    Args:
-        regulariser_weight: λ, by default 1e-3.
-        settings: by default minibatches of 100 and no regulariser; the paper's is
-            `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
-
-    Raises:
-        ValueError: data that the objective refuses, that are not of the field's states and inputs, or are of a rigid
-            body and have no unit quaternions; fewer training windows than a minibatch, or one window normalised by
-            itself; a field with nothing to learn; rates that do not go with it; a rule that makes no sense; a weight
-            without a regulariser; or no random key.
-    """
-    settings = Settings() if settings is None else settings
-    data, judged_on = prepared(field, train, validation, key, settings)
-    try:
-        jax.tree.map(lambda *_: None, rates, eqx.filter(field, trainable(field)))
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"rates must be a number, or a tree of them that begins as the field does, got {checks.short_repr(rates)}"
-        ) from error
-    weight = _weight(regulariser_weight, settings)
-    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
-    return _fit(start(field, key), plan, data, judged_on, settings)
-
-
-def _weight(asked: float | None, settings: Settings) -> float:
-    """λ, or what another objective weighs by it."""
-    if asked is None:
-        return WEIGHT
-    if settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
-        raise ValueError(
-            f"regulariser_weight is {checks.short_repr(asked)} but settings.regulariser is None; leave it out, or "
-            "take one of hybrid_jax.training.loss.REGULARISERS"
-        )
-    return asked
-
-
 def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
-    """A plan with every number as an array, as `vmap` wants it.
+    """A configuration with every number as an array, as `vmap` needs it.
 
     Raises:
-        ValueError: a number that makes no sense, by its name.
+        ValueError: a rate or weight that is negative or not finite, or a count that is too small; says which.
     """
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
@@ -220,24 +201,19 @@ def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, re
     )
 
 
-@eqx.filter_jit
-def _fit(state, plan, train, validation, settings):
-    return run(state, plan, train, validation, settings, plan.max_epochs)
-
-
 def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
-    """The first n_train of the lane's windows in random order, then the rest."""
+    """The first n_train windows of the subset in random order, then the rest."""
     listed = plan.subset.shape[0]
 
     def among(first: int) -> Int[Array, " n"]:
-        # The same tickets however many are drawn: JAX counts them (jax_threefry_partitionable).
-        ticket = jax.random.uniform(key, (first,))
+        # The first numbers are the same however many are drawn (jax_threefry_partitionable).
+        draws = jax.random.uniform(key, (first,))
         inside = jnp.arange(first) < plan.n_train
-        order = jnp.argsort(jnp.where(inside, ticket, jnp.inf))
+        order = jnp.argsort(jnp.where(inside, draws, jnp.inf))
         return plan.subset.at[:first].set(plan.subset[:first][order])
 
-    # A lane that uses few of many does not pay for sorting all of them.
-    few = listed // FEW
+    # A run that uses few of many windows does not pay for sorting all of them.
+    few = listed // SHORTCUT
     return jax.lax.cond(plan.n_train <= few, lambda: among(few), lambda: among(listed))
 
 
@@ -248,8 +224,8 @@ def _descend(rates: PyTree, parameters: Learner, direction: PyTree) -> Learner:
     return jax.tree.map(part, rates, parameters, direction)
 
 
-def _judge(state, plan, field, adam, key, train_loss, error) -> FitState:
-    """The state after an epoch: is it the best, and does the run go on?"""
+def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
+    """The state after an epoch: whether it is the best one, and whether the run continues."""
     finished = state.epoch + 1
     finite = jnp.isfinite(train_loss) & jnp.isfinite(error)
     better = finite & (error < state.best_mse)
@@ -258,7 +234,7 @@ def _judge(state, plan, field, adam, key, train_loss, error) -> FitState:
     patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
     status = jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING)
     status = jnp.where(patient, status, STOPPED)
-    # Python's integers make 64 bits in JAX's double precision, where the loop carries 32.
+    # Python integers become 64 bit in double precision, but the loop carries 32 bit.
     status = jnp.where(finite, status, DIVERGED).astype(jnp.int32)
     best_mse = jnp.where(better, error, state.best_mse)
     return FitState(field, adam, best, best_mse, best_epoch, finished, status, train_loss, key)

@@ -1,54 +1,58 @@
-"""What a training run minimises, and on what it is judged: by default how well a field predicts trajectories."""
+"""What a training run minimises and validates on, and the checks before it begins."""
 
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import diffrax
-from jaxtyping import Array, Float, PyTree
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, update_running_stats
-from hybrid_jax.integrate import RK4, along, rollout_minibatch
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, trainable, update_running_stats
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.integrate import RK4, along, checked, rollout_minibatch
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.training.loss import Minibatch, Regulariser, loss, minibatch
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
-Learner = Any  # an Equinox module: a vector field, or whatever the objective at hand can evaluate
+Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
 
 
 class Objective(Protocol):
-    """Turns windows into a number to descend on, and one to judge an epoch by. A value that can be hashed."""
+    """Maps windows to a training loss and a validation loss. It must be hashable."""
 
     def prepare(self, windows: Trajectories, name: str) -> PyTree:
-        """The data of a run, once, before it begins: anything with a length that an array of indices picks from.
+        """The data of a run: anything with a length that can be indexed by an array of integers. Called once.
 
         Raises:
-            ValueError: windows of which nothing can be learned; `name` is what they are called.
+            ValueError: windows that cannot be used; `name` is the argument's name.
         """
         ...
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
-        """A minibatch in the layout in which `loss` wants it."""
+        """A minibatch in the layout that `loss` needs."""
         ...
 
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
     ) -> tuple[Float[Array, ""], PyTree]:
-        """The loss on a minibatch, and what was seen on the way."""
+        """The loss on a minibatch, and what `observe` needs of the evaluation."""
         ...
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
-        """The field after it has seen the minibatch: running statistics move, learned parameters do not."""
+        """The field with its running statistics updated by the minibatch; learned parameters stay as they are."""
         ...
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
-        """What early stopping and the choice of the best epoch go by; less is better."""
+        """The validation loss, which early stopping and the choice of the best epoch use."""
         ...
 
 
 @dataclass(frozen=True)
 class TrajectoryLoss:
-    """L_MSE + λ L_reg of the predicted trajectories of a vector field (paper, Sec. 3.3); judged by L_MSE alone."""
+    """L_MSE + λ L_reg of predicted trajectories (paper, Sec. 3.3). Validation uses L_MSE alone."""
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
         return check(windows, name)
@@ -70,10 +74,10 @@ class TrajectoryLoss:
 
 @dataclass(frozen=True)
 class Settings:
-    """What is the same for all lanes of a sweep and fixed when it is compiled.
+    """What a training program is compiled for; the same for all runs of a sweep.
 
     Raises:
-        ValueError: a regulariser that is no function, such as the name of one.
+        ValueError: a regulariser that is not a function, such as the name of one.
     """
 
     batch_size: int = 100
@@ -83,7 +87,64 @@ class Settings:
 
     def __post_init__(self):
         if self.regulariser is not None and not callable(self.regulariser):
-            said = checks.short_repr(self.regulariser)
+            got = checks.short_repr(self.regulariser)
             raise ValueError(
-                f"regulariser must be a function, such as one of hybrid_jax.training.loss.REGULARISERS, got {said}"
+                f"regulariser must be a function, such as one of hybrid_jax.training.loss.REGULARISERS, got {got}"
             )
+
+
+def prepared(
+    field: Learner, train: Trajectories, validation: Trajectories, key: PRNGKeyArray, settings: Settings
+) -> tuple[PyTree, PyTree]:
+    """Both sets of windows as prepared by the objective, after all checks of what a run is given.
+
+    Raises:
+        ValueError: windows that the objective refuses, that do not match the field, or are of a rigid body and have no
+            unit quaternions; fewer windows than a minibatch; a minibatch that `check_minibatch` refuses; a field with
+            nothing to learn; or no random key.
+    """
+    data = settings.objective.prepare(train, "train")
+    validated_on = settings.objective.prepare(validation, "validation")
+    _check_learns(field)
+    for name, windows in (("train", train), ("validation", validation)):
+        _check_match(field, windows, name, settings)
+    checks.key("key", key)
+    checks.count("settings.batch_size", settings.batch_size)
+    check_minibatch(field, settings)
+    if len(data) < settings.batch_size:
+        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
+    return data, validated_on
+
+
+def check_minibatch(field: Learner, settings: Settings) -> None:
+    """Refuse minibatches of one window where a BatchNorm is trained: minus its own mean, a window is a constant.
+
+    Raises:
+        ValueError: the field learns through a BatchNorm, and the minibatch is smaller than 2.
+    """
+    nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, Frozen | BatchNorm))
+    if settings.batch_size < 2 and any(isinstance(node, BatchNorm) for node in nodes):
+        raise ValueError(
+            f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {settings.batch_size}"
+        )
+
+
+def _check_learns(field: Learner) -> None:
+    if not any(jax.tree.leaves(trainable(field))):
+        raise ValueError(
+            f"field: {type(field).__name__} has nothing to learn, no array of floating-point numbers; a Python float "
+            "is none, use jnp.asarray"
+        )
+
+
+def _check_match(field: Learner, windows: Trajectories, name: str, settings: Settings) -> None:
+    """Refuse windows that do not match a vector field. Other learners are checked by their objective."""
+    if isinstance(field, AbstractVectorField):
+        try:
+            x0, _, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+        except ValueError as error:
+            raise ValueError(f"{name}: {error}") from error
+        if x0.dtype != jnp.result_type(windows.x0):
+            raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
+    if moves_a_rigid_body(field):
+        check_attitudes(windows, name)

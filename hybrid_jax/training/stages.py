@@ -1,7 +1,7 @@
-"""Training in stages: physics first and then the residual, short windows first and then longer ones, group by group.
+"""Training in stages: e.g. physics first and then the residual, or short windows first and then longer ones.
 
-A stage is one run of `training`, from the best field of the stage before, with rates and a horizon of its own. What a
-stage does not improve on the windows of its validation it leaves as it was.
+Each stage is one training run with its own learning rates and horizon. It starts from the best field of the stage
+before. A stage that does not improve the validation loss leaves the field as it was.
 """
 
 from collections.abc import Mapping, Sequence
@@ -10,31 +10,32 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import optax
 from jaxtyping import PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
-from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config, run, start
-from hybrid_jax.training.objective import Learner, Settings
-from hybrid_jax.training.preparation import prepared
+from hybrid_jax.training.driver import FitResult, Report, default_settings, default_weight, descent, drive, ready
+from hybrid_jax.training.fitting import FitState, make_run_config, start
+from hybrid_jax.training.objective import Learner, Settings, prepared
 from hybrid_jax.trajectories import Trajectories
 
 
 @dataclass(frozen=True)
 class Stage:
-    """One run.
+    """One training run.
 
     Attributes:
-        rates: learning rate of each group, by the beginning of its path in the field, such as "physics",
-            "residual/weight_out" or "physics/deviations/drag"; the longest that fits counts, and what no group holds
-            stays as it is. "" is the whole field.
-        steps: intervals of a window that are trained on, from its start; all, if none are named.
-        epochs: the most of them.
-        patience: epochs without a better validation after which the stage ends.
+        rates: learning rate of each group of parameters. A group is named by the beginning of its path in the field,
+            e.g. "physics", "residual/weight_out" or "physics/deviations/drag"; "" is the whole field. The longest name
+            that matches counts. Parameters in no group are frozen.
+        steps: number of intervals of each window that are trained on, from its start; by default all.
+        epochs: stop after this many epochs.
+        patience: stop after this many epochs without a better validation loss.
 
     Raises:
-        ValueError: a rate, or a count, that makes no sense.
+        ValueError: a rate that is negative or not finite, or a count below 1.
     """
 
     rates: Mapping[str, float]
@@ -52,10 +53,10 @@ class Stage:
 
 
 def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
-    """A tree like the learned part of a field, with the rate of its group for each array; see `Stage`.
+    """The learning rate of each learned array of a field, as a tree like the field; see `Stage`.
 
     Raises:
-        ValueError: a group that holds no learned array, and which paths there are.
+        ValueError: a group without a learned array; lists the paths that exist.
     """
     learned = eqx.filter(field, trainable(field))
     paths = list(named_leaves(learned))
@@ -86,10 +87,10 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
 
 
 def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
-    """A run at its start that is to beat its own start: `best` stays the start until an epoch is better.
+    """A run at its start with the validation loss of its initial field: `best` is that field until an epoch is better.
 
     Args:
-        validation: as the objective has prepared it.
+        validation: as prepared by the objective.
     """
     error = settings.objective.validate(state.field, validation, settings)
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
@@ -101,41 +102,40 @@ def fit_in_stages(
     validation: Trajectories,
     key: PRNGKeyArray,
     stages: Sequence[Stage],
+    *,
+    optimiser: optax.GradientTransformation | None = None,
+    regulariser_weight: float | None = None,
     settings: Settings | None = None,
-    regulariser_weight: float = 0.0,
-) -> list[FitState]:
-    """The runs of all stages, one after the other; the last one's `best` is the trained field.
+    progress: Report | bool | None = None,
+) -> list[FitResult]:
+    """Train a field in stages; `results[-1].best` is the trained field. Arguments are those of `fit`.
 
-    Every stage is judged on whole validation windows, and only what is better there than the field that it began with
-    is kept, from the first stage on.
+    Every stage is validated on whole validation windows. Only what is better there than the field that the stage began
+    with is kept, from the first stage on.
 
     Raises:
-        ValueError: what `preparation.prepared` refuses; shorter windows than a stage asks
-            for; rates of a group that the field has not; or no stages.
+        ValueError: as `fit`; windows shorter than a stage needs; rates of a group that the field does not have; or no
+            stages.
     """
-    settings = Settings() if settings is None else settings
-    data, judged_on = prepared(field, train, validation, key, settings)
+    settings = default_settings(train) if settings is None else settings
+    data, validated_on = prepared(field, train, validation, key, settings)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
-    states = []
-    for stage, stage_key in zip(stages, jax.random.split(key, len(stages)), strict=True):
-        plan = make_run_config(
-            rates_by_group(field, stage.rates),
-            jnp.arange(len(data)),
-            len(data),
-            0,
-            stage.patience,
-            stage.epochs,
-            regulariser_weight,
-        )
-        states.append(_fit(start(field, stage_key), plan, cut(data, stage.steps), judged_on, settings))
-        field = states[-1].best
-    return states
+    rates = [rates_by_group(field, stage.rates) for stage in stages]
+    horizons = [cut(data, stage.steps) for stage in stages]
+    optimiser, weight = descent(optimiser), default_weight(regulariser_weight, settings)
+    field, results = ready(field, train), []
+    keys = jax.random.split(key, len(stages))
+    for stage, rate, windows, stage_key in zip(stages, rates, horizons, keys, strict=True):
+        listed = jnp.arange(len(data)), len(data)
+        plan = make_run_config(rate, *listed, 0, stage.patience, stage.epochs, weight)
+        state = _validated(start(field, stage_key, optimiser), validated_on, settings)
+        results.append(drive(state, plan, windows, validated_on, settings, optimiser, progress))
+        field = results[-1].best
+    return results
 
 
-@eqx.filter_jit
-def _fit(state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings) -> FitState:
-    return run(judged(state, validation, settings), plan, train, validation, settings, plan.max_epochs)
+_validated = eqx.filter_jit(judged)
 
 
 def _is_in(path: str, group: str) -> bool:
