@@ -20,7 +20,7 @@ from hybrid_jax import runtime
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import RK4, rollout, rollout_batch
-from hybrid_jax.io.models import Model, load, save
+from hybrid_jax.io import Model, check_savable, load, portable, save
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.training.fitting import fit
 from hybrid_jax.training.objective import Settings
@@ -37,9 +37,11 @@ __all__ = [
     "Settings",
     "Trajectories",
     "Vehicle",
+    "check_savable",
     "fit",
     "load",
     "load_vehicle",
+    "portable",
     "residual_network",
     "rigid_body",
     "rollout",

@@ -6,7 +6,6 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
@@ -15,17 +14,15 @@ from experiments.real_flight.folds import Lessons, padded
 from experiments.real_flight.logs import Windows
 from experiments.real_flight.recipes import Recipe, Step, stage_of
 from experiments.runner.stages import Stages
-from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates
+from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.io.models import portable
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import restricted
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.channels import ChannelLoss, channels_from
@@ -36,21 +33,6 @@ from hybrid_jax.trajectories import Trajectories, concatenate
 from hybrid_jax.vehicle import Vehicle
 
 NETWORK, ORDER = range(2)  # what the keys of a seed are for
-
-
-@portable
-class Kinematics(AbstractVectorField):
-    """ṗ = v and q̇ = ½ q ⊗ [0, ω], with v̇ = ω̇ = 0: what holds without any physics."""
-
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        still = jnp.zeros((6, *x.shape[1:]), x.dtype)
-        return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), still])
-
-
-@train_batch.register(Kinematics)
-@infer_batch.register(Kinematics)
-def _(field, x, u):
-    return field(x, u)
 
 
 @dataclass(frozen=True)

@@ -38,7 +38,7 @@ from experiments.reporting.report_tables import Table, verdicts
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.terms import nominal_values
 from hybrid_jax.flights.splits import flight_of
-from hybrid_jax.io.files import json_text, json_value, write_whole
+from hybrid_jax.io.files import json_text, json_value, write_atomic
 from hybrid_jax.sweep.lanes import lane
 
 PIECES = 6  # predictions in the figure of a flight
@@ -79,7 +79,7 @@ def write_outcome(outcome: Outcome, console: Console) -> None:
     page = sections(head(outcome), tables, captions, record["notes"], record["environment"], shown)
     files = {"rows.csv": to_csv(outcome.rows), "report.md": page, "report.json": json_text(record)}
     for name, content in files.items():
-        write_whole(out / name, content)
+        write_atomic(out / name, content)
     print_tables(console, [*score_tables(outcome.rows, outcome.dt), *judged(claims)])
     console.print(
         f"Fold by fold, parameters, checks of every log: {out / 'report.md'}", highlight=False, soft_wrap=True

@@ -16,7 +16,7 @@ from experiments.paper.rows import DOMAIN_OF, DOMAINS, THETA, Row, check_unique,
 from experiments.paper.standings import standings
 from experiments.reporting.report_page import page
 from experiments.reporting.report_tables import Table, headline, lane_notes, parameters, verdicts
-from hybrid_jax.io.files import json_text, json_value, read_json, write_whole
+from hybrid_jax.io.files import json_text, json_value, read_json, write_atomic
 
 JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
 FLOOR = "wind_sine_mse"  # key of `extra`: the share of L^T_MSE that is the wind's sine
@@ -65,7 +65,7 @@ def write_report(out: str | Path, report: Report) -> None:
     text = page(report_tables(report), **_page_parts(report))
     contents = {CSV_NAME: to_csv(report.rows), PAGE_NAME: text, JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
-        write_whole(out / name, content)
+        write_atomic(out / name, content)
 
 
 def load_report(path: str | Path) -> Report:

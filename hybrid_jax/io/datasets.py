@@ -1,4 +1,4 @@
-"""Sets of windows as one file each: no pickle, checked by its own checksum, the same bytes for the same content."""
+"""Datasets of windows, each in one archive."""
 
 import platform
 from collections.abc import Mapping
@@ -19,11 +19,11 @@ ARRAYS = ("x0", "u", "x")
 
 @dataclass(frozen=True)
 class Dataset:
-    """Named splits and where they come from.
+    """Named splits of windows.
 
     Attributes:
         splits: windows by name.
-        metadata: JSON values; `config` is what fixed the windows, the rest (versions, tallies, …) describes them.
+        metadata: JSON values. `config` determines the windows; the rest (versions, counts, …) describes them.
         origin: the file it was read from, for messages.
     """
 
@@ -33,14 +33,14 @@ class Dataset:
 
     @property
     def config(self) -> Mapping[str, Any]:
-        """What fixed the windows."""
+        """The configuration that determines the windows."""
         return self.metadata.get("config", {})
 
     def first(self, split: str, count: int | None = None) -> Trajectories:
-        """The first `count` windows of a split, or all: subsets of growing count are nested.
+        """The first `count` windows of a split, or all. Larger subsets contain smaller ones.
 
         Raises:
-            ValueError: no such split, or it has fewer windows.
+            ValueError: there is no such split, or it has fewer windows.
         """
         if split not in self.splits:
             raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
@@ -51,29 +51,29 @@ class Dataset:
 
 
 def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) -> None:
-    """Write a dataset, whole or not at all. Saving the same windows and configuration again leaves the file as it is.
+    """Write a dataset atomically. If the file already has these windows and this configuration, it is left unchanged.
 
     Raises:
-        ValueError: windows are malformed, or those of a vehicle have no unit quaternions; metadata are not JSON; or the
-            file exists with other content and `overwrite` is off.
-        OSError: the folder cannot be written.
+        ValueError: windows are malformed, windows of a vehicle have no unit quaternions, metadata are not JSON, or the
+            file exists with other content and `overwrite` is false.
+        OSError: the file cannot be written.
     """
     path = Path(path)
     _check_splits(path, dataset)
     if path.exists() and not overwrite:
         if _has_content(path, content_hash(dataset)):
             return
-        raise ValueError(f"{path}: exists with other content; choose another name or say that it may be overwritten")
+        raise ValueError(f"{path}: exists with other content; choose another path or pass overwrite=True")
     header = {"about": dataset.metadata, "splits": _split_table(dataset)}
     save_archive(path, FORMAT, header, _named_arrays(dataset))
 
 
 def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = None) -> Dataset:
-    """Read a dataset and verify it.
+    """Read and verify a dataset.
 
     Raises:
-        ValueError: the file is missing, truncated, not a dataset, damaged, malformed, or of a configuration other than
-            the expected one; one line that names the file and what is wrong.
+        ValueError: the file is missing, damaged or not a dataset, or its configuration is not the expected one; one
+            line that names the file.
     """
     header, arrays = load_archive(path, FORMAT)
     try:
@@ -83,7 +83,7 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
         }
         dataset = Dataset(splits, dict(header["about"]), origin=str(path))
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
-        raise ValueError(f"{path}: not a whole dataset: lacks {first_line(error)}") from error
+        raise ValueError(f"{path}: not a complete dataset: lacks {first_line(error)}") from error
     _check_splits(path, dataset)
     if expected_config is not None:
         require_config(path, dataset.config, expected_config)
@@ -91,24 +91,25 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
 
 
 def content_hash(dataset: Dataset) -> str:
-    """SHA-256 (hex) over configuration, names, types, shapes, dt and bytes of all windows."""
+    """SHA-256 (hex) of the configuration and all windows."""
     return digest([dataset.config, _split_table(dataset)], _named_arrays(dataset))
 
 
 def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of a configuration, whatever the order of its keys."""
+    """SHA-256 (hex) of a configuration. The order of keys does not matter."""
     return digest(config, {})
 
 
 def versions(*packages: str) -> dict[str, str]:
-    """Python and the installed versions of packages; a package that is not installed reads 'not installed'."""
-    found = {"python": platform.python_version()}
-    for package in packages:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
-    return found
+    """The version of Python and of each package, or "not installed"."""
+    return {"python": platform.python_version()} | {package: _version(package) for package in packages}
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"
 
 
 def _check_splits(path: Path | str, dataset: Dataset) -> None:
@@ -125,11 +126,8 @@ def _split_table(dataset: Dataset) -> dict[str, Any]:
 
 
 def _named_arrays(dataset: Dataset) -> dict[str, np.ndarray]:
-    return {
-        f"{name}/{part}": np.ascontiguousarray(getattr(dataset.splits[name], part))
-        for name in sorted(dataset.splits)
-        for part in ARRAYS
-    }
+    places = ((name, part) for name in sorted(dataset.splits) for part in ARRAYS)
+    return {f"{name}/{part}": np.asarray(getattr(dataset.splits[name], part)) for name, part in places}
 
 
 def _has_content(path: Path, digest: str) -> bool:
@@ -143,7 +141,7 @@ def require_config(path: str | Path, found: Mapping[str, Any], expected: Mapping
     """Compare two configurations.
 
     Raises:
-        ValueError: they differ; one line that names the file and shows every field that does.
+        ValueError: they differ; one line that names the file and every field that differs.
     """
     found, expected = _flatten(found), _flatten(expected)
     differing = [
@@ -156,7 +154,7 @@ def require_config(path: str | Path, found: Mapping[str, Any], expected: Mapping
 
 
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
-    """Nested keys joined by dots → the value as JSON, in which a tuple and a list are the same."""
+    """Nested keys joined by dots → the value as JSON, which does not distinguish tuples from lists."""
     flat = {}
     for key, value in config.items():
         nested = isinstance(value, Mapping)
