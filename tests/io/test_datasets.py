@@ -1,7 +1,6 @@
 """Laws of dataset files."""
 
 import errno
-import json
 import os
 import time
 import zipfile
@@ -59,7 +58,7 @@ def test_round_trip(file, dataset):
         assert loaded.splits[name].dt == 0.01
 
 
-def test_same_content_same_bytes_at_another_time_and_in_another_order(file, dataset, tmp_path, monkeypatch):
+def test_equal_content_gives_equal_bytes(file, dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: 2e9)
     turned = replace(dataset, splits=dict(reversed(dataset.splits.items())))
     save_dataset(tmp_path / "again.npz", turned)
@@ -90,28 +89,21 @@ def test_any_flipped_byte_is_noticed(file):
     assert unnoticed <= 1
 
 
-def test_an_altered_array_with_a_sound_zip_fails_the_checksum(file):
+@pytest.mark.parametrize("missing", [False, True])
+def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     with zipfile.ZipFile(file) as archive:
         entries = {name: archive.read(name) for name in archive.namelist()}
-    changed = bytearray(entries["train/x.npy"])
+    changed = bytearray(entries.pop("train/x.npy"))
     changed[-2] ^= 1
-    entries["train/x.npy"] = bytes(changed)
+    if not missing:
+        entries["train/x.npy"] = bytes(changed)
     with zipfile.ZipFile(file, "w") as archive:
         for name, content in entries.items():
             archive.writestr(name, content)
     assert "checksum differs" in refusal(file)
 
 
-def test_a_missing_array_is_noticed(file):
-    with zipfile.ZipFile(file) as archive:
-        entries = {name: archive.read(name) for name in archive.namelist() if name != "test/u.npy"}
-    with zipfile.ZipFile(file, "w") as archive:
-        for name, content in entries.items():
-            archive.writestr(name, content)
-    assert "checksum differs" in refusal(file)
-
-
-def test_missing_files_and_strangers_are_refused(tmp_path):
+def test_missing_and_other_files_are_refused(tmp_path):
     assert "no such file" in refusal(tmp_path / "none.npz")
     stranger = tmp_path / "stranger.npz"
     np.savez(stranger, a=np.zeros(3))
@@ -126,29 +118,14 @@ def test_missing_files_and_strangers_are_refused(tmp_path):
     assert "not a hybrid_jax dataset" in refusal(tmp_path)
 
 
-def test_pickles_are_never_run(tmp_path):
-    class Trap:
-        def __reduce__(self):
-            return os.mkdir, (str(tmp_path / "sprung"),)
-
-    path = tmp_path / "trap.npz"
-    with zipfile.ZipFile(path, "w") as archive:
-        header = {"format": "hybrid_jax dataset 1", "sha256": "", "metadata": {}, "splits": {}}
-        archive.writestr("header.json", json.dumps(header))
-        with archive.open("x.npy", "w") as entry:
-            np.lib.format.write_array(entry, np.array([Trap()], dtype=object), allow_pickle=True)
-    refusal(path)
-    assert not (tmp_path / "sprung").exists()
-
-
-def test_another_configuration_shows_the_fields_that_differ(file):
+def test_another_configuration_names_the_fields_that_differ(file):
     message = refusal(file, expected_config={**CONFIG, "seed": 1, "vehicle": {"mass": 1.6, "inertia": [0.1, 0.2, 0.3]}})
     assert "seed is 0, expected 1" in message
     assert "vehicle.mass is 1.5, expected 1.6" in message
     assert "inertia" not in message
 
 
-def test_other_content_is_not_overwritten_unless_told(file, dataset):
+def test_overwriting_is_explicit(file, dataset):
     before = file.read_bytes()
     save_dataset(file, dataset)
     other = replace(dataset, splits={"train": windows(3)})
@@ -159,7 +136,7 @@ def test_other_content_is_not_overwritten_unless_told(file, dataset):
     assert len(load_dataset(file).splits["train"]) == 3
 
 
-def test_an_interrupted_write_leaves_the_old_file_and_no_litter(file, dataset, monkeypatch):
+def test_an_interrupted_write_leaves_the_old_file_alone(file, dataset, monkeypatch):
     before = file.read_bytes()
 
     def full_disk(_):
@@ -185,7 +162,7 @@ def test_metadata_must_be_json(tmp_path, dataset):
         save_dataset(tmp_path / "a.npz", replace(dataset, metadata={"config": {"a": float("nan")}}))
 
 
-def test_subsets_are_nested_and_too_large_ones_refused(file):
+def test_subsets_are_nested(file):
     loaded = load_dataset(file)
     np.testing.assert_array_equal(loaded.first("train", 7).x, loaded.first("train").x[:7])
     with pytest.raises(ValueError, match=r"set\.npz: 21 windows of split 'train' asked for, it has 20"):

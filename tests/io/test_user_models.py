@@ -1,0 +1,255 @@
+"""Whatever Equinox module a user writes is saved and comes back the same, and a file never runs code."""
+
+import functools
+import os
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import user_modules
+from pendulum import pendulum
+from user_modules import fields, prediction
+
+import hybrid_jax as hj
+import hybrid_jax.adaptation.expert_augmentation  # defines two of the old classes
+from hybrid_jax.io import describe, structure
+from hybrid_jax.io.archive import named_leaves, save_archive
+from hybrid_jax.io.models import FORMAT
+
+KEY = jax.random.key(1)
+FIELDS = fields()
+OLD_FILES = sorted((Path(__file__).parent / "saved_by_version_1").glob("*.npz"))
+
+
+def python(*arguments):
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    command = [sys.executable, *map(str, arguments)]
+    return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=300)
+
+
+@pytest.fixture(scope="module")
+def in_fresh_process(tmp_path_factory):
+    """Predictions of all models, saved here and loaded in another process."""
+    folder = tmp_path_factory.mktemp("models")
+    for name, field in FIELDS.items():
+        hj.save(folder / f"{name}.npz", field)
+    done = python("-c", "import sys, user_modules; user_modules.predict_all(sys.argv[1])", folder)
+    assert done.returncode == 0, done.stderr
+    return np.load(folder / "predictions.npy.npz")
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_fresh_process_predicts_the_same(name, in_fresh_process):
+    np.testing.assert_array_equal(in_fresh_process[name], prediction(name, hj.Model(FIELDS[name])))
+
+
+@pytest.mark.parametrize("name", FIELDS)
+def test_a_loaded_model_is_the_saved_one(name, tmp_path):
+    path, field = tmp_path / "model.npz", FIELDS[name]
+    assert hj.check_savable(field) is None
+    with warnings.catch_warnings(action="error"):
+        hj.save(path, field)
+    for loaded in (hj.load(path).field, hj.load(path, like=fields()[name]).field):
+        assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
+        assert describe(loaded) == describe(field)
+
+
+def test_two_runs_of_a_script_share_its_classes(tmp_path):
+    script = tmp_path / "script.py"
+    script.write_text(
+        "import sys, jax, jax.numpy as jnp, hybrid_jax as hj\n"
+        "class Decay(hj.AbstractVectorField):\n"
+        "    rate: jax.Array\n"
+        "    def __init__(self, key): self.rate = jax.random.uniform(key, (2,))\n"
+        "    def __call__(self, x, u): return -self.rate * x\n"
+        "if sys.argv[1] == 'save': hj.save('model.npz', Decay(jax.random.key(3)))\n"
+        "print(hj.load('model.npz').field.rate)\n"
+    )
+    first, second = (
+        subprocess.run([sys.executable, script, what], cwd=tmp_path, capture_output=True, text=True, timeout=300)
+        for what in ("save", "load")
+    )
+    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
+    assert first.stdout == second.stdout
+
+
+@pytest.mark.parametrize("path", OLD_FILES, ids=lambda path: path.stem)
+def test_files_of_version_1_predict_what_they_did(path):
+    model = hj.load(path)
+    x0, u, dt = np.float32(model.about["x0"]), np.float32(model.about["u"]), model.about["dt"]
+    if "past" in model.about:
+        found = model.field.predict(hj.Trajectories(x0, u, np.float32(model.about["past"]), dt), u)
+    else:
+        found = model.predict(x0, u, dt)
+    # Programs of another optimisation level round differently.
+    np.testing.assert_allclose(found, model.about["prediction"], rtol=1e-5, atol=1e-5)
+    assert len(OLD_FILES) == 23
+
+
+def module_with(monkeypatch, name, sign):
+    """An imported module of this name with a class Linear: ẋ = sign a x."""
+    module = ModuleType(name)
+    code = "import hybrid_jax as hj\nclass Linear(hj.AbstractVectorField):\n    a: object\n"
+    exec(f"{code}    def __call__(self, x, u): return {sign} * self.a * x", vars(module))
+    monkeypatch.setitem(sys.modules, name, module)
+    return module
+
+
+def test_classes_of_one_name_are_told_apart_by_module(tmp_path, monkeypatch):
+    one, other = module_with(monkeypatch, "one", 1), module_with(monkeypatch, "other", -1)
+    for module in (one, other):
+        hj.save(tmp_path / f"{module.__name__}.npz", module.Linear(jnp.ones(())))
+    assert type(hj.load(tmp_path / "one.npz").field) is one.Linear
+    assert type(hj.load(tmp_path / "other.npz").field) is other.Linear
+
+
+def test_a_class_that_is_not_imported_is_named(tmp_path, monkeypatch):
+    module = module_with(monkeypatch, "one", 1)
+    hj.save(tmp_path / "model.npz", module.Linear(jnp.ones(())))
+    monkeypatch.delitem(sys.modules, "one")
+    with pytest.raises(ValueError, match=r"one:Linear .*import one first, or pass like="):
+        hj.load(tmp_path / "model.npz")
+    assert hj.load(tmp_path / "model.npz", like=module.Linear(jnp.zeros(()))).field.a == 1
+
+
+def test_a_portable_name_outlives_its_module_and_is_unique(tmp_path, monkeypatch):
+    monkeypatch.setattr(structure, "_PORTABLE", {})
+    old, new = module_with(monkeypatch, "old", 1), module_with(monkeypatch, "new", 1)
+    hj.save(tmp_path / "model.npz", hj.portable(old.Linear, name="linear")(jnp.ones(())))
+    with pytest.raises(ValueError, match=r"'linear' is taken by old:Linear"):
+        hj.portable(name="linear")(new.Linear)
+    monkeypatch.setattr(structure, "_PORTABLE", {})
+    hj.portable(name="linear")(new.Linear)
+    assert type(hj.load(tmp_path / "model.npz").field) is new.Linear
+
+
+def local_field(gain=2.0, size=3, dtype=np.float32):
+    class Local(hj.AbstractVectorField):
+        net: eqx.Module
+        gain: jax.Array
+
+        def __call__(self, x, u):
+            return self.gain * self.net(x)
+
+    return Local(eqx.nn.Linear(size, size, key=KEY), jnp.asarray(gain, dtype))
+
+
+def with_activation(function):
+    return eqx.tree_at(lambda field: field.net.activation, FIELDS["perceptron"], function)
+
+
+# Name → model that a file cannot rebuild, the same with other weights, and the part that is the reason.
+SKELETONS = {
+    "local class": (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
+    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/net/activation"),
+    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/net/activation"),
+    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/net/activation.*prediction"),
+}
+
+
+@pytest.mark.parametrize("name", SKELETONS)
+def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
+    path, (field, like, reason) = tmp_path / "model.npz", SKELETONS[name]
+    like = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_inexact_array(leaf) else leaf, like)
+    assert re.fullmatch(rf"{reason}.*", hj.check_savable(field))
+    with pytest.warns(UserWarning, match=rf"like=.*{reason}"):
+        hj.save(path, field)
+    with pytest.raises(ValueError, match=rf"model\.npz: .*{reason if name != 'local class' else ''}.*pass like="):
+        hj.load(path)
+    loaded = hj.load(path, like=like).field
+    assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
+    assert type(loaded) is type(like)
+    with pytest.raises(ValueError, match="field"):
+        describe(field)
+
+
+@pytest.mark.filterwarnings("ignore:.*like=")
+def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
+    hj.save(tmp_path / "model.npz", local_field())
+    with pytest.raises(ValueError, match=r"'field/net/bias' is float32\[3\], expected float32\[4\]$"):
+        hj.load(tmp_path / "model.npz", like=local_field(size=4))
+    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected int32\[\]$"):
+        hj.load(tmp_path / "model.npz", like=local_field(dtype=np.int32))
+    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected none$"):
+        hj.load(tmp_path / "model.npz", like=pendulum())
+
+
+def test_a_skeleton_with_other_static_values_is_refused(tmp_path):
+    hj.save(tmp_path / "model.npz", FIELDS["wrapper"])
+    other = user_modules.Scaled(FIELDS["wrapper"].inner, (1.0, 3.0))
+    with pytest.raises(ValueError, match=r"field/scale/1 is 2\.0, but 3\.0 in `like`$"):
+        hj.load(tmp_path / "model.npz", like=other)
+
+
+def test_what_cannot_be_saved_is_refused_with_its_path(tmp_path):
+    reason = r"field/layers/1 is of type .*TextIOWrapper, which cannot be saved"
+    with Path(__file__).open() as file:
+        field = eqx.tree_at(lambda field: field.layers[1], FIELDS["convolution"], file)
+        assert re.match(reason, hj.check_savable(field))
+        with pytest.raises(ValueError, match=reason):
+            hj.save(tmp_path / "model.npz", field)
+    assert hj.check_savable(len).startswith("field must be an Equinox module")
+    assert not list(tmp_path.iterdir())
+
+
+class Alarm(eqx.Module):
+    """An Equinox module that would tell if any code of it ran."""
+
+    command: str
+
+    def __init__(self, command):
+        raise AssertionError(command)
+
+    __check_init__ = __init__
+
+
+LINEAR = "equinox.nn._linear:Linear"
+HOSTILE = {
+    "class that is a function": {"class": "os:system", "fields": {"command": "touch sprung"}},
+    "class of another kind": {"class": "subprocess:Popen", "fields": {"args": "touch sprung"}},
+    "module as class": {"class": "os", "fields": {}},
+    "function of an imported module": {"named": "os.system"},
+    "builtin": {"named": "builtins.eval"},
+    "function that reads files": {"named": "jax.numpy.load"},
+    "module that is not imported": {"class": "antigravity:Module", "fields": {}},
+    "class by another name": {"class": "hybrid_jax:Hybrid", "fields": {"physics": 1, "residual": 1}},
+    "method": {"class": f"{LINEAR}.__call__", "fields": {}},
+    "attribute of a method": {"class": f"{LINEAR}.__init__.__globals__", "fields": {}},
+    "abstract class": {"class": "hybrid_jax.dynamics.base:AbstractVectorField", "fields": {}},
+    "fields of another class": {"class": LINEAR, "fields": {"__class__": "os", "__dict__": 1}},
+    "unknown entry": {"run": "touch sprung"},
+}
+
+
+@pytest.mark.parametrize("name", HOSTILE)
+def test_a_hostile_structure_is_refused(name, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    inside = {"class": "hybrid_jax.dynamics.base:Hybrid", "fields": {"physics": HOSTILE[name], "residual": None}}
+    for tree in (HOSTILE[name], inside):
+        save_archive("hostile.npz", FORMAT, {"field": tree, "about": {}}, {})
+        with pytest.raises(ValueError, match=r"^hostile\.npz: .*$"):
+            hj.load("hostile.npz")
+    assert [path.name for path in tmp_path.iterdir()] == ["hostile.npz"]
+    assert "antigravity" not in sys.modules
+
+
+def test_no_code_of_a_users_class_runs(tmp_path):
+    tree = {"class": f"{__name__}:Alarm", "fields": {"command": "touch sprung"}}
+    save_archive(tmp_path / "model.npz", FORMAT, {"field": tree, "about": {}}, {})
+    assert hj.load(tmp_path / "model.npz").field.command == "touch sprung"
+
+
+def test_a_description_names_classes_and_static_values_but_holds_no_arrays():
+    one = describe(FIELDS["nested"])
+    assert one["class"] == "user_modules:Nested"
+    assert one["fields"]["options"] == {"class": "@Options", "fields": {"gain": 0.7, "steps": {"tuple": [1, 2]}}}
+    assert one == describe(user_modules.Nested(KEY))
+    assert one != describe(eqx.tree_at(lambda field: field.limits, FIELDS["nested"], (-1.0, 5.0)))
