@@ -4,6 +4,7 @@ Reading a structure runs no code that the file chooses. A class is looked up amo
 already imported and must be an Equinox module of exactly that name. Its `__init__` is not called.
 """
 
+import builtins
 import dataclasses
 import inspect
 import math
@@ -33,7 +34,10 @@ _TYPES = """bool_ int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 bflo
 # The functions and types that a file may name.
 _ALLOWED: dict[str, Any] = {
     f"{module.__name__}.{name}": vars(module)[name]
-    for module, names in ((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE + " " + _TYPES), (np, _TYPES))
+    for module, names in (
+        *((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE), (jnp, _TYPES), (np, _TYPES)),
+        (builtins, "bool int float complex"),
+    )
     for name in names.split()
     if name in vars(module)
 }
@@ -135,7 +139,7 @@ class Structure:
     def _unknown(self, value: Any, path: str, static: bool) -> Any:
         name = _address(type(value))
         if callable(value):
-            name = f"the function {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
+            name = f"the callable {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
         elif not static and jax.tree_util.all_leaves([value]):
             expected = "an array, number, text, function, container or module"
             raise ValueError(f"{path} is of type {name}, which cannot be saved; expected {expected}")
