@@ -44,7 +44,7 @@ def derivative(field: AbstractVectorField, x, u):
         return derivative(field.physics, x, u) + derivative(field.residual, x, u)
     if not (isinstance(field, ResidualNetwork) and isinstance(field.norm, BatchNorm)):
         return field(x, u)
-    hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+    hidden = field.weight_in @ field.scaling.concatenate(x, u)
     mean, variance = moments(hidden)
     normalised = (hidden - mean) / jnp.sqrt(variance + field.norm.epsilon)
     return field.weight_out @ jax.nn.relu(field.norm.gain * normalised + field.norm.shift) + field.bias_out
@@ -68,7 +68,7 @@ def observed(field: AbstractVectorField, x0, u, predicted):
     if not (isinstance(field, ResidualNetwork) and isinstance(field.norm, BatchNorm)):
         return field
     starts = jnp.concatenate([x0[None], predicted[:-1]])
-    mean, variance = moments(field.weight_in @ jnp.concatenate([starts, field.scaling(u)], axis=1).T)
+    mean, variance = moments(field.weight_in @ field.scaling.concatenate(starts.T, u.T))
     norm = field.norm
     running = jax.tree.map(
         lambda old, new: old + norm.momentum * (new - old), norm.running, RunningStats(mean, variance)

@@ -21,6 +21,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.dynamics.rigid_body import RigidBody as OurRigidBody
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm
+from hybrid_jax.networks.scaling import InputScaling
 from hybrid_jax.trajectories import Trajectories
 
 
@@ -75,6 +76,7 @@ class Network(nn.Module):
         super().__init__()
         norm = field.norm
         assert isinstance(norm, BatchNorm)
+        assert isinstance(field.scaling, InputScaling)
         self.weight_in, self.gain, self.shift, self.weight_out, self.bias_out = (
             nn.Parameter(tensor(leaf))
             for leaf in (field.weight_in, norm.gain, norm.shift, field.weight_out, field.bias_out)

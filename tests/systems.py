@@ -18,7 +18,6 @@ import hybrid_jax as hj
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.io.models import portable
 
 STEPS = 10
 GRID = 64
@@ -44,7 +43,6 @@ class System:
     test: hj.Trajectories
 
 
-@portable
 class Car(AbstractVectorField):
     """A single-track car: x = (X [m], Y [m], yaw [rad], v_x, v_y [m/s, body], yaw rate [rad/s]), u = (steering [rad],
     acceleration [m/s²]).
@@ -80,7 +78,6 @@ class Car(AbstractVectorField):
         )
 
 
-@portable
 class Burgers(AbstractVectorField):
     """∂w/∂t = −w ∂w/∂s + ν ∂²w/∂s² + u sin 2πs + r w (1 − w²) at `GRID` points of a ring of length 1."""
 
@@ -94,7 +91,6 @@ class Burgers(AbstractVectorField):
         return -x * slope + jnp.exp(self.log_viscosity) * bend + force + self.reaction * x * (1 - x**2)
 
 
-@portable
 class Dense(AbstractVectorField):
     """Equinox' own network of [x, u]."""
 
@@ -104,7 +100,6 @@ class Dense(AbstractVectorField):
         return self.network(jnp.concatenate([x, u]))
 
 
-@portable
 class Convolution(AbstractVectorField):
     """Two layers of Equinox' convolution along the ring; blind to u."""
 
@@ -115,7 +110,6 @@ class Convolution(AbstractVectorField):
         return self.second(jax.nn.tanh(self.first(x[None])))[0]
 
 
-@portable
 class Gain(AbstractVectorField):
     """A user's wrapper around another field."""
 

@@ -163,11 +163,7 @@ def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
 
 
 def _read_entries(path: Path) -> dict[str, bytes]:
-    """The bytes of each entry by name.
-
-    Names that leave the folder, and compressed entries, which could fill the memory, are refused: neither is written
-    here.
-    """
+    """The bytes of each entry by name. Refuses names that leave the folder, and compression, which may hide a size."""
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             place = PurePosixPath(entry.filename.replace("\\", "/"))

@@ -5,7 +5,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import equinox as eqx
 import jax
@@ -14,13 +14,14 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import check_start
 from hybrid_jax.integrate import checked, rollout, rollout_batch
-from hybrid_jax.io.archive import load_archive, named_leaves, save_archive, to_numpy, with_leaves
+from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"
-FORMAT_1 = "hybrid_jax model 1"
+FORMAT_1 = "hybrid_jax model 1"  # still read: see `renamed`
 
 
 @dataclass(frozen=True)
@@ -32,7 +33,7 @@ class Model:
         about: JSON values, such as where the model comes from and its test error.
     """
 
-    field: Any
+    field: AbstractVectorField
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def predict(
@@ -111,12 +112,12 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
         raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
-    if not isinstance(field, eqx.Module):
-        raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
-    return Model(field, about)
+    if isinstance(field, eqx.Module):
+        return Model(cast(AbstractVectorField, field), about)
+    raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
 
 
-def _filled(like: eqx.Module, tree: Any, arrays: Mapping[str, np.ndarray]) -> eqx.Module:
+def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
     """`like` with the arrays of a file."""
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
     filled = with_leaves({"field": like}, dynamic)["field"]

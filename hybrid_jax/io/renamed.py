@@ -11,9 +11,10 @@ from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.networks.fused import FusedNetwork
-from hybrid_jax.networks.mlp import InputScaling, LinearResidual, LinearSkip, ResidualNetwork
+from hybrid_jax.networks.mlp import LinearResidual, LinearSkip, ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.scaling import InputScaling
 from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
 from hybrid_jax.vehicle import Vehicle
 

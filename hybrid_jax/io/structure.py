@@ -4,11 +4,12 @@ Reading a structure runs no code that the file chooses. A class is looked up amo
 already imported and must be an Equinox module of exactly that name. Its `__init__` is not called.
 """
 
+import builtins
 import dataclasses
 import inspect
 import math
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import is_dataclass
 from functools import partial
 from types import ModuleType
@@ -19,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hybrid_jax.io.archive import array_type, from_numpy
+from hybrid_jax.io.archive import Arrays, array_type, from_numpy
 from hybrid_jax.io.renamed import RENAMED
 
 _ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid
@@ -33,13 +34,18 @@ _TYPES = """bool_ int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 bflo
 # The functions and types that a file may name.
 _ALLOWED: dict[str, Any] = {
     f"{module.__name__}.{name}": vars(module)[name]
-    for module, names in ((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE + " " + _TYPES), (np, _TYPES))
+    for module, names in (
+        *((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE), (jnp, _TYPES), (np, _TYPES)),
+        (builtins, "bool int float complex"),
+    )
     for name in names.split()
     if name in vars(module)
 }
 _ALLOWED["equinox.identity"] = inspect.signature(eqx.nn.MLP).parameters["final_activation"].default
 _PORTABLE: dict[str, Any] = {}  # "@name" → class or function
-_NAMES = {"class", "kind", "named", "unknown", "array", "static", "key", "dtype"}  # tags of entries that hold no value
+# Keys of JSON objects: names of things, and content.
+_NAMES = {"class", "kind", "named", "unknown", "array", "static", "key", "dtype"}
+_CONTENT = {"fields", "items", "tuple", "list", "float", "complex"}
 Item = TypeVar("Item", bound=Callable)
 
 
@@ -133,7 +139,7 @@ class Structure:
     def _unknown(self, value: Any, path: str, static: bool) -> Any:
         name = _address(type(value))
         if callable(value):
-            name = f"the function {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
+            name = f"the callable {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
         elif not static and jax.tree_util.all_leaves([value]):
             expected = "an array, number, text, function, container or module"
             raise ValueError(f"{path} is of type {name}, which cannot be saved; expected {expected}")
@@ -144,7 +150,7 @@ class Structure:
         self.problem = self.problem or problem
 
 
-def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+def decode(value: Any, arrays: Arrays) -> Any:
     """The object that a structure describes.
 
     Raises:
@@ -186,10 +192,8 @@ def static_values(tree: Any, path: str = "field") -> dict[str, Any]:
     """The numbers, text and None in a structure, by path."""
     match tree:
         case dict():
-            tags = {"fields", "items", "tuple", "list", "float", "complex"}
-            parts = [
-                (path if key in tags else f"{path}/{key}", item) for key, item in tree.items() if key not in _NAMES
-            ]
+            pairs = [(key, item) for key, item in tree.items() if key not in _NAMES]
+            parts = [(path if key in _CONTENT else f"{path}/{key}", item) for key, item in pairs]
         case list():
             parts = [(f"{path}/{index}", item) for index, item in enumerate(tree)]
         case _:
