@@ -8,7 +8,7 @@ import pytest
 from test_least_squares import Push, pushes
 
 from hybrid_jax import rotation
-from hybrid_jax.adaptation.least_squares import fit_least_squares, parametrise, residual
+from hybrid_jax.adaptation.least_squares import fit_least_squares, prediction_errors, ravel_parameters
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
@@ -80,10 +80,10 @@ def inside():
 
 def descended(field, windows, steps=3):
     """Least squares by Gauss and Newton's steps from near the minimum: `fit_least_squares` takes long to compile."""
-    theta, rebuild = parametrise(field)
+    theta, rebuild = ravel_parameters(field)
 
     def errors(theta):
-        r = jax.vmap(lambda window: residual(rebuild(theta), window))(windows).ravel()
+        r = jax.vmap(lambda window: prediction_errors(rebuild(theta), window))(windows).ravel()
         return r, r
 
     def step(theta, _):

@@ -1,0 +1,256 @@
+"""Systems that the library must serve from fit to file: a truth, a changed truth, a model of it and windows.
+
+`SYSTEMS[name]()` builds one; all are small enough that tens of windows of 10 intervals train in seconds.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from pendulum import pendulum
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.io.models import portable
+
+STEPS = 10
+GRID = 64
+
+
+@dataclass(frozen=True)
+class System:
+    """A system to learn on `source` windows and to adapt to on `target` windows.
+
+    Attributes:
+        truth, changed: the true field of the source and of the target.
+        model: the field to train; its physics has wrong parameters and leaves out a force.
+        train, validation: windows of the truth.
+        target, test: windows of the changed truth.
+    """
+
+    truth: AbstractVectorField
+    changed: AbstractVectorField
+    model: AbstractVectorField
+    train: hj.Trajectories
+    validation: hj.Trajectories
+    target: hj.Trajectories
+    test: hj.Trajectories
+
+
+@portable
+class Car(AbstractVectorField):
+    """A single-track car: x = (X [m], Y [m], yaw [rad], v_x, v_y [m/s, body], yaw rate [rad/s]), u = (steering [rad],
+    acceleration [m/s²]).
+
+    A tyre's lateral force is c α for a small slip angle α, and saturates at `grip` times its load if that is given.
+    """
+
+    log_front: Float[Array, ""]  # log of the cornering stiffness over the nominal one
+    log_rear: Float[Array, ""]
+    grip: float | None = eqx.field(static=True, default=None)
+    drag: float = eqx.field(static=True, default=0.0)  # [1/m]
+
+    def __call__(self, x, u):
+        _, _, yaw, v, side, rate = x
+        mass, inertia, front, rear = 1500.0, 2500.0, 1.2, 1.6
+        load = mass * 9.81 / (front + rear)
+
+        def tyre(log_stiffness, slip, arm):
+            force = 8e4 * jnp.exp(log_stiffness) * slip
+            return force if self.grip is None else self.grip * load * arm * jnp.tanh(force / (self.grip * load * arm))
+
+        ahead = tyre(self.log_front, u[0] - jnp.arctan2(side + front * rate, v), rear)
+        behind = tyre(self.log_rear, -jnp.arctan2(side - rear * rate, v), front)
+        return jnp.stack(
+            [
+                v * jnp.cos(yaw) - side * jnp.sin(yaw),
+                v * jnp.sin(yaw) + side * jnp.cos(yaw),
+                rate,
+                u[1] - ahead * jnp.sin(u[0]) / mass + side * rate - self.drag * v**2,
+                (ahead * jnp.cos(u[0]) + behind) / mass - v * rate,
+                (front * ahead * jnp.cos(u[0]) - rear * behind) / inertia,
+            ]
+        )
+
+
+@portable
+class Burgers(AbstractVectorField):
+    """∂w/∂t = −w ∂w/∂s + ν ∂²w/∂s² + u sin 2πs + r w (1 − w²) at `GRID` points of a ring of length 1."""
+
+    log_viscosity: Float[Array, ""]
+    reaction: float = eqx.field(static=True, default=0.0)
+
+    def __call__(self, x, u):
+        ahead, behind = jnp.roll(x, -1), jnp.roll(x, 1)
+        slope, bend = (ahead - behind) * (GRID / 2), (ahead - 2 * x + behind) * GRID**2
+        force = u[0] * jnp.sin(2 * jnp.pi * jnp.arange(GRID) / GRID).astype(x.dtype)
+        return -x * slope + jnp.exp(self.log_viscosity) * bend + force + self.reaction * x * (1 - x**2)
+
+
+@portable
+class Dense(AbstractVectorField):
+    """Equinox' own network of [x, u]."""
+
+    network: eqx.nn.MLP
+
+    def __call__(self, x, u):
+        return self.network(jnp.concatenate([x, u]))
+
+
+@portable
+class Convolution(AbstractVectorField):
+    """Two layers of Equinox' convolution along the ring; blind to u."""
+
+    first: eqx.nn.Conv1d
+    second: eqx.nn.Conv1d
+
+    def __call__(self, x, u):
+        return self.second(jax.nn.tanh(self.first(x[None])))[0]
+
+
+@portable
+class Gain(AbstractVectorField):
+    """A user's wrapper around another field."""
+
+    log_gain: Float[Array, ""]
+    field: AbstractVectorField
+
+    def __call__(self, x, u):
+        return jnp.exp(self.log_gain) * self.field(x, u)
+
+
+def car(front=1.0, rear=1.0, **options):
+    """A car whose cornering stiffnesses are these factors of the nominal ones."""
+    return Car(jnp.log(jnp.asarray(front)), jnp.log(jnp.asarray(rear)), **options)
+
+
+def burgers(viscosity, reaction=0.0):
+    """Burgers' equation with a viscosity and a rate of reaction."""
+    return Burgers(jnp.log(jnp.asarray(viscosity)), reaction)
+
+
+def windows(field, start, inputs, dt, count, seed):
+    """Windows of a field from `start(rng, count)` (n, d) under `inputs(rng, (n, t))` (n, t, m)."""
+    rng = np.random.default_rng(seed)
+    x0 = jnp.asarray(start(rng, count), np.float32)
+    u = jnp.asarray(inputs(rng, (count, STEPS)), np.float32)
+    return hj.Trajectories(x0, u, jax.jit(hj.rollout_batch)(field, x0, u, dt), dt)
+
+
+def _system(truth, changed, model, start, inputs, dt, counts=(60, 30)) -> System:
+    def made(field, count, seed):
+        return windows(field, start, inputs, dt, count, seed)
+
+    many, few = counts
+    return System(
+        truth, changed, model, made(truth, many, 0), made(truth, few, 1), made(changed, 20, 2), made(changed, few, 3)
+    )
+
+
+def _pendulum(wrap=lambda network: network, norm="batch") -> System:
+    residual = hj.residual_network(2, 1, jax.random.key(1), hidden=16, norm=norm)
+    return _system(
+        truth=pendulum(0.5, 0.8),
+        changed=pendulum(0.7, 0.8),
+        model=hj.Hybrid(pendulum(0.6), wrap(residual)),
+        start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * [2.0, 4.0],
+        inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)),
+        dt=0.05,
+    )
+
+
+def car_start(rng, n):
+    """Anywhere within 100 m, at 10 to 25 m/s."""
+    low, high = [-100, -100, -np.pi, 10, -1, -0.4], [100, 100, np.pi, 25, 1, 0.4]
+    return rng.uniform(low, high, (n, 6))
+
+
+def car_inputs(rng, shape):
+    """Steering within 0.12 rad and acceleration within 3 m/s², held over a window but for a tenth of them."""
+    held = rng.uniform(-1, 1, (shape[0], 1, 2)) + 0.1 * rng.normal(size=(*shape, 2))
+    return held * [0.12, 3.0]
+
+
+def _car() -> System:
+    return _system(
+        truth=car(grip=0.9, drag=1e-3),
+        changed=car(0.7, 0.8, grip=0.9, drag=1e-3),
+        model=hj.Hybrid(car(1.3, 0.8), hj.residual_network(6, 2, jax.random.key(1), hidden=16)),
+        start=car_start,
+        inputs=car_inputs,
+        dt=0.05,
+    )
+
+
+def _flights(truth, changed, model) -> System:
+    speed = hj.IRIS.hover_speed
+
+    def start(rng, n):
+        q = np.array([1.0, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
+        q /= np.linalg.norm(q, axis=-1, keepdims=True)
+        return np.concatenate(
+            [rng.normal(size=(n, 3)), q, 2 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))], axis=-1
+        )
+
+    def inputs(rng, shape):
+        return speed * (1 + 0.1 * rng.normal(size=(shape[0], 1, 4)) + 0.02 * rng.normal(size=(*shape, 4)))
+
+    return _system(truth, changed, model, start, inputs, 0.01)
+
+
+def _iris() -> System:
+    true = Terms(drag=(0.3, 0.3, 0.1))
+    heavy = jax.tree.map(lambda leaf: leaf + 0.2, multirotor(hj.IRIS, terms=true))
+    residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
+    return _flights(multirotor(hj.IRIS, terms=true), heavy, hj.Hybrid(hj.rigid_body(hj.IRIS), residual))
+
+
+def _multirotor() -> System:
+    def real(shift, learn=("Ix", "Iy", "k_rotors", "drag", "centre_of_mass"), drag=0.3):
+        return jax.tree.map(lambda leaf: leaf + shift, multirotor(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
+
+    residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
+    return _flights(real(0.05), real(0.15), hj.Hybrid(real(0.0, drag=0.0), residual))
+
+
+def _ring(residual) -> System:
+    def start(rng, n):
+        wave = 2 * np.pi * (np.arange(1, 4)[:, None] * np.arange(GRID) / GRID)
+        return (0.5 * rng.normal(size=(n, 1, 3)) @ np.sin(wave) + 0.5 * rng.normal(size=(n, 1, 3)) @ np.cos(wave))[:, 0]
+
+    return _system(
+        truth=burgers(0.01, 1.0),
+        changed=burgers(0.015, 1.0),
+        model=hj.Hybrid(burgers(0.02), residual),
+        start=start,
+        inputs=lambda rng, shape: rng.normal(size=(*shape, 1)),
+        dt=0.01,
+    )
+
+
+def _dense() -> System:
+    return _ring(Dense(eqx.nn.MLP(GRID + 1, GRID, 32, 1, activation=jax.nn.softplus, key=jax.random.key(1))))
+
+
+def _convolution() -> System:
+    first, second = jax.random.split(jax.random.key(1))
+    options = {"kernel_size": 5, "padding": "SAME", "padding_mode": "CIRCULAR"}
+    return _ring(Convolution(eqx.nn.Conv1d(1, 8, **options, key=first), eqx.nn.Conv1d(8, 1, **options, key=second)))
+
+
+SYSTEMS: dict[str, Callable[[], System]] = {
+    "pendulum": cache(_pendulum),
+    "car": cache(_car),
+    "iris": cache(_iris),
+    "multirotor": cache(_multirotor),
+    "ring_dense": cache(_dense),
+    "ring_convolution": cache(_convolution),
+    "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network), norm="layer")),
+}
