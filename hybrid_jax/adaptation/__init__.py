@@ -20,7 +20,7 @@ from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmen
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.adaptation.methods import METHODS, FineTune, LeastSquares, Method, Ridge, Solution, Source
 from hybrid_jax.adaptation.result import Adaptation, Parameter
-from hybrid_jax.adaptation.uncertainty import Interval, covariance_of, intervals, standard_errors
+from hybrid_jax.adaptation.uncertainty import Interval, covariance_of, intervals
 
 __all__ = [
     "METHODS",
@@ -43,5 +43,4 @@ __all__ = [
     "fit_least_squares",
     "intervals",
     "select_disturbance",
-    "standard_errors",
 ]

@@ -8,13 +8,12 @@ The fits without one window are solved from the normal equations at the minimum,
 (PRESS; Allen 1974). Windows must be independent; the errors within one need not be.
 """
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, fit_least_squares
+from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares
 from hybrid_jax.adaptation.uncertainty import inverse, normal_equations
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.disturbance import (
@@ -46,7 +45,7 @@ class DisturbanceSelection(eqx.Module):
 def select_disturbance(
     field: AbstractVectorField,
     windows: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: Solver = None,
     max_steps: int = 100,
     scale: Scale = None,
     indices: tuple[int, ...] | None = None,
@@ -57,9 +56,7 @@ def select_disturbance(
 
     Args:
         windows: n independent ones.
-        max_steps: of each of the two fits.
-        scale: divides the error of each state.
-        indices: the disturbed states, see `with_disturbance`.
+        indices: the disturbed states, see `with_disturbance`; for the rest see `fit_least_squares`.
 
     Raises:
         ValueError: as `fit_least_squares`.
@@ -84,10 +81,7 @@ def _selection(
 
 
 def left_out(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
-    scale: Scale = None,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, " n"]:
     """L_MSE of each window as predicted by a fit of θ_p to all others, to first order in the change of θ_p.
 
@@ -95,7 +89,6 @@ def left_out(
 
     Args:
         field: one whose θ_p minimises L_MSE of all windows.
-        scale: divides the error of each state.
     """
     gram, score, square = normal_equations(field, windows, solver, scale=scale)
     others = jnp.sum(gram, axis=0) - gram, jnp.sum(score, axis=0) - score

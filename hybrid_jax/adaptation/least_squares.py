@@ -24,6 +24,7 @@ from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 
+Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
 
 
@@ -65,11 +66,7 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
 
 
 def fit_least_squares(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
-    max_steps: int = 100,
-    scale: Scale = None,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver = None, max_steps: int = 100, scale: Scale = None
 ) -> LeastSquaresFit:
     """Minimise L_MSE in inference mode over the θ_p of the field's physics.
 
@@ -78,7 +75,6 @@ def fit_least_squares(
 
     Args:
         windows: of any length; in a compiled program their values are not checked.
-        solver: integrates the rollouts; RK4 by default.
         scale: divides the error of each state.
 
     Raises:
@@ -113,9 +109,7 @@ def check_determined(field: AbstractVectorField, n: int) -> None:
 
 
 @eqx.filter_jit
-def _fit_least_squares(
-    field, windows: Trajectories, solver: diffrax.AbstractSolver | None, max_steps: int, scale: Scale
-) -> LeastSquaresFit:
+def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale) -> LeastSquaresFit:
     start, unravel = ravel_parameters(field)
 
     def residuals(theta: Float[Array, " p"]) -> Float[Array, "n t d"]:
@@ -171,10 +165,7 @@ def ravel_parameters(
 
 
 def prediction_errors(
-    field: AbstractVectorField,
-    window: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
-    scale: Scale = None,
+    field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
     """(x_t − x̂_t) / scale of one window, x̂ in inference mode."""
     errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, solver)

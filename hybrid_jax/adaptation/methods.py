@@ -22,13 +22,7 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class Solution(NamedTuple):
-    """The result of `Method.solve`.
-
-    Attributes:
-        field: the adapted field.
-        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
-        status: STOPPED (converged), CAPPED (at the limit of steps) or DIVERGED, as in `hybrid_jax.training.fitting`.
-    """
+    """The adapted field, the steps that it took, and STOPPED (converged), CAPPED or DIVERGED of training.fitting."""
 
     field: AbstractVectorField
     steps: Int[Array, ""] | int = 0
@@ -52,10 +46,11 @@ class Method(Protocol):
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field to the windows `train`. Methods of the library compile and map over stacked fields.
+        """Adapt a field to the windows `train`, judged by `validation` if it must choose or stop.
+
+        Methods of the library compile and map over stacked fields.
 
         Args:
-            validation: for early stopping and the choice of hyper-parameters; not to be trained on.
             settings: the solver, the objective, and the size of minibatches.
 
         Raises:

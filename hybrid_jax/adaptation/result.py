@@ -33,16 +33,15 @@ class Adaptation:
     """An adapted field and what is known about it.
 
     Attributes:
-        field: the adapted field.
-        method: its method: the name, or the class of one that was passed as a value.
-        parameters: of its physics and disturbance, by name; see `uncertainty.named_parameters`.
-        disturbance: the constant disturbance of ẋ, one number for each state, if it has one.
-        mse_before, mse_after: L_MSE on all windows, of the source field and of the adapted one.
+        method: the name, or the class of a method that was passed as a value.
+        parameters: of physics and disturbance, by name; see `uncertainty.named_parameters`.
+        disturbance: the constant disturbance of ẋ, one number for each state, if there is one.
+        mse_before, mse_after: L_MSE of source and adapted field on all windows.
         windows: their number.
         steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
         status: "converged", "stopped at the limit of steps" or "diverged".
         level: confidence level of the intervals.
-        without_intervals: why the parameters have no intervals, if they have none.
+        without_intervals: why there are no intervals, if there are none.
     """
 
     field: AbstractVectorField

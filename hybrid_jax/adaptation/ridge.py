@@ -7,14 +7,15 @@ uses state and input themselves.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from hybrid_jax import checks
+from hybrid_jax.adaptation.least_squares import Solver
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import checked, integrate
 from hybrid_jax.networks.mlp import LinearResidual, ResidualNetwork
@@ -24,28 +25,11 @@ from hybrid_jax.trajectories import Trajectories, check
 PENALTIES = tuple(10.0**power for power in range(6, -5, -1))  # the strongest, which changes least, first
 
 Penalty = Float[Array, ""] | float
-Update = Callable[
-    [AbstractVectorField, Trajectories, Penalty, diffrax.AbstractSolver | None], AbstractVectorField
-]  # such as `last_layer`
+Update = Callable[[AbstractVectorField, Trajectories, Penalty, Solver], AbstractVectorField]  # such as `last_layer`
 
 
-class Transitions(eqx.Module):
-    """Recorded intervals of length dt [s]: the states at both ends and the input held between them."""
-
-    before: Float[Array, "s d"]
-    after: Float[Array, "s d"]
-    u: Float[Array, "s m"]
-    dt: float = eqx.field(static=True)
-
-
-class RidgeFit(eqx.Module):
-    """The result of `fit_ridge`.
-
-    Attributes:
-        field: the adapted field.
-        penalty: the one chosen; if it is an end of the grid, the grid is too short.
-        mse: the validation loss; by default L_MSE on the validation windows.
-    """
+class RidgeFit(NamedTuple):
+    """The field at the penalty that was chosen, which should not be an end of the grid, and its validation loss."""
 
     field: AbstractVectorField
     penalty: Float[Array, ""]
@@ -53,10 +37,7 @@ class RidgeFit(eqx.Module):
 
 
 def last_layer(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    penalty: Penalty,
-    solver: diffrax.AbstractSolver | None = None,
+    field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> AbstractVectorField:
     """The field with the output layer of its network changed by ΔW, Δb.
 
@@ -75,20 +56,17 @@ def last_layer(
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
     check(windows, "windows")
     checks.positive("penalty", penalty)
-    data = transitions(windows)
+    before, u, after = transitions(windows)
     activations = jax.vmap(network.activations)
-    middle = (activations(data.before, data.u) + activations(data.after, data.u)) / 2
-    weight, bias = ridge(middle, defects(field, data, solver), penalty)
+    middle = (activations(before, u) + activations(after, u)) / 2
+    weight, bias = ridge(middle, defects(field, windows, solver), penalty)
     output = (network.weight_out + weight, network.bias_out + bias)
     changed = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, output)
     return Hybrid(field.physics, changed) if isinstance(field, Hybrid) else changed
 
 
 def linear_residual(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    penalty: Penalty,
-    solver: diffrax.AbstractSolver | None = None,
+    field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
     """The field plus a linear map of [x, u], regressed on the defects as in `last_layer`.
 
@@ -100,10 +78,10 @@ def linear_residual(
     """
     check(windows, "windows")
     checks.positive("penalty", penalty)
-    data = transitions(windows)
-    z = jnp.concatenate([(data.before + data.after) / 2, data.u], axis=1)
+    before, u, after = transitions(windows)
+    z = jnp.concatenate([(before + after) / 2, u], axis=1)
     mean, scale = mean_and_scale(z)
-    weight, bias = ridge((z - mean) / scale, defects(field, data, solver), penalty)
+    weight, bias = ridge((z - mean) / scale, defects(field, windows, solver), penalty)
     return Hybrid(field, LinearResidual(weight / scale, bias - weight @ (mean / scale)))
 
 
@@ -153,25 +131,23 @@ def best_candidate(
     return jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf)), losses
 
 
-def transitions(windows: Trajectories) -> Transitions:
-    """All intervals of all windows."""
+def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"]]:
+    """The state before, the input held and the state after, of all intervals of all windows."""
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
-    return Transitions(*(jnp.reshape(a, (x.shape[0] * x.shape[1], a.shape[2])) for a in (before, x, u)), dt=windows.dt)
+    before, u, x = (jnp.reshape(a, (-1, a.shape[2])) for a in (before, u, x))
+    return before, u, x
 
 
-def defects(
-    field: AbstractVectorField, data: Transitions, solver: diffrax.AbstractSolver | None = None
-) -> Float[Array, "s d"]:
-    """e, the derivative that the field lacks, mean of the interval's two ends, to second order in dt.
+def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:
+    """e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
 
     With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e: a missing acceleration also changes the position,
     and would be corrected there a second time. The same step backwards from x₁ is off by the opposite amount, so the
     mean of the two has no such error. An exact field has no defect.
     """
-
-    before, after, dt = data.before, data.after, data.dt
-    before, u, solver = checked(field, before, data.u[:, None], dt, solver, windows=True)
+    (before, u, after), dt = transitions(windows), windows.dt
+    before, u, solver = checked(field, before, u[:, None], dt, solver, windows=True)
     after = after.astype(before.dtype)
 
     def step(start: Float[Array, "s d"], dt: float) -> Float[Array, "s d"]:

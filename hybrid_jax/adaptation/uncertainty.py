@@ -19,7 +19,6 @@ intervals are too narrow. Neither contains bias: effects that the model cannot e
 from collections.abc import Callable
 from typing import Literal, NamedTuple
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,6 +28,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import (
     Scale,
+    Solver,
     check_determined,
     check_windows,
     prediction_errors,
@@ -56,7 +56,7 @@ def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
     kind: Kind = "sandwich",
-    solver: diffrax.AbstractSolver | None = None,
+    solver: Solver = None,
     chunk: int = 250,
     error: ErrorLoss | None = None,
     scale: Scale = None,
@@ -100,23 +100,17 @@ def _covariance_of(
 
 
 class NormalEquations(NamedTuple):
-    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its residual r.
+    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
 
-    Attributes:
-        gram: JᵀJ.
-        score: Jᵀr.
-        square: rᵀr.
-    """
-
-    gram: Float[Array, "n p p"]
-    score: Float[Array, "n p"]
-    square: Float[Array, " n"]
+    gram: Float[Array, "n p p"]  # JᵀJ
+    score: Float[Array, "n p"]  # Jᵀr
+    square: Float[Array, " n"]  # rᵀr
 
 
 def normal_equations(
     field: AbstractVectorField,
     windows: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: Solver = None,
     chunk: int = 250,
     error: ErrorLoss | None = None,
     scale: Scale = None,
@@ -145,17 +139,6 @@ def _expanded(
     return jnp.einsum("tde,tep->tdp", curvature, jacobian), jax.vmap(jax.grad(error))(r)
 
 
-def standard_errors(field: AbstractVectorField, covariance: Float[Array, "p p"]) -> AbstractVectorField:
-    """A tree like the physics with the standard error of each parameter in its place.
-
-    Raises:
-        ValueError: a covariance of another number of parameters or, where it is known, one that is not finite or has a
-            negative variance.
-    """
-    theta, unravel = ravel_parameters(physics_of(field))
-    return unravel(_deviations(covariance, theta.size))
-
-
 def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
     """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
 
@@ -163,7 +146,8 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
     that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
 
     Raises:
-        ValueError: a level that is not between 0 and 1; as `standard_errors`.
+        ValueError: a level that is not between 0 and 1; a covariance of another number of parameters or, where it is
+            known, one that is not finite or has a negative variance.
     """
     if not 0 < (checks.real(level) or 0) < 1:
         raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")

@@ -8,6 +8,7 @@ import pytest
 from pendulum import LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
+from hybrid_jax.adaptation.adapting import adapt
 from hybrid_jax.adaptation.expert_augmentation import RECORDED, Augmentation, expert_augmented, prediction_mse
 from hybrid_jax.integrate import rollout
 from hybrid_jax.metrics import rollout_mse
@@ -61,6 +62,13 @@ def test_what_is_read_moves_to_a_changed_vehicle_and_predicts_it(trained, factor
     assert np.median(lengths(trained, target)) == pytest.approx(factor * LENGTH, rel=0.1)
     alone = rollout_mse(trained.expert.field, split(target, PAST)[1])
     assert prediction_mse(trained, target, PAST) < 0.5 * alone
+
+
+def test_it_is_a_method_of_adapt(trained):
+    target = flights(100, seed=5, length=0.7 * LENGTH)
+    result = adapt(trained.expert.field, target, method=trained)
+    found = np.exp(result.parameters["log_length"].value)
+    assert found == pytest.approx(0.7 * LENGTH, rel=0.1)
 
 
 def test_a_box_of_one_point_leaves_the_source_model():

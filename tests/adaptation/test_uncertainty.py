@@ -17,7 +17,7 @@ from test_least_squares import Brake, Push, log_lengths, pushes
 from experiments import coverage as command
 from experiments.coverage import Config, coverage
 from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals, standard_errors
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.vehicle import IRIS
@@ -82,12 +82,6 @@ def test_a_lane_is_the_covariance_alone():
 def test_a_residual_is_taken_as_given():
     bare, hybrid = (covariance_of(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0)))))
     np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
-
-
-def test_standard_errors_stand_where_the_parameters_do():
-    errors = standard_errors(Hybrid(rigid_body(IRIS), Push(jnp.ones(2))), COVARIANCE)
-    for name, error in zip(("Ix", "Iy", "k"), (0.01, 0.02, 0.03), strict=True):
-        np.testing.assert_allclose(errors.log_ratios[name], error, rtol=1e-6)
 
 
 @pytest.mark.parametrize(("level", "z"), [(0.6827, 1.0), (0.95, 1.95996)])  # of the normal distribution's table
