@@ -49,14 +49,11 @@ def adapt(
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
-        settings: by default RK4, minibatches of at most 100, and a loss in which each state's error is relative to its
-            RMS change over a window, so that units do not matter (for a rigid body: position, attitude, velocity, body
-            rates).
+        settings: by default RK4, minibatches of at most 100, and `scaled_loss`, so that units do not matter.
         level: confidence level of the intervals.
 
     Raises:
-        ValueError: an unknown method, windows that are malformed, too few or not of this field, or a field that the
-            method cannot adapt.
+        ValueError: an unknown method, malformed, too few or other windows, or a field that the method cannot adapt.
     """
     name, method = _method(method)
     check_windows(field, windows)
@@ -67,18 +64,24 @@ def adapt(
     for part, data in (("windows", windows), ("validation", held_out)):
         check_windows(field, data, part)
         checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
+    exact, size = getattr(method, "has_intervals", False), _size(field)
+    if exact and size > NAMED:
+        name = type(physics_of(field)).__name__
+        raise ValueError(f"field: {name} has {size} parameters, no named physics to fit; use method='fine_tune'")
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
-    adapted = _without_zero(solution.field) if disturbance_of(field) is None else solution.field
-    exact = getattr(method, "has_intervals", False) and int(solution.status) != DIVERGED
-    parameters, missing = _parameters(adapted, train, settings, level, exact)
-    disturbance = disturbance_of(adapted)
+    adapted, found = solution.field, disturbance_of(solution.field)
+    disturbance = None if found is None else np.asarray(found.vector(windows.x0.shape[-1]))
+    if disturbance_of(field) is None and not np.any(disturbance):  # the windows need none
+        adapted, disturbance = without_disturbance(adapted), None
+    finite = int(solution.status) != DIVERGED
+    parameters, missing = _parameters(adapted, train, settings, level, exact and finite)
     return Adaptation(
         field=adapted,
         method=name,
         parameters=parameters,
-        disturbance=None if disturbance is None else np.asarray(disturbance.vector(windows.x0.shape[-1])),
+        disturbance=disturbance,
         mse_before=float(_mse(field, windows, solver=settings.solver)),
         mse_after=float(_mse(adapted, windows, solver=settings.solver)),
         windows=len(windows),
@@ -125,21 +128,19 @@ def _split(windows: Trajectories, validation: Trajectories | None, needed: bool)
     return windows[:last], windows[last:]
 
 
-def _without_zero(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without a disturbance that is zero, as where windows were found to need none."""
-    found = disturbance_of(field)
-    return field if found is None or np.any(np.asarray(found.value)) else without_disturbance(field)
+def _size(field: AbstractVectorField) -> int:
+    """The number of parameters of the physics, without a disturbance."""
+    physics = physics_of(without_disturbance(field))
+    return sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics))))
 
 
 def _parameters(
     field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, exact: bool
 ) -> tuple[dict[str, Parameter], str | None]:
     """The parameters by name, and why they have no intervals, if they have none."""
-    physics = physics_of(field)
-    learned = jax.tree.leaves(eqx.filter(physics, trainable(physics)))
-    if not 0 < sum(leaf.size for leaf in learned) <= NAMED:
+    if not 0 < _size(field) <= NAMED:
         return {}, NOT_LEAST_SQUARES
-    own = without_disturbance(physics)
+    own = physics_of(without_disturbance(field))
     units = UNITS if isinstance(own, AbstractRigidBody) else getattr(own, "units", {})
     values = {
         name: Parameter(float(value), unit=units.get(name, units.get(name.split("[")[0])))

@@ -27,19 +27,12 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class DisturbanceSelection(eqx.Module):
-    """The result of `select_disturbance`.
-
-    Attributes:
-        fit: the fit that was kept; the disturbance of its field is zero where the windows need none.
-        needed: whether they need one.
-        gain: by how much it lowers L_MSE of left-out windows, mean over windows.
-        standard_error: of the gain.
-    """
+    """The fit that was kept, with a disturbance of zero if none is needed, and why."""
 
     fit: LeastSquaresFit
     needed: Bool[Array, ""]
-    gain: Float[Array, ""]
-    standard_error: Float[Array, ""]
+    gain: Float[Array, ""]  # by how much a disturbance lowers L_MSE of left-out windows, mean over windows
+    standard_error: Float[Array, ""]  # of the gain
 
 
 def select_disturbance(

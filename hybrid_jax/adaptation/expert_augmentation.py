@@ -32,16 +32,11 @@ RECORDED = -1  # the augmentation_seed of a recorded window
 
 @portable
 class Encoder(eqx.Module):
-    """A perceptron from the states and inputs of the past to one number in (−1, 1) for each parameter.
-
-    Attributes:
-        weights, biases: of its layers, in order.
-        seen: mean and variance of its inputs over source flights.
-    """
+    """A perceptron from the states and inputs of the past to one number in (−1, 1) for each parameter."""
 
     weights: tuple[Float[Array, "out in"], ...]
     biases: tuple[Float[Array, " out"], ...]
-    seen: RunningStats
+    seen: RunningStats  # of its inputs over source flights
 
     def __call__(self, past: Trajectories) -> Float[Array, " p"]:
         z = (encoder_inputs(past) - self.seen.mean) * jax.lax.rsqrt(self.seen.variance + 1e-12)
@@ -55,16 +50,11 @@ class ExpertAugmented(eqx.Module):
     """A hybrid whose θ_p an encoder estimates from the past of each flight.
 
     It is also a method of `adapt`: the mean of its estimates over the heads of the windows.
-
-    Attributes:
-        encoder: the trainable part.
-        expert: the hybrid of the source.
-        box: lowest and highest factor on each of the expert's parameters.
     """
 
     encoder: Encoder
-    expert: Frozen
-    box: tuple[float, float] = eqx.field(static=True)
+    expert: Frozen  # the hybrid of the source
+    box: tuple[float, float] = eqx.field(static=True)  # lowest and highest factor on each of the expert's parameters
     uses_validation: ClassVar[bool] = False
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:

@@ -29,19 +29,12 @@ Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; w
 
 
 class LeastSquaresFit(eqx.Module):
-    """The result of `fit_least_squares`.
+    """The result of `fit_least_squares`."""
 
-    Attributes:
-        field: the field with the fitted θ_p; the start if no finite L_MSE was reached.
-        mse: its L_MSE on the windows, of errors over `scale`.
-        steps: evaluations of the residuals and their Jacobian.
-        converged: whether it stopped before `max_steps`, at a finite L_MSE.
-    """
-
-    field: AbstractVectorField
-    mse: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    field: AbstractVectorField  # with the fitted θ_p; the start if no finite L_MSE was reached
+    mse: Float[Array, ""]  # L_MSE on the windows, of errors over `scale`
+    steps: Int[Array, ""]  # evaluations of the residuals and their Jacobian
+    converged: Bool[Array, ""]  # whether it stopped before `max_steps`, at a finite L_MSE
 
 
 class _LevenbergMarquardt(optimistix.AbstractGaussNewton):

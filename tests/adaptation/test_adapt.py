@@ -163,7 +163,7 @@ class Nothing(AbstractVectorField):
 
 
 class Weights(AbstractVectorField):
-    gains: Float[Array, " 60"]
+    gains: Float[Array, " n"]
 
     def __call__(self, x, u):
         return x * self.gains.sum()
@@ -182,7 +182,12 @@ class Weights(AbstractVectorField):
         (
             Weights(jnp.zeros(60)),
             {},
-            "windows: 40 are too few for the 60 parameters of Weights, at least 61 are needed",
+            "field: Weights has 60 parameters, no named physics to fit; use",
+        ),
+        (
+            Weights(jnp.zeros(45)),
+            {},
+            "windows: 40 are too few for the 45 parameters of Weights, at least 46",
         ),
         (hj.rigid_body(hj.IRIS), {}, "field: RigidBody does not take a state"),
     ],
