@@ -143,7 +143,7 @@ OF_WINDOWS = {
     "covariance": lambda w, n: uncertainty.covariance_of(SWING, w, chunk=n),
     "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
     "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),
-    "adapted": lambda w, n: ridge.adapted(ridge.last_layer, MIXED, w, WINDOWS, (1.0, n)),
+    "adapted": lambda w, n: ridge.fit_ridge(ridge.last_layer, MIXED, w, WINDOWS, (1.0, n)),
     "mse": lambda w, n: metrics.rollout_mse(SWING, w, n),
     "split": lambda w, n: split(check(w), n),
     "windows_of": lambda w, n: check(windows_of(w.u[0], w.u[0, :-1], w.dt, steps=n)),

@@ -49,7 +49,7 @@ class CommonField(AbstractVectorField):
 
     def acting(self, x: State, residual: State) -> State:
         """What of ẋ is not f_p, from what the residual returned."""
-        return apply_residual(self.body, x, self.steady.of_all + residual)
+        return apply_residual(self.body, x, self.steady.vector(STATE_SIZE) + residual)
 
     def linearize(self, x, u, dx, du):
         alone, slope = linearize(self.body, x, u, dx, du)

@@ -75,7 +75,7 @@ def nine_numbers(
 def disturbed_seeds(nine: Trained) -> list[str]:
     """How many seeds of each domain have a constant disturbance, in words."""
     fields: dict[tuple[str, int], Any] = {**nine.adapted}
-    pushes = {domain: field.physics.residual.acceleration for (domain, _), field in fields.items()}
+    pushes = {domain: field.physics.residual.value for (domain, _), field in fields.items()}
     counts = {domain: np.any(np.asarray(push) != 0, axis=1) for domain, push in pushes.items()}
     return [f"{domain}: {found.sum()} of {len(found)} seeds have a disturbance." for domain, found in counts.items()]
 

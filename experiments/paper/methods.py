@@ -17,9 +17,9 @@ from experiments.paper.study import domain_name, places
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
-from hybrid_jax.adaptation.least_squares import physics_of
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, unfreeze
+from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane
@@ -107,7 +107,7 @@ def augmented(case: Case, name: str) -> Lanes:
     def one(model, windows: Trajectories):
         past, _ = split(windows, PAST)
         typical = jnp.mean(jax.lax.map(model.estimate, past, batch_size=min(250, len(past))), axis=0)
-        return prediction_mse(model, windows, PAST, solver), physics_of(model.flying(typical))
+        return prediction_mse(model, windows, PAST, solver), physics_of(model.with_parameters(typical))
 
     experts = case.experts
     errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: by_lane(one, experts.best, windows))
@@ -144,7 +144,7 @@ def with_intervals(case: Case, lanes: Lanes) -> Lanes:
 
 def _ridge(method) -> Callable[[Case, str], Lanes]:
     def solve(field, train, validation, shared):
-        return ridge.adapted(method, field, train, validation, solver=shared.solver).field, 0, STOPPED
+        return ridge.fit_ridge(method, field, train, validation, settings=shared).field, 0, STOPPED
 
     return found_by(solve)
 

@@ -13,7 +13,7 @@ import numpy as np
 from experiments.paper.conditions import drawn, settings
 from experiments.paper.config import Config
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation.disturbance_selection import fit_with_selected_disturbance
+from hybrid_jax.adaptation.disturbance_selection import select_disturbance
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
@@ -90,7 +90,7 @@ def constant_disturbance(field, train: Trajectories, validation: Trajectories, s
 
 def needed_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
     """The same, but a disturbance of zero where the windows need none."""
-    return _told(fit_with_selected_disturbance(field, train, shared.solver).fit)
+    return _told(select_disturbance(field, train, shared.solver).fit)
 
 
 def _told(found: LeastSquaresFit):

@@ -131,7 +131,7 @@ def parameters(fields: Any, lanes: Sequence[Lane], training: Windows, objective:
 
 def _parameters(fields: Any, own: np.ndarray, windows: Trajectories, objective: ChannelLoss):
     """θ_p alone where there are no more windows than parameters."""
-    enough = own.shape[1] > least_squares.parametrise(lane(fields, 0))[0].size
+    enough = own.shape[1] > least_squares.ravel_parameters(lane(fields, 0))[0].size
     ends = jax.device_get(_intervals(fields, own, windows, objective) if enough else _values(fields))
 
     def one(index: int) -> dict[str, Any]:
@@ -155,7 +155,7 @@ def _intervals(fields: Any, own: Int[np.ndarray, "lanes n"], windows: Trajectori
 def _values(fields: Any):
     def one(field):
         body = body_of(field)
-        size = least_squares.parametrise(body)[0].size
+        size = least_squares.ravel_parameters(body)[0].size
         return intervals(body, jnp.zeros((size, size)))
 
     return jax.lax.map(one, fields)
@@ -180,7 +180,7 @@ def linear_residuals(
 @eqx.filter_jit
 def _linear_residuals(base, windows: Trajectories, subsets: Int[np.ndarray, "lanes n"], validation: Trajectories):
     def one(subset):
-        return ridge.adapted(ridge.linear_residual, base, windows[subset], validation).field
+        return ridge.fit_ridge(ridge.linear_residual, base, windows[subset], validation).field
 
     return jax.lax.map(one, subsets)
 

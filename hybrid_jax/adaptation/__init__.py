@@ -1,0 +1,46 @@
+"""Adapt a trained field to a few windows of a changed system, and say how well its parameters are known.
+
+    source = hj.fit(hj.Hybrid(pendulum, network), train, validation, key)
+    result = hj.adapt(source.best, windows)
+    print(result.report())
+    result.parameters["log_length"].value, result.parameters["log_length"].low
+
+By default least squares fits the physical parameters θ_p and, if the windows need one, a constant disturbance; the
+network stays as it is. `METHODS` lists the other methods by name; a method is a value, and `Method` says how to write
+one.
+
+- adapting, result, methods: `adapt`, what it returns, and the methods.
+- least_squares, disturbance_selection, uncertainty: the pure functions behind least squares and its intervals.
+- ridge, expert_augmentation: corrections in closed form; an encoder that estimates θ_p from the past.
+"""
+
+from hybrid_jax.adaptation.adapting import adapt
+from hybrid_jax.adaptation.disturbance_selection import DisturbanceSelection, select_disturbance
+from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
+from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
+from hybrid_jax.adaptation.methods import METHODS, FineTune, LeastSquares, Method, Ridge, Solution, Source
+from hybrid_jax.adaptation.result import Adaptation, Parameter
+from hybrid_jax.adaptation.uncertainty import Interval, covariance_of, intervals
+
+__all__ = [
+    "METHODS",
+    "Adaptation",
+    "Augmentation",
+    "DisturbanceSelection",
+    "ExpertAugmented",
+    "FineTune",
+    "Interval",
+    "LeastSquares",
+    "LeastSquaresFit",
+    "Method",
+    "Parameter",
+    "Ridge",
+    "Solution",
+    "Source",
+    "adapt",
+    "covariance_of",
+    "expert_augmented",
+    "fit_least_squares",
+    "intervals",
+    "select_disturbance",
+]

@@ -1,7 +1,7 @@
-"""θ_p alone by nonlinear least squares: the physics' parameters that minimise L_MSE, everything else as it is.
+"""Nonlinear least squares for the physical parameters θ_p; a hybrid's residual stays as it is.
 
-With a handful of parameters the Jacobian of all windows costs as much as a few rollouts, and Levenberg–Marquardt
-(Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands. θ_p is meant in the physics' own
+With a handful of parameters the Jacobian of all windows costs as much as a few rollouts, so Levenberg–Marquardt
+(Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands. θ_p is in the physics' own
 parametrisation: for a `RigidBody` the log-ratios.
 """
 
@@ -16,28 +16,25 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import rollout
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 
+Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
+Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
+
 
 class LeastSquaresFit(eqx.Module):
-    """What least squares found.
+    """The result of `fit_least_squares`."""
 
-    Attributes:
-        field: the field with the fitted θ_p; the start itself if no finite L_MSE was reached.
-        mse: its L_MSE on the windows.
-        steps: evaluations of the residuals and their Jacobian.
-        converged: whether it stopped by itself, at a finite L_MSE, before `max_steps`.
-    """
-
-    field: AbstractVectorField
-    mse: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
+    field: AbstractVectorField  # with the fitted θ_p; the start if no finite L_MSE was reached
+    mse: Float[Array, ""]  # L_MSE on the windows, of errors over `scale`
+    steps: Int[Array, ""]  # evaluations of the residuals and their Jacobian
+    converged: Bool[Array, ""]  # whether it stopped before `max_steps`, at a finite L_MSE
 
 
 class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
@@ -62,47 +59,54 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
 
 
 def fit_least_squares(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: diffrax.AbstractSolver | None = None,
-    max_steps: int = 100,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver = None, max_steps: int = 100, scale: Scale = None
 ) -> LeastSquaresFit:
-    """Minimise L_MSE of the field as deployed over the θ_p of its physics; a hybrid's residual stays as it is.
+    """Minimise L_MSE in inference mode over the θ_p of the field's physics.
 
     Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. The precision
-    is that of θ_p: to about 1e-3 standard errors in float32.
+    is that of θ_p: about 1e-3 standard errors in float32.
 
     Args:
-        windows: of any length; in a compiled program their numbers are not looked at.
-        solver: integrates the rollouts; RK4 by default.
+        windows: of any length; in a compiled program their values are not checked.
+        scale: divides the error of each state.
 
     Raises:
-        ValueError: the physics has nothing to fit, or windows that are malformed or not of this field.
+        ValueError: the physics has no parameter, or windows that are malformed or not of this field.
     """
     check_windows(field, windows)
     checks.count("max_steps", max_steps)
-    return _fit_least_squares(field, windows, solver, max_steps)
+    return _fit_least_squares(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
-    """Refuse windows that nothing can be learned from: malformed ones, or those of a rigid body that has no attitude.
+    """Refuse malformed windows, and those of a rigid body without unit quaternions.
 
     Raises:
-        ValueError: what of `name` is wrong, and where.
+        ValueError: what is wrong with `name`, and where.
     """
     check(windows, name)
     if moves_a_rigid_body(field):
         check_attitudes(windows, name)
 
 
+def check_determined(field: AbstractVectorField, n: int) -> None:
+    """Refuse n windows if the physics has as many parameters or more.
+
+    Raises:
+        ValueError: it has, or it has none.
+    """
+    p = ravel_parameters(field)[0].size
+    if n <= p:
+        name = type(physics_of(field)).__name__
+        raise ValueError(f"windows: {n} are too few for the {p} parameters of {name}, at least {p + 1} are needed")
+
+
 @eqx.filter_jit
-def _fit_least_squares(
-    field, windows: Trajectories, solver: diffrax.AbstractSolver | None, max_steps: int
-) -> LeastSquaresFit:
-    start, rebuild = parametrise(field)
+def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale) -> LeastSquaresFit:
+    start, unravel = ravel_parameters(field)
 
     def residuals(theta: Float[Array, " p"]) -> Float[Array, "n t d"]:
-        return jax.vmap(lambda window: residual(rebuild(theta), window, solver))(windows)
+        return jax.vmap(lambda window: prediction_errors(unravel(theta), window, solver, scale))(windows)
 
     # Each parameter is measured by what it does to the residuals, and these by their size at the start, so that the
     # damping and the tolerances, which are absolute numbers, mean the same for any units, data and field (Moré 1978).
@@ -130,44 +134,35 @@ def _fit_least_squares(
     reached = _mse(residuals(theta))
     finite = jnp.isfinite(reached)
     return LeastSquaresFit(
-        field=rebuild(jnp.where(finite, theta, start)),
+        field=unravel(jnp.where(finite, theta, start)),
         mse=jnp.where(finite, reached, _mse(at_start)),
         steps=jnp.asarray(found.stats["num_steps"], jnp.int32),
         converged=(found.result == optimistix.RESULTS.successful) & finite,
     )
 
 
-def physics_of(field: AbstractVectorField) -> AbstractVectorField:
-    """f_p: the physics of a hybrid, or the field itself."""
-    return field.physics if isinstance(field, Hybrid) else field
-
-
-def parametrise(
+def ravel_parameters(
     field: AbstractVectorField,
 ) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], AbstractVectorField]]:
     """θ_p as a vector, in the order of the physics' leaves, and the field as a function of it.
 
     Raises:
-        ValueError: the physics has no parameter that may be learned.
+        ValueError: the physics has no trainable parameter.
     """
     physics = physics_of(field)
     learned, rest = eqx.partition(physics, trainable(physics))
     theta, unravel = ravel_pytree(learned)
     if theta.size == 0:
         raise ValueError(f"field: its physics, {type(physics).__name__}, has no parameter to fit")
-
-    def rebuild(theta: Float[Array, " p"]) -> AbstractVectorField:
-        fitted = eqx.combine(unravel(theta), rest)
-        return Hybrid(fitted, field.residual) if isinstance(field, Hybrid) else fitted
-
-    return theta, rebuild
+    return theta, lambda theta: with_physics(field, eqx.combine(unravel(theta), rest))
 
 
-def residual(
-    field: AbstractVectorField, window: Trajectories, solver: diffrax.AbstractSolver | None = None
+def prediction_errors(
+    field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
-    """x_t − x̂_t of one window, x̂ as deployed."""
-    return jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, solver)
+    """(x_t − x̂_t) / scale of one window, x̂ in inference mode."""
+    errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, solver)
+    return errors if scale is None else (errors / scale).astype(errors.dtype)
 
 
 def _mse(residuals: Float[Array, "n t d"]) -> Float[Array, ""]:
@@ -175,5 +170,5 @@ def _mse(residuals: Float[Array, "n t d"]) -> Float[Array, ""]:
 
 
 def _nonzero(size: Float[Array, "*p"]) -> Float[Array, "*p"]:
-    """A size to divide by; where there is none, 1: a parameter without effect then stays where it is."""
+    """The size, or 1 where it is zero: a parameter without effect then stays where it is."""
     return jnp.where(size > 0, size, 1)

@@ -1,12 +1,8 @@
-"""A constant disturbance of a multirotor: the simplest thing that a change can bring which its physics has no name for.
+"""A constant disturbance of the state derivative: steady wind, a load off centre, a biased actuator.
 
-A steady wind, a load off centre, a bent blade: all of them push or turn the vehicle by what hardly changes in a window.
-Six numbers hold that, and together with θ_p least squares finds them from seconds of flight, where a network that was
-taught by plenty of flight would forget some of it:
+Least squares finds it together with the physical parameters θ_p (see `hybrid_jax.adaptation`):
 
     fit_least_squares(with_disturbance(hybrid), windows).field
-
-Whether there is such a push the windows tell as well: see `disturbance_fit.fit_with_selected_disturbance`.
 """
 
 from typing import ClassVar
@@ -16,47 +12,103 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
-SIZE = STATE_SIZE - VELOCITY.start
+ACCELERATIONS = STATE_SIZE - VELOCITY.start  # v̇ and ω̇ of a rigid body; ṗ and q̇ follow from v and ω exactly
 
 
 class ConstantDisturbance(AbstractVectorField):
-    """ẋ = [0, 0, a, α], whatever x and u are.
+    """ẋ = d at the disturbed states and zero at the others, for all x and u.
 
-    The code serves a batch as it stands: x (13,) and u (4,) may carry trailing batch axes.
+    The code serves a batch as it stands: x (d,) and u (m,) may carry trailing batch axes.
 
     Attributes:
-        acceleration: a [m/s², world] and α [rad/s², body].
+        value: one number for each disturbed state, in the unit of its derivative. A scalar holds for every state.
+        indices: the disturbed states; by default the last `len(value)` states.
+
+    Raises:
+        ValueError: another number of indices than of values.
     """
 
     accepts_batch: ClassVar[bool] = True
 
-    acceleration: Float[Array, "6"]
+    value: Float[Array, "*k"]
+    indices: tuple[int, ...] | None = eqx.field(static=True, default=None)
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        return jnp.broadcast_to(self.of_all.reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
+    def __check_init__(self):
+        if self.indices is not None and jnp.shape(self.value)[-1:] != (len(self.indices),):
+            raise ValueError(f"indices: {len(self.indices)} for a value of shape {jnp.shape(self.value)}")
 
-    @property
-    def of_all(self) -> Float[Array, "13"]:
-        """ẋ of any state."""
-        return jnp.concatenate([jnp.zeros(VELOCITY.start, self.acceleration.dtype), self.acceleration])
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        return jnp.broadcast_to(self.vector(len(x)).reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
+
+    def vector(self, d: int) -> Float[Array, " d"]:
+        """ẋ of any of d states."""
+        if self.value.ndim == 0:
+            return jnp.broadcast_to(self.value, (d,))
+        if self.indices is None:
+            return jnp.concatenate([jnp.zeros(d - len(self.value), self.value.dtype), self.value])
+        if not 0 <= min(self.indices) <= max(self.indices) < d:
+            raise ValueError(f"indices must be between 0 and {d - 1}, got {self.indices}")
+        entries, zero = dict(zip(self.indices, self.value, strict=True)), jnp.zeros((), self.value.dtype)
+        return jnp.stack([entries.get(i, zero) for i in range(d)])
 
 
-def disturbed(field: AbstractVectorField, acceleration: Float[Array, "6"]) -> Hybrid:
-    """ẋ = f(x, u) + [0, 0, a, α]: any field and a constant disturbance, as in `ConstantDisturbance`."""
-    return Hybrid(field, ConstantDisturbance(acceleration))
+def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tuple[int, ...] | None = None) -> Hybrid:
+    """ẋ = f(x, u) + d: a field of any kind and a `ConstantDisturbance`."""
+    return Hybrid(field, ConstantDisturbance(value, indices))
 
 
-def with_disturbance(field: Hybrid) -> Hybrid:
-    """A hybrid whose physics has a constant disturbance of zero beside it, which `fit_least_squares` fits too.
+def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None = None) -> AbstractVectorField:
+    """The field with a constant disturbance of zero in its physics, for `fit_least_squares` to fit.
 
-    Raises:
-        ValueError: no hybrid.
+    A field that has one already is returned as it is.
+
+    Args:
+        indices: the disturbed states; by default v̇ and ω̇ of a rigid body, and every state of another system.
     """
-    if not isinstance(field, Hybrid):
-        raise ValueError(f"field must be a Hybrid, got {checks.short_repr(field)}")
-    dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(field.physics, eqx.is_inexact_array)))
-    return Hybrid(disturbed(field.physics, jnp.zeros(SIZE, jnp.result_type(*dtypes, jnp.float32))), field.residual)
+    physics = physics_of(field)
+    if disturbance_of(field) is not None:
+        return field
+    dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
+    shape = (ACCELERATIONS,) if moves_a_rigid_body(physics) else ()
+    zero = jnp.zeros(shape if indices is None else (len(indices),), jnp.result_type(*dtypes, jnp.float32))
+    return with_physics(field, disturbed(physics, zero, indices))
+
+
+def without_disturbance(field: AbstractVectorField) -> AbstractVectorField:
+    """The field without the constant disturbance of its physics, if it has one."""
+    physics = physics_of(field)
+    return with_physics(field, physics.physics) if isinstance(physics, Hybrid) else field
+
+
+def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
+    """The field with one number for each of d states where the disturbance of its physics is a scalar."""
+    found = disturbance_of(field)
+    if found is None or found.value.ndim > 0:
+        return field
+    return with_physics(field, disturbed(physics_of(without_disturbance(field)), found.vector(d)))
+
+
+def physics_of(field: AbstractVectorField) -> AbstractVectorField:
+    """f_p: the physics of a hybrid, with its constant disturbance if it has one; or the field itself."""
+    while isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
+        field = field.physics
+    return field
+
+
+def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> AbstractVectorField:
+    """The field with other physics in the place of `physics_of(field)`."""
+    if isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
+        return Hybrid(with_physics(field.physics, physics), field.residual)
+    return physics
+
+
+def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
+    """The constant disturbance of the field's physics, if it has one."""
+    match physics_of(field):
+        case Hybrid(residual=ConstantDisturbance() as found):
+            return found
+    return None

@@ -21,10 +21,11 @@ from hybrid_jax.vehicle import Vehicle
 # Format 1 names a class by its bare name; format 2 by "module:qualname". A class that moves or is renamed gets an entry
 # here: the class today, or a function from the saved fields (name → value) to the object.
 RENAMED: dict[str, type | Callable[[dict[str, Any]], Any]] = {
-    **{cls.__name__: cls for cls in (ConstantDisturbance, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid)},
+    **{cls.__name__: cls for cls in (ForcedBody, Frozen, FrozenRates, HoldState, Hybrid)},
     **{cls.__name__: cls for cls in (Kinematics, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust)},
     **{cls.__name__: cls for cls in (Accelerations, BodyFrame, BodyMotion, Motion)},
     **{cls.__name__: cls for cls in (BatchNorm, Bias, InputScaling, LayerNorm, Terms, Vehicle)},
+    "ConstantDisturbance": lambda fields: ConstantDisturbance(fields["acceleration"]),
     "DeployedNetwork": FusedNetwork,
     "LinearPath": LinearSkip,
     "NearGround": GroundDistance,

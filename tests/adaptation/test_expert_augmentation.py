@@ -8,7 +8,8 @@ import pytest
 from pendulum import LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
-from hybrid_jax.adaptation.expert_augmentation import REAL, Augmentation, expert_augmented, prediction_mse
+from hybrid_jax.adaptation.adapting import adapt
+from hybrid_jax.adaptation.expert_augmentation import RECORDED, Augmentation, expert_augmented, prediction_mse
 from hybrid_jax.integrate import rollout
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import split
@@ -28,7 +29,7 @@ WINDOWS = flights(1000, seed=0)
 
 
 def expert(box=(0.5, 2.0), hidden=32):
-    """An untrained network that says nothing beside the right length: the source model could not be better."""
+    """An untrained network that says nothing about the right length: the source model could not be better."""
     network = residual_network(2, 1, KEY, hidden=4)
     silent = eqx.tree_at(lambda net: (net.weight_out, net.bias_out), network, (jnp.zeros((2, 4)), jnp.zeros(2)))
     return expert_augmented(Hybrid(pendulum(), silent), split(WINDOWS, PAST)[0], KEY, box=box, hidden=hidden)
@@ -48,7 +49,7 @@ def lengths(field, windows):
 
 def test_the_length_is_recovered_on_augmented_flights(trained):
     data = OBJECTIVE.prepare(flights(200, seed=2), "test")[200:]
-    flown, theta = jax.vmap(lambda one: OBJECTIVE.flown(trained, one, SETTINGS))(data)
+    flown, theta = jax.vmap(lambda one: OBJECTIVE.augmented(trained, one, SETTINGS))(data)
     off = np.log(lengths(trained, flown)) - np.asarray(theta)[:, 0]
     # Lengths are drawn from ±69 %, 40 % rms; a swing through rest says little, so the bound is on the median.
     assert np.median(np.abs(off)) < 0.08
@@ -61,6 +62,13 @@ def test_what_is_read_moves_to_a_changed_vehicle_and_predicts_it(trained, factor
     assert np.median(lengths(trained, target)) == pytest.approx(factor * LENGTH, rel=0.1)
     alone = rollout_mse(trained.expert.field, split(target, PAST)[1])
     assert prediction_mse(trained, target, PAST) < 0.5 * alone
+
+
+def test_it_is_a_method_of_adapt(trained):
+    target = flights(100, seed=5, length=0.7 * LENGTH)
+    result = adapt(trained.expert.field, target, method=trained)
+    found = np.exp(result.parameters["log_length"].value)
+    assert found == pytest.approx(0.7 * LENGTH, rel=0.1)
 
 
 def test_a_box_of_one_point_leaves_the_source_model():
@@ -81,13 +89,15 @@ def test_no_past_leads_out_of_the_box(size):
 def test_every_window_is_learned_from_as_flown_and_as_the_expert_flies_it():
     model = expert()
     data = OBJECTIVE.prepare(WINDOWS[:10], "train")
-    assert list(data.ticket) == [REAL] * 10 + list(range(10))
-    flown, theta = jax.vmap(lambda one: OBJECTIVE.flown(model, one, SETTINGS))(data)
+    assert list(data.augmentation_seed) == [RECORDED] * 10 + list(range(10))
+    flown, theta = jax.vmap(lambda one: OBJECTIVE.augmented(model, one, SETTINGS))(data)
     np.testing.assert_array_equal(flown.x[:10], WINDOWS.x[:10])
     np.testing.assert_allclose(theta[:10], np.log(LENGTH), rtol=1e-6)
     assert len(np.unique(theta[10:])) == 10
     np.testing.assert_array_equal(flown.u[10:], WINDOWS.u[:10])
-    other = jax.vmap(lambda theta, one: rollout(model.flying(theta), one.x0, one.u, one.dt))(theta[10:], WINDOWS[:10])
+    other = jax.vmap(lambda theta, one: rollout(model.with_parameters(theta), one.x0, one.u, one.dt))(
+        theta[10:], WINDOWS[:10]
+    )
     np.testing.assert_array_equal(flown.x[10:], other)
 
 

@@ -8,7 +8,7 @@ import pytest
 from jaxtyping import Array, Float
 from pendulum import LENGTH, pendulum, swings
 
-from hybrid_jax.adaptation.least_squares import fit_least_squares, parametrise
+from hybrid_jax.adaptation.least_squares import fit_least_squares, ravel_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.integrate import rollout_batch
@@ -180,6 +180,6 @@ def test_a_field_with_nothing_to_fit_is_refused():
 
 def test_parameters_as_a_vector_and_back():
     field = Hybrid(body(Ix=1.1, Iy=0.9, k=1.2), Push(jnp.ones(2)))
-    theta, rebuild = parametrise(field)
+    theta, rebuild = ravel_parameters(field)
     np.testing.assert_allclose(theta, np.log([1.1, 0.9, 1.2]), rtol=1e-6)
     assert eqx.tree_equal(rebuild(theta), field)

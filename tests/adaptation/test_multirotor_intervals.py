@@ -8,11 +8,12 @@ import pytest
 from test_least_squares import Push, pushes
 
 from hybrid_jax import rotation
-from hybrid_jax.adaptation.least_squares import fit_least_squares, parametrise, residual
+from hybrid_jax.adaptation.least_squares import fit_least_squares, prediction_errors, ravel_parameters
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
-from hybrid_jax.dynamics.rigid_body import RigidBody
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.training.channels import Channel, ChannelLoss
 from hybrid_jax.trajectories import Trajectories
@@ -53,6 +54,13 @@ def test_of_the_paper_s_parameters_they_are_those_of_the_rigid_body():
         np.testing.assert_allclose(interval.high * interval.low, value**2, rtol=1e-6)  # about it as a ratio
 
 
+def test_a_disturbance_has_intervals_beside_the_parameters():
+    field = Hybrid(with_disturbance(rigid_body(IRIS)), Push(jnp.ones(2)))
+    found = intervals(field, np.eye(9) * 1e-4)
+    assert list(found) == ["Ix", "Iy", "k", *(f"disturbance[{name}]" for name in ("vx", "vy", "vz", "wx", "wy", "wz"))]
+    np.testing.assert_allclose(found["disturbance[wz]"], Z * 0.01 * np.array([0, -1, 1]), rtol=1e-5)  # float32
+
+
 REPEATS, NOISE = 240, 0.01  # [m], [1], [m/s], [rad/s] alike
 
 
@@ -80,10 +88,10 @@ def inside():
 
 def descended(field, windows, steps=3):
     """Least squares by Gauss and Newton's steps from near the minimum: `fit_least_squares` takes long to compile."""
-    theta, rebuild = parametrise(field)
+    theta, rebuild = ravel_parameters(field)
 
     def errors(theta):
-        r = jax.vmap(lambda window: residual(rebuild(theta), window))(windows).ravel()
+        r = jax.vmap(lambda window: prediction_errors(rebuild(theta), window))(windows).ravel()
         return r, r
 
     def step(theta, _):

@@ -8,17 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax import Hybrid, load, residual_network, rigid_body, rollout_batch, save
+from hybrid_jax import Hybrid, Settings, load, residual_network, rigid_body, rollout_batch, save
 from hybrid_jax.adaptation.ridge import (
     PENALTIES,
-    adapted,
+    best_candidate,
     defects,
-    intervals_of,
+    fit_ridge,
     last_layer,
     linear_residual,
+    mean_and_scale,
     ridge,
-    select,
-    standard,
+    transitions,
 )
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import perturbed
@@ -31,7 +31,7 @@ from hybrid_jax.vehicle import IRIS
 
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 # Compiled once for all tests: fields and windows here have few shapes, and a penalty is an array.
-_rolled, _defects, _adapted, _mse = map(eqx.filter_jit, (rollout_batch, defects, adapted, rollout_mse))
+_rolled, _defects, _fit_ridge, _mse = map(eqx.filter_jit, (rollout_batch, defects, fit_ridge, rollout_mse))
 _last_layer, _linear_residual = map(eqx.filter_jit, (last_layer, linear_residual))
 
 
@@ -77,9 +77,10 @@ def derivatives(field, windows):
 def test_a_defect_is_what_the_field_lacks_to_second_order():
     def error(dt):
         truth = with_linear(source().physics)
-        intervals = intervals_of(flown(truth, dt=dt))
-        ends = (jax.vmap(truth.residual)(x, intervals.u) for x in (intervals.before, intervals.after))
-        return float(jnp.abs(_defects(truth.physics, intervals) - sum(ends) / 2).max())
+        data = flown(truth, dt=dt)
+        before, u, after = transitions(data)
+        ends = (jax.vmap(truth.residual)(x, u) for x in (before, after))
+        return float(jnp.abs(_defects(truth.physics, data) - sum(ends) / 2).max())
 
     with jax.enable_x64(True):
         # Measured forwards only it is of first order: what a missing acceleration does to the position, ½ dt δv̇.
@@ -91,7 +92,7 @@ def test_an_exact_field_has_no_defect():
         field = source().physics
         # The flights are RK4's with the same step, so only the step backwards errs: dt⁴ = 1e-8, times motions of
         # up to 4 rad/s to some power.
-        assert jnp.abs(_defects(field, intervals_of(flown(field)))).max() < 1e-6
+        assert jnp.abs(_defects(field, flown(field))).max() < 1e-6
 
 
 @pytest.mark.parametrize(
@@ -136,22 +137,22 @@ def gusty(seed):
 @pytest.mark.parametrize(("method", "left"), [(last_layer, 0.8), (linear_residual, 0.1)])
 def test_flights_not_seen_are_predicted_better(method, left):
     """Six hidden units of no training offer little; all of the state offers the drag but for its curvature."""
-    result = _adapted(method, source(), gusty(0), gusty(1))
+    result = _fit_ridge(method, source(), gusty(0), gusty(1))
     assert _mse(result.field, gusty(2)) < left * _mse(source(), gusty(2))
     assert PENALTIES[-1] <= result.penalty < PENALTIES[0]
     np.testing.assert_allclose(result.mse, _mse(result.field, gusty(1)), rtol=1e-3)  # float32, sums in another order
 
 
-def test_a_lane_is_the_run_alone():
+def test_a_mapped_run_is_the_run_alone():
     """Seeds have other fields and other training windows; one program serves them all."""
     fields, trains = [source(seed) for seed in range(3)], [gusty(seed) for seed in (0, 2, 3)]
 
     def one(field, train):
-        return adapted(last_layer, field, train, gusty(1))
+        return fit_ridge(last_layer, field, train, gusty(1))
 
     lanes = jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(stack(fields), stack(trains)))
     for i, (field, train) in enumerate(zip(fields, trains, strict=True)):
-        here, alone = lane(lanes, i), _adapted(last_layer, field, train, gusty(1))
+        here, alone = lane(lanes, i), _fit_ridge(last_layer, field, train, gusty(1))
         # Float32 defects carry 1e-7 / dt, and neighbours in the grid may predict equally well.
         np.testing.assert_allclose(here.mse, alone.mse, rtol=1e-3)
         np.testing.assert_allclose(derivatives(here.field, train), derivatives(alone.field, train), rtol=0, atol=1e-2)
@@ -160,11 +161,11 @@ def test_a_lane_is_the_run_alone():
 
 def test_a_field_that_diverges_is_not_chosen():
     bad = eqx.tree_at(lambda f: f.residual.bias_out, source(), jnp.full(13, jnp.nan))
-    choose = eqx.filter_jit(select)
-    best, errors = choose(stack([bad, source(1), source()]), gusty(0))
+    choose = eqx.filter_jit(best_candidate)
+    best, errors = choose(stack([bad, source(1), source()]), gusty(0), Settings())
     assert best == 1 + np.argmin(errors[1:])
     assert np.isnan(errors[0])
-    assert choose(stack([bad, bad, bad]), gusty(0))[0] == 0
+    assert choose(stack([bad, bad, bad]), gusty(0), Settings())[0] == 0
 
 
 @pytest.mark.parametrize("penalty", [1e3, 1.0, 1e-4])
@@ -185,7 +186,7 @@ def test_a_channel_that_never_varied_is_no_feature():
     """A rotor that kept its speed while data were taken says nothing, however much it does later."""
     rng = np.random.default_rng(0)
     z = np.stack([rng.normal(3, 2, 1000), np.full(1000, 600.1), np.zeros(1000)], axis=1).astype(np.float32)
-    mean, scale = standard(z)
+    mean, scale = mean_and_scale(z)
     scaled = (z - mean) / scale
     np.testing.assert_allclose(scaled[:, 0].std(), 1, rtol=1e-5)
     assert jnp.abs(scaled[:, 1:]).max() < 1e-2  # float32's round-off of the mean over 1e-3

@@ -1,0 +1,198 @@
+"""Laws of `adapt`: one call and one result for every system and method."""
+
+import inspect
+import json
+import textwrap
+from dataclasses import dataclass, replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+from pendulum import LENGTH, pendulum, swings
+from systems import car, car_inputs, car_start, windows
+
+import hybrid_jax as hj
+from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, physics_of, with_disturbance
+from hybrid_jax.metrics import rollout_mse
+
+NETWORK = jax.tree.map(lambda leaf: 0.1 * leaf, hj.residual_network(2, 1, jax.random.key(0), hidden=4, norm="none"))
+PUSH = jnp.array([0.0, 1.5])
+
+
+def noisy(trajectories, seed=0, size=0.01):
+    """The windows with white noise of `size` times the spread of each state."""
+    spread = np.std(np.asarray(trajectories.x), axis=(0, 1))
+    noise = size * spread * np.random.default_rng(seed).normal(size=trajectories.x.shape)
+    return replace(trajectories, x=np.asarray(trajectories.x + noise, np.float32))
+
+
+def flown(truth, count=40, seed=0):
+    """Windows of a field with the states and inputs of a pendulum."""
+    start = swings(count, seed=seed)
+    return replace(start, x=eqx.filter_jit(hj.rollout_batch)(truth, start.x0, start.u, start.dt))
+
+
+def test_the_pendulum_s_length_is_found_and_no_disturbance():
+    truth = hj.Hybrid(pendulum(LENGTH), NETWORK)
+    result = adapt(hj.Hybrid(pendulum(0.7), NETWORK), noisy(flown(truth)))
+    assert result.converged
+    assert result.disturbance is None
+    assert list(result.parameters) == ["log_length"]
+    # Four standard errors: the interval is 1.96 of them to either side.
+    found = result.parameters["log_length"]
+    assert abs(found.value - np.log(LENGTH)) < 4 / 1.96 * (found.high - found.value)
+    assert 0 < found.high - found.low < 0.1
+    assert eqx.tree_equal(result.field.residual, NETWORK)
+    assert result.mse_after < 0.1 * result.mse_before
+
+
+def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
+    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), NETWORK)
+    result = adapt(hj.Hybrid(pendulum(0.7), NETWORK), noisy(flown(truth)))
+    np.testing.assert_allclose(result.disturbance, PUSH, atol=0.2)
+    assert list(result.parameters) == ["log_length", "disturbance[0]", "disturbance[1]"]
+    assert result.parameters["disturbance[1]"].low > 1
+    again = adapt(result.field, noisy(flown(truth)), method=LeastSquares(disturbance=False))
+    np.testing.assert_allclose(again.disturbance, result.disturbance, rtol=1e-2)  # it is part of the physics by then
+
+
+def test_the_functions_behind_it_serve_the_pendulum_too():
+    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), NETWORK)
+    data = flown(truth)
+    fitted = fit_least_squares(with_disturbance(hj.Hybrid(pendulum(0.7), NETWORK)), data).field
+    found = intervals(fitted, covariance_of(fitted, data))
+    values = [np.log(LENGTH), *PUSH]
+    np.testing.assert_allclose([interval.value for interval in found.values()], values, atol=1e-3)
+
+
+def test_a_car_s_stiffnesses_are_found_from_noisy_windows():
+    data = noisy(windows(car(0.7, 1.2), car_start, car_inputs, 0.05, 60, 0), size=0.002)
+    result = adapt(car(1.0, 1.0), data, method="theta_least_squares")
+    assert result.converged
+    for name, factor in (("log_front", 0.7), ("log_rear", 1.2)):
+        found = result.parameters[name]
+        assert abs(found.value - np.log(factor)) < 4 / 1.96 * (found.high - found.value)
+        assert 0 < found.high - found.low < 0.2
+
+
+class Stretched(AbstractVectorField):
+    """Another field with the unit of each state divided by a factor."""
+
+    field: AbstractVectorField
+    factor: tuple[float, ...] = eqx.field(static=True)
+
+    def __call__(self, x, u):
+        factor = jnp.asarray(self.factor)
+        return self.field(x / factor, u) * factor
+
+
+def test_units_of_the_states_do_not_matter():
+    data = noisy(swings(40), size=0.05)  # damped: no length fits exactly, so weights decide
+    factor = (1000.0, 0.01)
+    stretched = replace(data, x0=np.asarray(data.x0) * factor, x=np.asarray(data.x) * factor)
+    stretched = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), stretched)
+    plain = adapt(pendulum(0.7), data, method="theta_least_squares").parameters["log_length"]
+    other = adapt(Stretched(pendulum(0.7), factor), stretched, method="theta_least_squares")
+    found = other.parameters["field.log_length"]
+    np.testing.assert_allclose([found.value, found.low, found.high], [plain.value, plain.low, plain.high], rtol=1e-3)
+
+
+@pytest.mark.parametrize("name", sorted(METHODS))
+def test_every_method_has_the_same_result(name):
+    data = flown(hj.Hybrid(pendulum(LENGTH), NETWORK))
+    method = METHODS[name]
+    method = replace(method, max_epochs=3) if isinstance(method, FineTune) else name
+    result = adapt(hj.Hybrid(pendulum(0.55), NETWORK), data, method=method)
+    assert isinstance(result, Adaptation)
+    assert np.isfinite(result.mse_after)
+    assert jax.tree.structure(physics_of(result.field)) == jax.tree.structure(pendulum())
+    assert (result.parameters["log_length"].low is None) == ("least_squares" not in name)
+    assert result.method in result.report()
+    assert ("No intervals" in result.report()) == ("least_squares" not in name)
+    assert json.loads(json.dumps(result.to_dict()))["parameters"]["log_length"]["unit"] is None
+
+
+def test_a_method_maps_over_stacked_fields():
+    data, lengths = flown(pendulum(LENGTH)), jnp.array([0.4, 0.6])
+    fields = eqx.filter_vmap(lambda length: pendulum(length))(lengths)
+    solve = METHODS["theta_least_squares"].solve
+    found = eqx.filter_vmap(lambda field: solve(field, data, data, hj.Settings()))(fields)
+    np.testing.assert_allclose(jnp.exp(found.field.log_length), LENGTH, rtol=1e-4)  # float32
+
+
+@pytest.mark.parametrize(("frozen", "moves"), [("residual", "physics"), ("physics", "residual")])
+def test_what_is_frozen_stays(frozen, moves):
+    field = hj.Hybrid(pendulum(0.55), NETWORK)
+    result = adapt(field, flown(hj.Hybrid(pendulum(LENGTH), NETWORK)), method=FineTune(frozen=frozen, max_epochs=3))
+    assert eqx.tree_equal(getattr(result.field, frozen), getattr(field, frozen))
+    assert not eqx.tree_equal(getattr(result.field, moves), getattr(field, moves))
+
+
+def test_a_method_of_a_user_is_the_example_of_the_docstring():
+    lines = inspect.cleandoc(Method.__doc__ or "").splitlines()
+    known = {"dataclass": dataclass, "AbstractVectorField": AbstractVectorField, "Solution": Solution}
+    known["rollout_mse"] = rollout_mse
+    exec(textwrap.dedent("\n".join(line for line in lines if not line or line[0] == " ")), known)
+    method = known["BestOf"]((pendulum(0.3), pendulum(LENGTH), pendulum(0.9)))
+    result = adapt(pendulum(0.7), swings(40, damping=0.0), method=method)
+    assert result.method == "BestOf"
+    assert eqx.tree_equal(result.field, pendulum(LENGTH))
+
+
+def test_a_disturbance_acts_on_any_states():
+    x, u = jnp.ones((5, 3)), jnp.zeros((1, 3))
+    for field, expected in (
+        (ConstantDisturbance(jnp.array([1.0, 2.0])), [0, 0, 0, 1, 2]),
+        (ConstantDisturbance(jnp.array([1.0, 2.0]), (3, 0)), [2, 0, 0, 1, 0]),
+        (ConstantDisturbance(jnp.array(3.0)), [3, 3, 3, 3, 3]),
+    ):
+        np.testing.assert_array_equal(field(x, u), np.outer(expected, np.ones(3)))
+        np.testing.assert_array_equal(field(x[:, 0], u[:, 0]), expected)
+
+
+class Nothing(AbstractVectorField):
+    def __call__(self, x, u):
+        return x
+
+
+class Weights(AbstractVectorField):
+    gains: Float[Array, " n"]
+
+    def __call__(self, x, u):
+        return x * self.gains.sum()
+
+
+@pytest.mark.parametrize(
+    ("field", "options", "said"),
+    [
+        (pendulum(), {"method": "magic"}, "method must be one of least_squares, .*source, or a value, got 'magic'"),
+        (pendulum(), {"method": 3}, "method must have a method solve, see Method, got 3"),
+        (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
+        (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
+        (pendulum(), {"method": "last_layer"}, "last_layer needs a field whose residual is a ResidualNetwork"),
+        (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
+        (Nothing(), {"method": "fine_tune"}, "field: Nothing has nothing to train"),
+        (
+            Weights(jnp.zeros(60)),
+            {},
+            "field: Weights has 60 parameters, no named physics to fit; use",
+        ),
+        (
+            Weights(jnp.zeros(45)),
+            {},
+            "windows: 40 are too few for the 45 parameters of Weights, at least 46",
+        ),
+        (hj.rigid_body(hj.IRIS), {}, "field: RigidBody does not take a state"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(field, options, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        adapt(field, swings(40), **options)
+    assert "\n" not in str(caught.value)
