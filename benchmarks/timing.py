@@ -1,7 +1,7 @@
-"""What every benchmark does alike: compile apart, compare results, time in turns, print tables, write JSON.
+"""Shared by all benchmarks: compile separately, compare results, time in turns, print tables, write JSON.
 
-The calls that are compared take turns, so that a busy moment of the machine hits all alike, and what counts is the
-median. A ratio of two calls is the median of the ratios within each turn. Set the cores with taskset.
+Calls that are compared take turns, so that load on the machine affects all of them, and medians are reported. A ratio
+of two calls is the median of the ratios within each turn. Set the cores with taskset.
 """
 
 import os
@@ -34,22 +34,22 @@ PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mj
 
 
 class Disagreement(RuntimeError):
-    """Two programs that were to be timed against each other do not compute the same."""
+    """Two programs to be compared do not compute the same."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure and where to write it."""
+    """Measure one benchmark."""
 
     preset: str = "full"
-    """full: what is reported. smoke: does it work, in seconds; its numbers say nothing."""
+    """full: the reported numbers. smoke: a functional check in seconds; its numbers mean nothing."""
     out: Path | None = None
     """Also write the numbers to this file as JSON, and a figure, if there is one, beside it."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """One number to keep an eye on, and what it should reach."""
+    """A measured number and its bounds."""
 
     what: str
     value: float
@@ -58,7 +58,7 @@ class Ratio:
 
     @property
     def holds(self) -> bool | None:
-        """Whether it is reached; None where nothing is asked for."""
+        """Whether the bounds hold; None without bounds."""
         if self.at_most is None and self.at_least is None:
             return None
         return (self.at_most is None or self.value <= self.at_most) and (
@@ -68,7 +68,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a benchmark measured: rows of JSON values, the same for reading, the ratios that matter, and a figure."""
+    """The results of a benchmark: rows of JSON values, tables of the same, ratios, and a figure."""
 
     rows: list[dict[str, Any]]
     tables: list[Table]
@@ -83,27 +83,27 @@ class Times:
     seconds: Mapping[Any, Sequence[float]]
 
     def median(self, name: Any) -> float:
-        """Of one call [s]."""
+        """The median of one call [s]."""
         return statistics.median(self.seconds[name])
 
     def medians(self) -> dict[Any, float]:
-        """Of every call [s]."""
+        """The medians of all calls [s]."""
         return {name: self.median(name) for name in self.seconds}
 
     def ratio(self, name: Any, other: Any) -> float:
-        """How many times as long as the other a call takes: the median over the turns."""
+        """The time of a call over that of another: the median over the turns."""
         return statistics.median(a / b for a, b in zip(self.seconds[name], self.seconds[other], strict=True))
 
 
 def stopwatch(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What the call returns, once it is computed, and the seconds that took."""
+    """The result of a call, once computed, and its duration [s]."""
     before = time.perf_counter()
     result = jax.block_until_ready(call())
     return result, time.perf_counter() - before
 
 
 def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
-    """Time each call once a turn, forwards and backwards by turns. Call each once before: this warms nothing up."""
+    """Time each call once per turn, in alternating order. Call each once before: there is no warm-up."""
     taken: dict[Any, list[float]] = {name: [] for name in calls}
     for turn in range(turns):
         for name in list(calls)[:: -1 if turn % 2 else 1]:
@@ -112,20 +112,20 @@ def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
 
 
 def compiled(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
-    """A call of the compiled function on arguments that lie on the device, and the seconds of tracing and compiling."""
+    """A call of the compiled function on device arrays, and the seconds of tracing and compiling."""
     call, seconds, _ = compiled_with_memory(function, *arguments)
     return call, seconds
 
 
 def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float, int]:
-    """As `compiled`, and the bytes that the program needs beside its arguments and results."""
+    """As `compiled`, and the bytes that the program needs besides its arguments and results."""
     arguments = jax.device_put(arguments)
     program, seconds = stopwatch(lambda: jax.jit(function).lower(*arguments).compile())
     return lambda: program(*arguments), seconds, program.memory_analysis().temp_size_in_bytes
 
 
 def repeated(call: Call, turns: int, budget: float) -> float:
-    """The median seconds of a call, after one that warms up; fewer turns, but three, once the budget [s] is spent."""
+    """The median seconds of a call, after a warm-up: up to `turns` times, but at least 3, within a budget [s]."""
     call()
     taken: list[float] = []
     while len(taken) < turns and (len(taken) < 3 or sum(taken) < budget):
@@ -174,7 +174,7 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     except ValueError as error:
         _end(name, error, BAD_INPUT)
     began = time.perf_counter()
-    # An empty cache, so that every compilation that is timed is one.
+    # An empty cache, so that timed compilations are real.
     os.environ.pop(PROGRAMS, None)
     with TemporaryDirectory() as cache:
         configure(Path(cache))
@@ -212,7 +212,7 @@ def _check(options: Options, presets: Mapping[str, Any]) -> None:
     if options.out is None:
         return
     if options.out.is_dir():
-        raise ValueError(f"--out {options.out}: is a folder, a file is wanted")
+        raise ValueError(f"--out {options.out}: is a folder, a file is needed")
     check_folder("--out", options.out.parent)
 
 
@@ -229,7 +229,7 @@ def _print(findings: Findings, console: Console) -> None:
 
 
 def ratio_table(ratios: Sequence[Ratio]) -> Table:
-    """What is reached and what is not."""
+    """Ratios and their bounds."""
     table = Table("ratio", "", "reach", "", title=f"on {cores()} cores")
     for ratio in ratios:
         bounds = (("≤", ratio.at_most), ("≥", ratio.at_least))

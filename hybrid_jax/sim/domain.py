@@ -1,4 +1,4 @@
-"""The true systems of the paper: the source and its two targets."""
+"""True systems: the source domain of the paper and its two targets."""
 
 from dataclasses import asdict, dataclass, replace
 from typing import Any

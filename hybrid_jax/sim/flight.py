@@ -18,7 +18,7 @@ from hybrid_jax.state import POSITION, VELOCITY
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 DT = pilot.PERIOD  # s
-CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), so that windows see the wind at every phase
+CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of the wind
 
 # Bounds of a sound flight of the Iris; those of other vehicles are scaled.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
@@ -28,10 +28,10 @@ class Flights(NamedTuple):
     """n flights of t decisions, float64.
 
     Attributes:
-        states: from take-off on.
+        states: from the start on.
         inputs: held from one state to the next [rad/s].
         lowest_rotor: the altitude of the lowest rotor at each state [m].
-        start: time of take-off [s].
+        start: time of the first state [s].
     """
 
     states: Float[Array | np.ndarray, "*n t+1 13"]
@@ -41,12 +41,15 @@ class Flights(NamedTuple):
 
 
 def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
-    """Random closed-loop flights at 100 Hz; float64 on the CPU whatever the caller's precision and device.
+    """Simulate random closed-loop flights at 100 Hz, always in float64 and on the CPU.
 
     Flight i depends on the key and i alone.
 
+    Args:
+        seconds: duration of each flight.
+
     Raises:
-        ValueError: no flights, no time or no key.
+        ValueError: flights or seconds are not positive, or key is not a random key.
     """
     checks.count("flights", flights)
     checks.positive("seconds", seconds)
