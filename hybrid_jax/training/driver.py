@@ -139,16 +139,23 @@ def fit(
     data, validated_on = prepared(field, train, validation, key, settings)
     optimiser = descent(optimiser)
     rates = default_rates(field, optimiser) if rates is None else rates
+    rates = _of_each(rates, eqx.filter(field, trainable(field)))
+    weight = default_weight(regulariser_weight, settings)
+    make_run_config(rates, 0, 0, min_epochs, patience, max_epochs, weight)  # refuses before the field is evaluated
+    field = ready(field, train)
+    rates = jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(rates)
+    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
+    return drive(start(field, key, optimiser), plan, data, validated_on, settings, optimiser, progress)
+
+
+def _of_each(rates: PyTree, learned: Learner) -> list:
+    """The rate of each learned array; a list, as the tree changes when the field is scaled."""
     try:
-        jax.tree.map(lambda *_: None, rates, eqx.filter(field, trainable(field)))
+        return jax.tree.leaves(jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), rates, learned))
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"rates must be a number, or a tree of them that begins as the field does, got {checks.short_repr(rates)}"
         ) from error
-    weight = default_weight(regulariser_weight, settings)
-    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
-    field = ready(field, train)
-    return drive(start(field, key, optimiser), plan, data, validated_on, settings, optimiser, progress)
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:

@@ -12,13 +12,15 @@ from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import zero_output
+from hybrid_jax.networks.scaling import with_scaling
 from hybrid_jax.training.fitting import make_run_config
 from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 from hybrid_jax.vehicle import IRIS
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
-FIELD = Hybrid(pendulum(0.6), zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none")))
+NETWORK = zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none"))
+FIELD = with_scaling(Hybrid(pendulum(0.6), NETWORK), TRAIN)
 
 
 def trained(stages, field=FIELD, train=TRAIN, **options):
