@@ -33,7 +33,7 @@ from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, pre
 from hybrid_jax.trajectories import Trajectories, check
 
 WEIGHT = 1e-3  # λ, where none is given
-PHYSICS_RATE, NETWORK_RATE = 1e-2, 1e-3
+PHYSICS_RATE, NETWORK_RATE = 1e-2, 3e-3
 FEW = 100  # so many learned numbers are taken for physical parameters
 BLOCK, BLOCK_SECONDS = 200, 0.5  # most epochs of a block, and how long it should take
 
@@ -115,8 +115,8 @@ def fit(
 
     Args:
         key: of the order of the minibatches.
-        rates: learning rates of Adam, a tree prefix of the field: a number, or e.g. `Hybrid(1e-2, 1e-3)`. By default
-            1e-2 for the physics of a `Hybrid` and for a field of at most 100 learned numbers, and 1e-3 otherwise.
+        rates: learning rates of Adam, a tree prefix of the field: a number, or e.g. `Hybrid(1e-2, 3e-3)`. By default
+            1e-2 for the physics of a `Hybrid` and for a field of at most 100 learned numbers, and 3e-3 otherwise.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
         min_epochs: no early stop before this many epochs.
