@@ -1,4 +1,4 @@
-"""How well a model predicts: L_MSE on windows, and ρ, what fine-tuning gained (paper, Sec. 3.3 and Eq. 9)."""
+"""Metrics of predictions: L_MSE of windows and ρ, the relative improvement by adaptation (paper, Sec. 3.3, Eq. 9)."""
 
 from collections.abc import Callable
 
@@ -12,14 +12,14 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check
 
-CHUNK = 1000  # windows that are predicted at a time
+CHUNK = 1000  # windows predicted at once
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
     """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window.
 
     Raises:
-        ValueError: the two are of different shapes, or hold no state.
+        ValueError: arrays of different shapes, or without a state.
     """
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
@@ -29,13 +29,13 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 def rollout_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
-    """L_MSE of a field as deployed, mean over windows, compared with the truth at every `every`-th interval's end.
+    """L_MSE of a field in inference mode, mean over windows, at the end of every `every`-th interval.
 
-    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache. It is not finite where
-    the field diverges.
+    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache. The result is not finite
+    if the field diverges.
 
     Raises:
-        ValueError: windows that `trajectories.check` or the field refuses, or an `every` beyond their horizon.
+        ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
     """
     check(windows, "windows")
     checks.count("chunk", chunk)
@@ -53,7 +53,7 @@ def rollout_mse(
 def mean_over(
     windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
 ) -> Float[Array, ""]:
-    """The mean of one number for each window, made for `chunk` of them at a time."""
+    """The mean over windows of `errors`, which is evaluated on `chunk` windows at a time."""
     whole = len(windows) // chunk * chunk
     chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, chunk, *leaf.shape[1:]), windows)
     rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
@@ -62,10 +62,10 @@ def mean_over(
 
 
 def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no gain, negative means that fine-tuning hurt (paper, Eq. 9).
+    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no improvement, below 0 worse than the source model (paper, Eq. 9).
 
     Raises:
-        ValueError: a source_mse that is known, and zero or negative: against it nothing is a gain.
+        ValueError: a source_mse that is not positive.
     """
     if not checks.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
         raise ValueError(f"source_mse must be positive, got {source_mse}")

@@ -1,4 +1,4 @@
-"""Windows of flight: a start, the inputs held over each interval, and the states that followed."""
+"""Windows of recorded trajectories: an initial state, the inputs held over each interval, and the next states."""
 
 import equinox as eqx
 import jax
@@ -13,9 +13,9 @@ class Trajectories(eqx.Module):
     """n windows of t equal intervals.
 
     Attributes:
-        x0: state at the start of each window.
+        x0: initial state of each window.
         u: input held over each interval.
-        x: state at the end of each interval; x[:, i] is reached from x0 after (i + 1) dt.
+        x: state at the end of each interval; x[:, i] is the state (i + 1) dt after x0.
         dt: length of an interval [s].
     """
 
@@ -33,22 +33,22 @@ class Trajectories(eqx.Module):
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
-        """The windows that index picks: a number, a slice or an array of indices, traced ones included.
+        """The windows at a number, a slice or an array of indices, which may be traced.
 
         Raises:
-            IndexError: a number that no window has.
+            IndexError: a number out of range.
         """
-        # JAX would take the last window instead, and a loop over the windows would not end.
+        # JAX would clamp the index, and a loop over the windows would not end.
         if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
         return jax.tree.map(lambda leaf: leaf[index], self)
 
 
 def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectories:
-    """Return trajectories unchanged after checking shapes, dt and, where it is known, that every number is finite.
+    """The trajectories unchanged, after checks of shapes, dt and, unless traced, that every number is finite.
 
     Raises:
-        ValueError: which array of `name` is wrong, where, and what was expected.
+        ValueError: says which array of `name` is wrong, where, and what was expected.
     """
     if not isinstance(trajectories, Trajectories):
         raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
@@ -75,10 +75,10 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
 
 
 def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> None:
-    """Refuse windows of a multirotor (state.py) whose quaternions are no rotations; of other states, nothing is known.
+    """Refuse states of 13 numbers (state.py) whose quaternions are not of norm 1.
 
     Raises:
-        ValueError: the place of the first and its norm.
+        ValueError: the index of the first such quaternion and its norm.
     """
     for part in ("x0", "x"):
         if trajectories.x0.shape[-1] == STATE_SIZE:
@@ -86,7 +86,7 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
-    """The first `at` intervals of each window, and the rest of it, which starts where they end.
+    """The first `at` intervals of each window, and the intervals after them.
 
     Raises:
         ValueError: a part would be empty.
@@ -107,15 +107,15 @@ def windows_of(
     steps: int,
     stride: int | None = None,
 ) -> Trajectories:
-    """Cut one flight, states[i] → states[i + 1] under inputs[i], into windows of `steps` intervals.
+    """Cut one trajectory, states[i] → states[i + 1] under inputs[i], into windows of `steps` intervals.
 
-    Its numbers are not looked at, so that windows with gaps can be left out afterwards; `check` does that.
+    Numbers that are not finite are accepted, so that windows with gaps can be removed afterwards; see `check`.
 
     Args:
-        stride: intervals between the starts of two windows; by default `steps`: windows touch but do not overlap.
+        stride: intervals between the starts of two windows; by default `steps`, so that windows do not overlap.
 
     Raises:
-        ValueError: arrays of the wrong shape or type, a dt that is not positive, or a flight shorter than one window.
+        ValueError: arrays of the wrong shape or type, a dt that is not positive, or fewer intervals than one window.
     """
     states, inputs = (
         np.asarray(checks.real_array("states", states)),
@@ -138,7 +138,7 @@ def concatenate(parts: list[Trajectories]) -> Trajectories:
     """All windows of the parts, in order.
 
     Raises:
-        ValueError: no parts, or parts of different dt, horizon, state or input.
+        ValueError: no parts, or parts that differ in dt, horizon, or size of state or input.
     """
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]

@@ -77,18 +77,21 @@ class ChannelScaling(AbstractScaling):
         return y if self.output is None else y * _column(self.output, y)
 
 
-class _Recorder(AbstractScaling):
-    """Keeps what a network reads and returns while its field is evaluated once, and silences it."""
+class _Silent(AbstractScaling):
+    """Silences a network, so that its field is what is left without it. `seen` records what it reads and returns."""
 
-    seen: list = eqx.field(static=True, default_factory=list)
+    seen: list | None = eqx.field(static=True, default=None)
 
     def concatenate(self, x, u):
-        self.seen.append(jnp.concatenate([x, u]))
-        return self.seen[-1]
+        return self.record(jnp.concatenate([x, u]))
 
     def outputs(self, y):
-        self.seen.append(y)
-        return jnp.zeros_like(y)
+        return jnp.zeros_like(self.record(y))
+
+    def record(self, values: Array) -> Array:
+        if self.seen is not None:
+            self.seen.append(values)
+        return values
 
 
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
@@ -106,18 +109,16 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
         return field
     x, u, after = _intervals(windows)
 
-    def recording(recorder: _Recorder) -> AbstractVectorField:
-        return structure.unflatten([recorder if place in unset else node for place, node in enumerate(nodes)])
-
-    predicted = rollout_batch(recording(_Recorder()), x, u[:, None], windows.dt)[:, 0]
+    silent = structure.unflatten([_Silent() if place in unset else node for place, node in enumerate(nodes)])
+    predicted = rollout_batch(silent, x, u[:, None], windows.dt)[:, 0]
     lacking, rate = (np.asarray(after - start) / windows.dt for start in (predicted, x))
     output = _positive(_rms(lacking), FLOOR * _rms(rate))
     for place in unset:
 
         def read(x, u, place=place):
-            recorder = _Recorder()
-            structure.unflatten([*nodes[:place], recorder, *nodes[place + 1 :]])(x, u)
-            return recorder.seen[0], recorder.seen[-1]
+            seen = []
+            structure.unflatten([*nodes[:place], _Silent(seen), *nodes[place + 1 :]])(x, u)
+            return seen[0], seen[-1]
 
         z, y = jax.vmap(read)(x, u)
         mean = np.mean(z, axis=0)

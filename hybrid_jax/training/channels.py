@@ -1,7 +1,7 @@
-"""A loss in which every channel of the state counts alike, whatever its unit, and an outlier does not count for all.
+"""A loss that weights the channels of the state and is robust against outliers.
 
-Without weights an error of 1 rad/s in the body rates outweighs one of 1 cm in position ten thousand times. Each channel
-is divided by its error under a simple baseline, so that 1 means: no better than that.
+Without weights, an error of 1 rad/s in the body rates counts ten thousand times as much as one of 1 cm in position.
+Here each channel is divided by its error under a simple baseline: 1 is no better than the baseline.
 """
 
 from collections.abc import Mapping
@@ -16,7 +16,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import rollout_batch, rollout_minibatch
 from hybrid_jax.metrics import mean_over
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.training.loss import Minibatch
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
@@ -26,7 +26,7 @@ MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY
 
 @dataclass(frozen=True)
 class Channel:
-    """Entries start … stop − 1 of the state, one vector, and the length of its error that counts as 1.
+    """Entries start … stop − 1 of the state, and the norm of their error that counts as 1.
 
     Raises:
         ValueError: no entries, or a scale that is not positive.
@@ -44,10 +44,10 @@ class Channel:
 
 @dataclass(frozen=True)
 class ChannelLoss:
-    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg; judged without the latter.
+    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg. Validation leaves L_reg out.
 
-    ρ(r) = r² up to `huber`, and 2 huber r − huber² beyond (Huber 1964, doubled); of the length of a channel's error, so
-    that no direction is preferred. Without `huber` it is r² throughout.
+    ρ(r) = r² up to `huber` and 2 huber r − huber² beyond (Huber 1964, doubled). It applies to the norm of a channel's
+    error, so that no direction is preferred. Without `huber`, ρ(r) = r².
 
     Raises:
         ValueError: no channels, or a threshold that is not positive.
@@ -89,7 +89,7 @@ class ChannelLoss:
         return mean_over(data, errors)
 
     def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-        """The sum over channels of what one error counts."""
+        """Σ over channels of ρ(‖error‖ / scale)."""
 
         def one(channel: Channel):
             square = jnp.sum(jnp.square(difference[..., channel.start : channel.stop] / channel.scale), axis=-1)
@@ -103,29 +103,32 @@ def channels_from(
     windows: Trajectories,
     parts: Mapping[str, slice] | None = None,
 ) -> tuple[Channel, ...]:
-    """Channels scaled by what a baseline, such as one of baselines.py, gets wrong by the end of the windows (RMS).
+    """Channels scaled by the RMS error of a baseline, such as one of baselines.py, at the end of the windows.
 
     Args:
-        parts: the entries of each channel; by default a multirotor's.
+        parts: the entries of each channel; by default those of state.py for a state of 13, and otherwise one channel
+            for each entry.
 
     Raises:
-        ValueError: windows that are malformed, or a channel in which the baseline makes no error.
+        ValueError: malformed windows, or a channel in which the baseline makes no error.
     """
-    check(windows, "windows")
+    size = check(windows, "windows").x.shape[-1]
+    if parts is None:
+        parts = MULTIROTOR if size == STATE_SIZE else {f"x[{i}]": slice(i, i + 1) for i in range(size)}
     predicted = eqx.filter_jit(rollout_batch)(baseline, windows.x0, windows.u, windows.dt)
     difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
 
     def channel(name: str, part: slice) -> Channel:
         scale = float(np.sqrt(np.mean(np.sum(np.square(difference[:, part]), axis=-1))))
         if not 0 < scale < np.inf:
-            raise ValueError(f"baseline: its error in {name} is {scale}, of no use as a measure")
+            raise ValueError(f"baseline: its error in {name} must be positive and finite, got {scale}")
         return Channel(part.start, part.stop, scale)
 
-    return tuple(channel(name, part) for name, part in (MULTIROTOR if parts is None else parts).items())
+    return tuple(channel(name, part) for name, part in parts.items())
 
 
 def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
-    """ρ(r) from r². Where r² is used, the root is of something else: its slope at zero is infinite."""
+    """ρ(r) from r². The root is taken of 1 where it is not used, as its slope at zero is infinite."""
     far = square > threshold**2
     length = jnp.sqrt(jnp.where(far, square, 1.0))
     return jnp.where(far, 2 * threshold * length - threshold**2, square)

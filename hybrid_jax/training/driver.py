@@ -33,7 +33,7 @@ from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, pre
 from hybrid_jax.trajectories import Trajectories, check
 
 WEIGHT = 1e-3  # λ, where none is given
-PHYSICS_RATE, NETWORK_RATE = 1e-2, 1e-3
+PHYSICS_RATE, NETWORK_RATE = 1e-2, 3e-3
 FEW = 100  # so many learned numbers are taken for physical parameters
 BLOCK, BLOCK_SECONDS = 200, 0.5  # most epochs of a block, and how long it should take
 
@@ -115,8 +115,8 @@ def fit(
 
     Args:
         key: of the order of the minibatches.
-        rates: learning rates of Adam, a tree prefix of the field: a number, or e.g. `Hybrid(1e-2, 1e-3)`. By default
-            1e-2 for the physics of a `Hybrid` and for a field of at most 100 learned numbers, and 1e-3 otherwise.
+        rates: learning rates of Adam, a tree prefix of the field: a number, or e.g. `Hybrid(1e-2, 3e-3)`. By default
+            1e-2 for the physics of a `Hybrid` and for a field of at most 100 learned numbers, and 3e-3 otherwise.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
         min_epochs: no early stop before this many epochs.
@@ -139,16 +139,23 @@ def fit(
     data, validated_on = prepared(field, train, validation, key, settings)
     optimiser = descent(optimiser)
     rates = default_rates(field, optimiser) if rates is None else rates
+    rates = _of_each(rates, eqx.filter(field, trainable(field)))
+    weight = default_weight(regulariser_weight, settings)
+    make_run_config(rates, 0, 0, min_epochs, patience, max_epochs, weight)  # refuses before the field is evaluated
+    field = ready(field, train)
+    rates = jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(rates)
+    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
+    return drive(start(field, key, optimiser), plan, data, validated_on, settings, optimiser, progress)
+
+
+def _of_each(rates: PyTree, learned: Learner) -> list:
+    """The rate of each learned array; a list, as the tree changes when the field is scaled."""
     try:
-        jax.tree.map(lambda *_: None, rates, eqx.filter(field, trainable(field)))
+        return jax.tree.leaves(jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), rates, learned))
     except (TypeError, ValueError) as error:
         raise ValueError(
             f"rates must be a number, or a tree of them that begins as the field does, got {checks.short_repr(rates)}"
         ) from error
-    weight = default_weight(regulariser_weight, settings)
-    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
-    field = ready(field, train)
-    return drive(start(field, key, optimiser), plan, data, validated_on, settings, optimiser, progress)
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:

@@ -1,7 +1,7 @@
-"""The training loss: L = L_MSE + λ L_reg (paper, Eq. 6 and 7), on a minibatch, features first.
+"""The training loss L = L_MSE + λ L_reg (paper, Eq. 6 and 7) of a minibatch, features first.
 
-A regulariser is a function of (hybrid, minibatch, predicted states) and keeps f_d from overwriting f_p. Its forms:
-the correlation of trajectories (the paper), inner product, cosine and Pearson correlation of f_p and f_d (Takeishi and
+A regulariser is a function of (hybrid, minibatch, predicted states). It keeps f_d from replacing f_p. There are the
+correlation of trajectories (the paper), inner product, cosine and Pearson correlation of f_p and f_d (Takeishi and
 Kalousis 2023; Osaka et al. 2025), and ‖f_d‖² (Yin et al. 2021, APHYNITY).
 """
 
@@ -18,7 +18,7 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class Minibatch(eqx.Module):
-    """b windows of t intervals of dt [s], features first, and how they are integrated: what the loss works on."""
+    """b windows of t intervals of dt [s], features first, and the solver that predicts them."""
 
     x0: Float[Array, "d b"]
     u: Float[Array, "t m b"]
@@ -45,7 +45,7 @@ def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Arr
     """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory of f_p alone (paper, Eq. 7); the mean over trajectories."""
     physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, batch.solver)
     a, b = (_unit(y.reshape(-1, y.shape[-1])) for y in (physics, predicted))
-    # ½‖a − b‖² = 1 − ⟨a, b⟩ for unit vectors, without the cancellation that eats a small difference in float32.
+    # ½‖a − b‖² = 1 − ⟨a, b⟩ for unit vectors, without cancellation in float32.
     return jnp.mean(0.5 * jnp.sum(jnp.square(a - b), axis=0))
 
 
@@ -88,7 +88,7 @@ def loss(
     regulariser: Regulariser | None,
     weight: Float[Array, ""] | float,
 ) -> Float[Array, ""]:
-    """L_MSE averaged over the minibatch, plus weight × regulariser where the field is a hybrid and one is given."""
+    """L_MSE averaged over the minibatch, plus weight × regulariser if there is one and the field is a `Hybrid`."""
     error = jnp.mean(mse(predicted, batch.x))
     if regulariser is None or not isinstance(field, Hybrid):
         return error

@@ -121,10 +121,10 @@ def fit_in_stages(
     data, validated_on = prepared(field, train, validation, key, settings)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
+    field, results = ready(field, train), []
     rates = [rates_by_group(field, stage.rates) for stage in stages]
     horizons = [cut(data, stage.steps) for stage in stages]
     optimiser, weight = descent(optimiser), default_weight(regulariser_weight, settings)
-    field, results = ready(field, train), []
     keys = jax.random.split(key, len(stages))
     for stage, rate, windows, stage_key in zip(stages, rates, horizons, keys, strict=True):
         listed = jnp.arange(len(data)), len(data)

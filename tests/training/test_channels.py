@@ -48,7 +48,7 @@ def test_scales_are_the_baseline_s_errors_at_the_horizon():
 
 
 def test_a_baseline_without_error_is_no_measure():
-    with pytest.raises(ValueError, match="error in angle is 0"):
+    with pytest.raises(ValueError, match="error in angle must be positive and finite, got 0"):
         channels_from(HoldState(), eqx.tree_at(lambda w: w.x, TRAIN, 0 * TRAIN.x + TRAIN.x0[:, None]), PARTS)
 
 

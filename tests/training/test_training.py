@@ -1,11 +1,15 @@
-"""Laws of one training run, on a system that is no quadrotor: a pendulum whose length, or damping, is unknown."""
+"""Laws of one training run, on a pendulum whose length or damping is unknown, and of `fit` on all systems."""
+
+import warnings
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
+from systems import SYSTEMS
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
@@ -16,7 +20,8 @@ from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, run, start
+from hybrid_jax.training.driver import FitInterrupted
+from hybrid_jax.training.fitting import DIVERGED, RUNNING, make_run_config, run, start
 from hybrid_jax.training.loss import residual_norm, trajectory_correlation
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -138,26 +143,28 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
     assert int(whole.best_epoch) == best + 1
     np.testing.assert_array_equal(whole.best.log_length, fields[best].log_length)
     np.testing.assert_allclose(whole.best_mse, errors[best], rtol=1e-4)  # another program for the same sums
-    # Run in one go or in blocks, the run is the same.
+    # Run in one go or in blocks, the run is the same, and its history is that of every epoch.
+    np.testing.assert_allclose(whole.history.validation, errors, rtol=1e-4)
+    assert whole.history.train[-1] == state.train_loss
     np.testing.assert_array_equal(state.field.log_length, whole.field.log_length)
 
 
 def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
     for state, minimum, patience in ((damped, 10, 10), (trained(pendulum(LENGTH, DAMPING), 0.0, patience=5), 10, 5)):
-        assert state.status == STOPPED
-        assert state.epoch == max(minimum, state.best_epoch + patience)
+        assert state.status == "ok"
+        assert state.epochs == max(minimum, state.best_epoch + patience)
     # With a rate of zero the first epoch is the best for ever; no later one is better.
     assert state.best_epoch == 1
 
 
 def test_without_a_better_epoch_patience_alone_decides():
     state = trained(pendulum(LENGTH, DAMPING), 0.0, min_epochs=0, patience=7)
-    assert (int(state.status), int(state.epoch)) == (STOPPED, 8)
+    assert (state.status, state.epochs) == ("ok", 8)
 
 
 def test_the_cap_is_marked():
     state = trained(pendulum(0.8, DAMPING), min_epochs=20, max_epochs=7)
-    assert (int(state.status), int(state.epoch)) == (CAPPED, 7)
+    assert (state.status, state.epochs) == ("capped", 7)
 
 
 def test_a_run_that_is_not_over_is_marked_running():
@@ -188,7 +195,7 @@ def test_each_epoch_sees_every_window_once():
     field = pendulum(0.8, DAMPING)
     for key in (KEY, jax.random.key(1)):
         state = trained(field, 0.0, key=key, max_epochs=1)
-        np.testing.assert_allclose(state.train_loss, rollout_mse(field, TRAIN), rtol=1e-5)  # float32 sums
+        np.testing.assert_allclose(state.history.train[0], rollout_mse(field, TRAIN), rtol=1e-5)  # float32 sums
 
 
 class Learned(AbstractVectorField):
@@ -202,15 +209,16 @@ class Learned(AbstractVectorField):
 
 def test_a_field_with_leaves_that_are_no_arrays_trains():
     field = Learned(eqx.nn.MLP(3, 2, 16, 1, activation=jax.nn.softplus, key=KEY))
-    state = trained(field, 0.01, max_epochs=40)
+    with pytest.warns(UserWarning, match="cannot be saved"):
+        state = trained(field, 0.01, max_epochs=40)
     assert state.best_mse < 0.5 * validated(field)
     assert state.best.network.activation is jax.nn.softplus
 
 
 def test_a_huge_rate_ends_the_run_as_diverged_with_a_finite_field(hybrid):
     state = trained(hybrid[0], Hybrid(0.0, 1e30), max_epochs=30)
-    assert state.status == DIVERGED
-    assert state.epoch < 30
+    assert state.status == "diverged"
+    assert state.epochs < 30
     assert jnp.isfinite(state.best_mse) == (state.best_epoch > 0)
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(state.best, eqx.is_array)))
 
@@ -223,7 +231,7 @@ def test_double_precision_trains_alone_and_in_a_sweep():
         alone = trained(field, train=train, validation=validation, max_epochs=3)
         plans = stack([make_run_config(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
         lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
-    assert (alone.status.dtype, int(alone.status)) == (np.int32, CAPPED)
+    assert (alone.state.status.dtype, alone.status) == (np.int32, "capped")
     assert alone.best.log_length.dtype == alone.best_mse.dtype == np.float64
     # Another program for the same sums, in the round-off of double precision.
     np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
@@ -260,7 +268,7 @@ def test_a_weight_is_that_of_a_regulariser_or_is_refused():
         for given in ({}, {"regulariser_weight": 1e-3}, {"regulariser_weight": 1.0})
     )
     assert eqx.tree_equal(usual, same)
-    assert usual.train_loss < other.train_loss
+    assert usual.history.train[0] < other.history.train[0]
 
 
 class Stiff(AbstractVectorField):
@@ -272,7 +280,10 @@ class Stiff(AbstractVectorField):
         return jnp.stack([x[1], u[0] - jnp.sin(x[0]) / self.length])
 
 
-@pytest.mark.parametrize("field", [Stiff(1.0), Frozen(pendulum())], ids=["float", "frozen"])
+NOTHING = {"float": Stiff(1.0), "frozen": Frozen(pendulum()), "function": lambda x, u: x, "number": 1.0}
+
+
+@pytest.mark.parametrize("field", NOTHING.values(), ids=NOTHING)
 def test_a_field_with_nothing_to_learn_is_refused(field):
     said = rf"^field: {type(field).__name__} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
     with pytest.raises(ValueError, match=said):
@@ -291,4 +302,46 @@ def test_one_window_is_not_normalised_by_itself(alone):
     with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
         train("batch")
     for trains in (lambda: train("layer"), lambda: train("batch", Frozen)):
-        assert np.all(trains().epoch == 1)
+        trained_once = trains()
+        assert np.all((trained_once.state if alone else trained_once).epoch == 1)
+
+
+def test_an_optax_optimiser_moves_a_field_as_adam_does():
+    """Adam by itself, and as an optimiser of the user's with its rate inside, or as a factor outside."""
+    field = pendulum(0.8, DAMPING)
+    usual, inside, outside = (
+        trained(field, rates, max_epochs=3, optimiser=optimiser)
+        for rates, optimiser in ((0.03, None), (None, optax.adam(0.03)), (0.03, optax.adam(1.0)))
+    )
+    for other in (inside, outside):
+        np.testing.assert_allclose(other.field.log_length, usual.field.log_length, rtol=1e-5)
+    with pytest.raises(ValueError, match=r"^optimiser must be an optax\.GradientTransformation"):
+        trained(field, optimiser="adam")
+
+
+def test_ctrl_c_between_blocks_keeps_the_run_so_far():
+    def stop(epoch, state):
+        if epoch >= 3:
+            raise KeyboardInterrupt
+
+    with pytest.raises(FitInterrupted) as stopped:
+        trained(pendulum(0.8, DAMPING), progress=stop)
+    result = stopped.value.result
+    assert (result.status, len(result.history.validation)) == ("running", result.epochs)
+    assert result.best_mse == np.float32(result.history.validation.min())
+
+
+def test_progress_is_shown_on_stderr_only_when_asked_for(capsys):
+    for progress in (None, True):
+        trained(pendulum(0.8, DAMPING), max_epochs=2, progress=progress)
+        said = capsys.readouterr()
+        assert (said.out, "2/2" in said.err) == ("", bool(progress))
+
+
+@pytest.mark.parametrize("name", SYSTEMS)
+def test_fit_with_defaults_beats_the_model_s_own_physics(name):
+    system = SYSTEMS[name]()
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", message=".*cannot be saved")
+        result = fit(system.model, system.train, system.validation, KEY, max_epochs=150)
+    assert result.best_mse < eqx.filter_jit(rollout_mse)(system.model.physics, system.validation)

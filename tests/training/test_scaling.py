@@ -1,0 +1,82 @@
+"""Laws of the scaling that `fit` reads off the training windows."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import SYSTEMS, Gain
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.base import fuse_for_inference, infer_batch, linearize
+from hybrid_jax.networks.mlp import LinearSkip
+from hybrid_jax.networks.scaling import ChannelScaling, InputScaling, with_scaling
+
+KEY = jax.random.key(0)
+CAR = SYSTEMS["car"]()
+SCALED = with_scaling(CAR.model, CAR.train)
+
+
+def samples(windows):
+    before = np.concatenate([windows.x0[:, None], windows.x[:, :-1]], axis=1)
+    return before.reshape(-1, before.shape[-1]), np.reshape(windows.u, (-1, windows.u.shape[-1]))
+
+
+def test_every_input_has_mean_zero_and_deviation_one():
+    z = jax.vmap(SCALED.residual.inputs)(*samples(CAR.train))
+    np.testing.assert_allclose(jnp.mean(z, axis=0), 0, atol=1e-3)
+    np.testing.assert_allclose(jnp.std(z, axis=0), 1, rtol=1e-3)  # float32 means of hundreds
+
+
+def test_a_unit_of_the_state_changes_nothing_that_the_network_reads():
+    """The position in kilometres: the network's inputs are the same."""
+    x, u = samples(CAR.train)
+    unit = np.array([1e-3, 1, 1, 1, 1, 1], np.float32)
+    windows = hj.Trajectories(CAR.train.x0 * unit, CAR.train.u, CAR.train.x * unit, CAR.train.dt)
+    network = hj.residual_network(6, 2, KEY, hidden=4)
+    metres, kilometres = with_scaling(network, CAR.train), with_scaling(network, windows)
+    np.testing.assert_allclose(
+        jax.vmap(metres.inputs)(x, u), jax.vmap(kilometres.inputs)(x * unit, u), rtol=1e-3, atol=1e-3
+    )
+    np.testing.assert_allclose(kilometres.scaling.output[0], 1e-3 * metres.scaling.output[0], rtol=1e-3)
+
+
+def test_a_scaling_that_was_given_or_set_stays():
+    given = hj.residual_network(6, 2, KEY, scaling=InputScaling(1.0, 2.0))
+    for field in (given, SCALED, CAR.model.physics):
+        assert with_scaling(field, CAR.validation) is field
+
+
+def test_networks_inside_other_fields_are_scaled():
+    network = hj.residual_network(6, 2, KEY, hidden=4)
+    for field in (Gain(jnp.zeros(()), network), LinearSkip(jnp.zeros((6, 8)), network)):
+        scaling = with_scaling(hj.Hybrid(CAR.model.physics, field), CAR.train).residual.field.scaling
+        assert scaling == SCALED.residual.scaling
+
+
+def test_constant_channels_are_left_their_size():
+    still = eqx.tree_at(lambda w: w.u, CAR.train, jnp.zeros_like(CAR.train.u))
+    assert with_scaling(CAR.model, still).residual.scaling.scale[-2:] == (1.0, 1.0)
+
+
+@pytest.mark.parametrize("skip", [False, True], ids=["network", "skip"])
+def test_every_way_to_evaluate_a_scaled_network_agrees(skip):
+    field = SCALED.residual
+    field = LinearSkip(jax.random.normal(KEY, (6, 8)), field) if skip else field
+    x, u = CAR.test.x0, CAR.test.u[:, 0]
+    expected = jax.vmap(field)(x, u)
+    np.testing.assert_allclose(infer_batch(field, x.T, u.T).T, expected, rtol=1e-4, atol=1e-5)
+    fused = fuse_for_inference(field)
+    assert type(fused) is not type(field)
+    np.testing.assert_allclose(jax.vmap(fused)(x, u), expected, rtol=1e-4, atol=1e-5)
+    dx, du = jnp.eye(6, 8), jnp.eye(2, 8, 6)
+    for i in range(3):
+        for a, b in zip(linearize(fused, x[i], u[i], dx, du), linearize(field, x[i], u[i], dx, du), strict=True):
+            np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
+
+
+def test_training_leaves_the_scaling_and_a_file_keeps_it(tmp_path):
+    trained = hj.fit(CAR.model, CAR.train, CAR.validation, KEY, max_epochs=2).best
+    assert trained.residual.scaling == SCALED.residual.scaling != ChannelScaling()
+    hj.save(tmp_path / "car.npz", trained)
+    assert eqx.tree_equal(hj.load(tmp_path / "car.npz").field, trained)
