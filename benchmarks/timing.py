@@ -23,8 +23,8 @@ from rich.console import Console
 from rich.table import Table
 
 from experiments.paper.figures import save_figure
-from experiments.reporting.environment import environment
 from experiments.runner.command import BAD_INPUT, check_folder
+from experiments.runner.environment import environment
 from hybrid_jax.io.files import json_text, write_whole
 from hybrid_jax.runtime import PROGRAMS, configure, cores
 

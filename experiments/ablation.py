@@ -18,10 +18,10 @@ from experiments.paper.figures import save_figure
 from experiments.paper.results import Lanes, rows_of, trained
 from experiments.paper.rows import Row, with_rho
 from experiments.paper.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
-from experiments.reporting.environment import environment
 from experiments.reporting.report import print_tables
 from experiments.reporting.report_page import sections
 from experiments.runner import command
+from experiments.runner.environment import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.io.files import json_text, json_value, write_whole

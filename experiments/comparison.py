@@ -33,9 +33,9 @@ from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
 from experiments.paper.results import Lanes, rows_of, save_models
 from experiments.paper.rows import SOURCE_OF, Row, with_rho
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
-from experiments.reporting.environment import environment
 from experiments.reporting.report import FLOOR, Report, print_report, write_report
 from experiments.runner import command
+from experiments.runner.environment import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax import checks
 from hybrid_jax.adaptation.expert_augmentation import Augmentation

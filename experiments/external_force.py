@@ -6,7 +6,7 @@ python -m experiments.external_force --help
 import numpy as np
 from rich.console import Console
 
-from experiments.paper.config import AdaptationConfig
+from experiments.paper.config import PRESETS, AdaptationConfig
 from experiments.paper.outcome import write_outcome
 from experiments.paper.study import EVERY, study
 from experiments.runner import command
@@ -42,7 +42,7 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
 
 def main() -> None:
     """The command line."""
-    command.run(NAME, "A side wind that the model has never felt: adapt to it.", experiment)
+    command.run(NAME, "A side wind that the model has never felt: adapt to it.", experiment, presets=PRESETS)
 
 
 if __name__ == "__main__":

@@ -5,7 +5,7 @@ python -m experiments.param_shift --help
 
 from rich.console import Console
 
-from experiments.paper.config import AdaptationConfig
+from experiments.paper.config import PRESETS, AdaptationConfig
 from experiments.paper.outcome import write_outcome
 from experiments.paper.study import study
 from experiments.runner import command
@@ -25,7 +25,7 @@ def experiment(config: AdaptationConfig, console: Console) -> None:
 
 def main() -> None:
     """The command line."""
-    command.run(NAME, "The vehicle's roll and pitch inertia change: adapt to it.", experiment)
+    command.run(NAME, "The vehicle's roll and pitch inertia change: adapt to it.", experiment, presets=PRESETS)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,13 @@
-"""How this process uses the machine: a JAX device for each CPU core, small loops compiled whole, programs kept.
-
-And in what precision: products of single precision are that on a GPU as well.
-"""
+"""Process-wide JAX set-up: one device per CPU core, XLA options, compilation cache, precision; and the hardware."""
 
 import contextlib
 import os
+import platform
 import zlib
+from collections import Counter
 from importlib.metadata import version
 from pathlib import Path
+from typing import Any
 
 import jax
 
@@ -16,32 +16,35 @@ PROGRAM = "*-cache"
 VERIFIED = ".verified"
 FLAGS = "XLA_FLAGS"
 EXTRA = "--xla_backend_extra_options"
-# XLA runs a loop kernel by kernel, and one that passes over 13 numbers of a minibatch costs less than its launch. It
-# makes one kernel of a loop without matrix products that touches no more than so many bytes, by default 1024.
+# XLA compiles a loop without matrix products into one kernel if it touches at most this many bytes, by default 1024.
+# Kernels over 13 numbers of a minibatch cost less than their launches, so the limit is raised.
 WHOLE_LOOPS = f"{EXTRA}=xla_cpu_small_while_loop_byte_threshold=10000000"
-# Compiler options of what runs seldom or is large. XLA's fusion emitters make a gradient step faster, but least squares
-# and predictions compile in half the time without; later versions may have no other way.
+# Compiler options for programs that run seldom or are large. Fusion emitters make a gradient step faster, but least
+# squares and predictions compile in half the time without them. Later versions may not have the option.
 FAST_COMPILE: dict[str, bool | int] = {}
 if version("jaxlib").split(".")[:2] == ["0", "10"]:
     FAST_COMPILE["xla_cpu_use_fusion_emitters"] = False
-# At its first level of optimisation the simulator compiles in two thirds of the time of its third, for flights that are
-# 3 % slower. None at all, which XLA_FLAGS may ask for, makes them five times as slow.
+# At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
+# level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
 
 
 def configure(cache: Path) -> None:
-    """Set all of it up; call it before the first array is made, because JAX's devices are fixed by then.
+    """Configure JAX. Call it before the first array is made, which fixes JAX's devices.
 
-    Programs are kept in the cache folder, or where JAX's own variable JAX_COMPILATION_CACHE_DIR says. Those that a
-    kill left half written are deleted: JAX would warn of each in every run, compile it anew and never replace it.
+    Truncated programs in the compilation cache, left by a kill, are deleted: JAX would warn of each in every run,
+    recompile it and never replace it.
+
+    Args:
+        cache: compiled programs are kept in its subfolder `programs`, unless JAX_COMPILATION_CACHE_DIR is set.
 
     Raises:
-        ValueError: the folder cannot be made.
+        ValueError: the folder cannot be created.
     """
     programs = Path(os.environ.get(PROGRAMS) or cache / "programs")
     try:
         programs.mkdir(parents=True, exist_ok=True)
-        _delete_half_written(programs)
+        _delete_truncated(programs)
     except OSError as error:
         where = f"{PROGRAMS} {programs}" if os.environ.get(PROGRAMS) else f"--cache {cache}"
         raise ValueError(f"{where}: cannot be written: {error.strerror}") from error
@@ -49,11 +52,11 @@ def configure(cache: Path) -> None:
         os.environ[FLAGS] = f"{flags} {WHOLE_LOOPS}".strip()
     jax.config.update("jax_num_cpu_devices", cores())
     jax.config.update("jax_compilation_cache_dir", str(programs))
-    # XLA's own caches would put their folder into the key of every program, and none would be found in a moved cache.
+    # XLA's own caches put their folder into the key of every program, so that a moved cache would be useless.
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
-    # A GPU's default rounds the factors of a product to 10 bits, which is 0.6 % of a gradient; on a CPU it is the same.
+    # A GPU's default rounds the factors of a product to 10 bits, an error of 0.6 % in a gradient. No effect on a CPU.
     jax.config.update("jax_default_matmul_precision", "float32")
 
 
@@ -62,18 +65,45 @@ def cores() -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _delete_half_written(programs: Path) -> None:
+def hardware() -> dict[str, Any]:
+    """Processor, cores, memory [GiB] and JAX devices, as JSON values."""
+    return {
+        "cpu": _processor(),
+        "cores": os.cpu_count(),
+        "memory_gib": _memory(),
+        "jax_backend": jax.default_backend(),
+        "jax_devices": [f"{count} × {kind}" for kind, count in Counter(d.device_kind for d in jax.devices()).items()],
+    }
+
+
+def _processor() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:  # not Linux
+        lines = []
+    names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
+    return names[0] if names else platform.processor() or platform.machine()
+
+
+def _memory() -> float | None:
+    try:
+        return round(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") / 2**30, 1)
+    except (AttributeError, ValueError, OSError):  # not POSIX
+        return None
+
+
+def _delete_truncated(programs: Path) -> None:
     verified = programs / VERIFIED
     since = verified.stat().st_mtime_ns if verified.exists() else 0
-    verified.touch()  # before looking, so that what is written meanwhile is verified next time
+    verified.touch()  # first, so that programs written meanwhile are verified next time
     for path in programs.glob(PROGRAM):
-        with contextlib.suppress(FileNotFoundError):  # another process that starts was faster
-            if path.stat().st_mtime_ns >= since and _half_written(path.read_bytes()):
+        with contextlib.suppress(FileNotFoundError):  # deleted by another process
+            if path.stat().st_mtime_ns >= since and _is_truncated(path.read_bytes()):
                 path.unlink()
 
 
-def _half_written(program: bytes) -> bool:
-    """Whether it is a zlib stream that ends too early; what zstandard wrote, where that is installed, is not judged."""
+def _is_truncated(program: bytes) -> bool:
+    """Whether it is a zlib stream that ends too early. Programs compressed by zstandard are not checked."""
     stream = zlib.decompressobj()
     try:
         stream.decompress(program)

@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 
 from experiments.paper.claims import claims
 from experiments.paper.rows import DOMAINS, MODELS, MODES, STATUSES, THETA, Row, with_rho
-from experiments.reporting.environment import environment
 from experiments.reporting.report import Report
+from experiments.runner.environment import environment
 
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": 8.5e-6}
 SIZES = (100, 500, 1000)

@@ -188,7 +188,7 @@ class Airspace:
         even = -(-max(len(block.keys()) for block in blocks) // jax.device_count())
         width = WIDTH.get(jax.default_backend(), even)
         self._groups = LaneGroups([block.lanes(bandwidth) for block in blocks], width)
-        self._run = LaneMap(self._groups.mapped(partial(simulate, controller)), 1, room=self._groups.room)
+        self._run = LaneMap(self._groups.mapped(partial(simulate, controller)), 1, min_capacity=self._groups.room)
 
     def fly(self, block: Block) -> Flights:
         """The flights of a block, found in the cache or flown now.

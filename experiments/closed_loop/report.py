@@ -19,10 +19,10 @@ from experiments.closed_loop.rows import FlightRow, Flyer, to_csv
 from experiments.closed_loop.tables import ablation_tables, gap_tables, speed_table, tables
 from experiments.paper.figures import save_figure
 from experiments.paper.rows import NAMES
-from experiments.reporting.environment import environment
 from experiments.reporting.report import print_tables
 from experiments.reporting.report_page import sections
 from experiments.reporting.report_tables import Table, verdicts
+from experiments.runner.environment import environment
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.io.files import json_text, json_value, write_whole
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT

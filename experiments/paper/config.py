@@ -2,19 +2,16 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-import platformdirs
-
+from experiments.runner.options import Run
 from hybrid_jax import checks
 from hybrid_jax.training.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
-# Options that change no result: where files lie, how often state is saved, on what machines it runs.
-UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
@@ -87,47 +84,6 @@ class Encoding:
     """Early stopping, by the error of the prediction on source and augmented validation flights."""
     max_epochs: int = 400
     """Cap on the encoder's epochs."""
-
-
-@dataclass(frozen=True)
-class Run:
-    """Results are written to --out; flights and finished stages are kept in --cache and reused by any run that needs
-    the same ones.
-    """
-
-    preset: Literal["paper", "quick", "smoke"] = "paper"
-    """paper: the full protocol. quick: two seeds, two sizes, about three minutes. smoke: does everything work."""
-    out: Path = Path("runs")
-    """Folder for the report, the figures and the models; a folder of the experiment's name is made in it."""
-    cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
-    """Folder for flights, finished stages and compiled programs."""
-    fresh: bool = False
-    """Start anew: what a run has left in --out, and sweeps that were begun, are moved aside; nothing is deleted."""
-    saving: float = 0.02
-    """Share of a sweep's time that saving its state may take; what a kill can cost grows as this shrinks."""
-    seeds: int = 10
-    """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
-    distributed: bool = False
-    """Be one of several processes, on one machine or many, that share the lanes: start the same command for each.
-    Process 0 writes. Who is who says the cluster (Slurm, Open MPI, Kubernetes, Cloud TPU) or the next three options."""
-    coordinator: str | None = None
-    """With --distributed: host:port of process 0, a port that is free there and that all can reach."""
-    processes: int | None = None
-    """With --distributed: how many there are."""
-    process_id: int | None = None
-    """With --distributed: which of them this is, from 0."""
-
-    def __post_init__(self):
-        if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
-            raise ValueError("--coordinator, --processes and --process-id need --distributed")
-        if self.seeds < 1:
-            raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
-        if not 0 < self.saving <= 1:
-            raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
-
-    def described(self) -> dict[str, Any]:
-        """All that fixes the results: where files lie, how often state is saved and where it runs do not."""
-        return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
 
 @dataclass(frozen=True)

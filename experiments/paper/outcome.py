@@ -14,8 +14,8 @@ from experiments.paper.figures import save_figure, scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.results import Lanes, save_models
 from experiments.paper.study import EVERY, Study
-from experiments.reporting.environment import environment
 from experiments.reporting.report import FLOOR, Report, print_report, write_report
+from experiments.runner.environment import environment
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 

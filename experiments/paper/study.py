@@ -1,7 +1,7 @@
 """The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -16,7 +16,7 @@ from experiments.paper.results import Lanes, rows_of, solution, trained
 from experiments.paper.rows import SOURCE_OF, Row, with_rho
 from experiments.paper.sensors import measured
 from experiments.paper.solved import Solve, constant_disturbance, solved
-from experiments.runner.precompile import Ahead, blank
+from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
@@ -24,8 +24,8 @@ from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.training import Room, compile_evaluation, compile_sweep, evaluate
-from hybrid_jax.training.fitting import FitState
+from hybrid_jax.sweep.training import evaluate, sweep
+from hybrid_jax.training.fitting import STOPPED, FitState
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
@@ -62,7 +62,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     learned: dict[str, FitState] = {}
     sources = dict.fromkeys(source_of(model) for model in config.models)
     unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
-    with Ahead({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
+    with PrecompilePool({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
         source = get(config.source_flights, SOURCE, source_splits(config))
         target = get(config.target_flights, domain, target_splits(config))
         for model in config.models:
@@ -78,7 +78,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
     """A model after pre-training on source flight, one lane a seed."""
-    shared = settings(config), source, room(config)
+    shared = settings(config), source, capacity(config)
     found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
     for factor in config.rates.decay:
         lanes = annealing(model, found.best, factor, config)
@@ -91,7 +91,7 @@ def adapted(
 ) -> FitState:
     """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
     lanes = adaptation(model, mode, fields, config)
-    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, room(config))
+    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, capacity(config))
 
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
@@ -135,9 +135,9 @@ def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
     return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
-def room(config: Config) -> Room:
-    """Of all programs of a model: pre-training has fewer lanes, adaptation fewer windows, and both share one."""
-    return Room(config.seeds * len(config.sizes), max(config.source_train, config.pooled()))
+def capacity(config: Config) -> tuple[int, int]:
+    """Runs and windows to compile for, shared by pre-training (fewer runs) and adaptation (fewer windows)."""
+    return config.seeds * len(config.sizes), max(config.source_train, config.pooled())
 
 
 def source_of(model: str) -> str:
@@ -160,13 +160,14 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     """Compile all that training and testing a model will run: of windows and models, a program knows shapes alone."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
-        {name: blank(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
+        {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
     before = pretraining(model, vehicle, config)
     after = adaptation(model, "target_only", fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
-        compile_sweep(states, plans, windows["train"], windows["validation"], shared, room(config))
-        compile_evaluation(states.best, target["test"], EVERY, shared, room(config))
+        stopped = replace(states, status=np.full_like(states.status, STOPPED))
+        sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
+    evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
 
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
@@ -183,7 +184,9 @@ def _solved(model: str, source: AbstractVectorField, config: Config, stages: Sta
 
 def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> np.ndarray:
     """L^T_MSE of stacked fields on the test flights."""
-    return stages.timed(stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config), room(config)))
+    return stages.timed(
+        stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config), capacity(config)[0])
+    )
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

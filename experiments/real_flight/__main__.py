@@ -157,7 +157,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not any(word.startswith(("--simulated", "--source", "--vehicle", "--help", "-h")) for word in given):
         print(GUIDE, file=sys.stderr)
         sys.exit(command.BAD_INPUT)
-    command.run(NAME, ABOUT, experiment, spaced(given), PRESETS)
+    command.run(NAME, ABOUT, experiment, spaced(given), presets=PRESETS)
 
 
 def spaced(arguments: Sequence[str]) -> list[str]:

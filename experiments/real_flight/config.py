@@ -5,8 +5,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
-from experiments.paper.config import Run, distinct
+from experiments.paper.config import distinct
 from experiments.real_flight.recipes import RECIPES, Model, RecipeName
+from experiments.runner.options import Run
 from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 

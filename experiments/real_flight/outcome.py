@@ -31,10 +31,10 @@ from experiments.real_flight.rows import Cell, FlightRow, by_name, cell_name, ce
 from experiments.real_flight.study import Study
 from experiments.real_flight.tables import choice_tables, fold_tables, log_tables, parameter_tables, score_tables
 from experiments.real_flight.train import Taught
-from experiments.reporting.environment import environment
 from experiments.reporting.report import print_tables
 from experiments.reporting.report_page import sections
 from experiments.reporting.report_tables import Table, verdicts
+from experiments.runner.environment import environment
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.terms import nominal_values
 from hybrid_jax.flights.splits import flight_of

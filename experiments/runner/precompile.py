@@ -1,4 +1,4 @@
-"""Programs compiled on other threads, while flights are being flown or another model is being trained."""
+"""Compile programs on other threads, while flights are simulated or another model is trained."""
 
 from collections.abc import Callable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -14,19 +14,19 @@ from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.trajectories import Trajectories
 
 
-class Ahead(AbstractContextManager):
-    """Jobs by name that compile, in the order in which they are given, one for each core at a time.
+class PrecompilePool(AbstractContextManager):
+    """A pool of named compile jobs, started in the order given, one per core at a time.
 
-    Processes of a distributed run compile as they go: threads of theirs would not meet in one order.
+    A distributed run ignores the jobs: its processes must compile collective programs in the same order.
     """
 
-    def __init__(self, jobs: Mapping[str, Callable[[], None]]):
+    def __init__(self, jobs: Mapping[str, Callable[[], object]]):
         self._pool = ThreadPoolExecutor(cores())
         alone = jax.process_count() == 1
         self._jobs: dict[str, Future] = {name: self._pool.submit(job) for name, job in jobs.items() if alone}
 
     def wait_for(self, name: str) -> None:
-        """Wait until a job is done, if there is one of this name. What it failed with, the caller will meet himself."""
+        """Wait for a job, if there is one of this name. Its error is ignored: the caller will run into it too."""
         if name in self._jobs:
             wait([self._jobs[name]])
 
@@ -34,8 +34,8 @@ class Ahead(AbstractContextManager):
         self._pool.shutdown(cancel_futures=True)
 
 
-def blank(spec: SplitSpec) -> Trajectories:
-    """Windows of the shapes of a split that has yet to be flown; the vehicle rests."""
+def placeholder(spec: SplitSpec) -> Trajectories:
+    """Windows at rest with the shapes of a split that is not yet simulated."""
     x = np.zeros((spec.windows, spec.steps, STATE_SIZE), np.float32)
     x[..., QUATERNION] = [1, 0, 0, 0]
     return Trajectories(x[:, 0], np.zeros((*x.shape[:2], INPUT_SIZE), np.float32), x, dt=DT)

@@ -1,4 +1,4 @@
-"""Progress on stderr: a live line for a person, a plain line now and then where the output is a file."""
+"""Progress on stderr: a live line in a terminal, an occasional plain line in a file."""
 
 import time
 from contextlib import AbstractContextManager
@@ -10,11 +10,11 @@ from rich.text import Text
 
 from hybrid_jax.sweep.training import Progress
 
-FIRST, QUIET = 5.0, 30.0  # s before the first line in a file, and between two
+FIRST, INTERVAL = 5.0, 30.0  # s before the first line in a file, and between lines
 
 
 class Line(AbstractContextManager):
-    """One line about a stage, drawn anew whenever there is news."""
+    """One line about a stage, updated by `say`."""
 
     def __init__(self, name: str, console: Console):
         self._name, self._console = name, console
@@ -30,45 +30,45 @@ class Line(AbstractContextManager):
         if self._live is not None:
             self._live.stop()
 
-    def say(self, news: str) -> None:
-        """Draw the news, in a file only now and then."""
-        line = f"{self._name}: {news}"
+    def say(self, text: str) -> None:
+        """Show the text; in a file at most once per INTERVAL."""
+        line = f"{self._name}: {text}"
         if self._live is not None:
             self._live.update(Text(line))
         elif time.perf_counter() > self._due:
-            self._due = time.perf_counter() + QUIET
+            self._due = time.perf_counter() + INTERVAL
             self._console.print(line, highlight=False, soft_wrap=True)
 
 
 class SweepLine(Line):
-    """About a sweep; `show` is what `sweep` calls after each block."""
+    """The progress of a sweep."""
 
     def show(self, progress: Progress) -> None:
-        """Draw where the sweep is."""
+        """Show the progress; called after each block."""
         self.say(describe(progress))
 
 
 class PartLine(Line):
-    """About work in so many parts, of which `show` is told how many are done."""
+    """The progress of work in a known number of parts."""
 
     def __init__(self, name: str, console: Console, parts: int):
         super().__init__(name, console)
         self._parts, self._began = parts, time.perf_counter()
 
     def show(self, done: int) -> None:
-        """Draw how many parts are done, and what is left if the others take as long."""
-        gone = time.perf_counter() - self._began
-        left = gone / done * (self._parts - done)
-        self.say(f"{done} of {self._parts} parts, {clock(gone)} gone, {clock(left)} left")
+        """Show the number of finished parts and the time left, if the others take as long."""
+        elapsed = time.perf_counter() - self._began
+        left = elapsed / done * (self._parts - done)
+        self.say(f"{done} of {self._parts} parts, {clock(elapsed)} elapsed, {clock(left)} left")
 
 
 def describe(progress: Progress) -> str:
-    """Lanes active, best loss, time gone and an estimate of what is left: least and most epochs to come."""
+    """Active runs, best loss, elapsed time, and bounds of the time left."""
     low, high = (progress.seconds * left / max(progress.epochs, 1) for left in (progress.at_least, progress.at_most))
-    share = progress.active / progress.lanes  # stopped lanes cost nothing any more
+    share = progress.active / progress.lanes  # stopped runs cost nothing
     return (
-        f"{progress.active} of {progress.lanes} lanes active, epoch {progress.epochs}, best validation loss "
-        f"{progress.best:.3g}, {clock(progress.seconds)} gone, {clock(low * share)} to {clock(high * share)} left"
+        f"{progress.active} of {progress.lanes} runs active, epoch {progress.epochs}, best validation loss "
+        f"{progress.best:.3g}, {clock(progress.seconds)} elapsed, {clock(low * share)} to {clock(high * share)} left"
     )
 
 

@@ -1,4 +1,4 @@
-"""What a folder of results is about: run.json, by which an unfinished run goes on as itself or not at all."""
+"""run.json in a results folder: the configuration of the run, so that only the same run can resume."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -7,29 +7,29 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
-from experiments.paper.config import Run
-from experiments.reporting.environment import PACKAGES
+from experiments.runner.environment import PACKAGES
+from experiments.runner.options import Run
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_whole
 
 FILE = "run.json"
-FIXED = ("config", "versions", "flights")  # what must be the same for a run to go on
+FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
 ANEW = "--fresh starts anew and moves it aside"
 
 
 class OtherRun(ValueError):
-    """What was begun differs from what is asked for; the message has a line for each difference."""
+    """The unfinished run differs from the requested one; the message has one line per difference."""
 
 
 @contextmanager
 def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
-    """Note in a folder that a run was begun there, and at the end that it is finished.
+    """Record that a run began in a folder, and at the end that it finished.
 
-    A run that ends in bad input was not begun: what was noted before stands again.
+    A run that ends in bad input restores the previous record.
 
     Raises:
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
-        ValueError: what is there cannot be read, or flights that are asked for.
+        ValueError: the record or a given file of flights cannot be read.
     """
     record = describe(config)
     if config.fresh:
@@ -53,7 +53,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
 
 
 def describe(config: Run) -> dict[str, Any]:
-    """All that fixes the results, as JSON values, and the time [UTC, ISO 8601]."""
+    """Everything that determines the results, as JSON values, and the time [UTC, ISO 8601]."""
     options = config.described()
     given = {name: value for name, value in options.items() if isinstance(value, Path)}
     return {
@@ -65,10 +65,10 @@ def describe(config: Run) -> dict[str, Any]:
 
 
 def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Compare what fixes a run.
+    """Compare two records of runs.
 
     Raises:
-        OtherRun: it differs; names `what`, and a line for each field with old → new.
+        OtherRun: they differ; the message begins with `what` and has a line `field: old → new` per difference.
     """
     before, now = (_flat({name: each.get(name, {}) for name in FIXED}) for each in (old, new))
     lines = [
@@ -85,14 +85,14 @@ def _write(folder: Path, record: Mapping[str, Any], state: str) -> None:
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:
-    """Move all that a run has left into a neighbour, its record last: a kill in between loses nothing."""
+    """Move the contents of a results folder to a backup beside it, the record last, so that a kill loses nothing."""
     left = [path for path in folder.iterdir() if path.name != ".lock"]
     if left:
         elsewhere = backup_path(folder, "before")
         elsewhere.mkdir()
         for path in sorted(left, key=lambda path: path.name == FILE):
             path.rename(elsewhere / path.name)
-        say(f"{folder}: what was there is now in {elsewhere}")
+        say(f"{folder}: earlier contents moved to {elsewhere}")
 
 
 def _sha256(path: Path) -> str:

@@ -1,21 +1,21 @@
-"""SIGINT and SIGTERM, held back while a sweep is in a block of epochs."""
+"""Defer SIGINT and SIGTERM until a block of epochs is complete."""
 
 import signal
 from contextlib import AbstractContextManager
-from typing import Any
+from typing import Any, Self
 
 
-class Held(AbstractContextManager):
-    """Hold the first signal until `deliver`, or until the end; a second one acts at once.
+class DeferredSignals(AbstractContextManager):
+    """Defer the first signal until `raise_pending` or the end of the context; a second one acts at once.
 
-    Only signals that the process handles in Python are held, and only in its main thread, as Python has it.
+    Only signals with a Python handler are deferred, and only in the main thread.
     """
 
     def __init__(self):
         self._first: int | None = None
         self._before: dict[int, Any] = {}
 
-    def __enter__(self) -> "Held":
+    def __enter__(self) -> Self:
         handlers = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
         self._before = {number: handler for number, handler in handlers.items() if callable(handler)}
         for number in self._before:
@@ -26,15 +26,15 @@ class Held(AbstractContextManager):
         for number, handler in self._before.items():
             signal.signal(number, handler)
         if kind is None:
-            self.deliver()
+            self.raise_pending()
 
     @property
-    def waiting(self) -> bool:
-        """Whether a signal has come."""
+    def pending(self) -> bool:
+        """Whether a signal has arrived."""
         return self._first is not None
 
-    def deliver(self) -> None:
-        """Let a signal that has come act now: its handler raises."""
+    def raise_pending(self) -> None:
+        """Call the original handler of a signal that has arrived; the handler raises."""
         if self._first is not None:
             self._act(self._first)
 

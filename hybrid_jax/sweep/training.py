@@ -1,7 +1,7 @@
 """Many training runs as one compiled program: every seed, size and rate is a lane (see lanes.py).
 
-A host loop takes the active lanes through blocks of epochs. Between two blocks it drops the lanes that have stopped,
-so that these cost nothing, reports progress, and is where a run can be interrupted.
+A host loop trains the active lanes in blocks of epochs. Between blocks it drops the lanes that have stopped, reports
+progress, and can be interrupted.
 """
 
 import time
@@ -26,35 +26,20 @@ from hybrid_jax.training.preparation import check_minibatch
 from hybrid_jax.trajectories import Trajectories
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
-PROGRAMS = 16  # of a kind that are kept: more than an experiment needs, and a bound on a long process's memory
-
-
-@dataclass(frozen=True)
-class Room:
-    """What a program has places for, so that sweeps of less share it; a sweep of more has a program of its own.
-
-    Attributes:
-        lanes: where a chunk is of a fixed width (see `LaneMap`).
-        windows: of training.
-    """
-
-    lanes: int = 0
-    windows: int = 0
-
-
-NO_MORE = Room()  # than is asked for
+PROGRAMS = 16  # compiled programs kept in memory, to train and to evaluate
 
 
 @dataclass(frozen=True)
 class Progress:
-    """What a sweep knows after a block of epochs.
+    """The state of a sweep after a block of epochs.
 
     Attributes:
         active: lanes still training.
         lanes: all lanes.
         epochs: the most epochs that a lane has completed.
         best: the smallest validation L_MSE of any lane.
-        longest: epochs that the active lanes may still need at the most, and need at the least.
+        at_least: epochs that some active lane still needs.
+        at_most: epochs that some active lane may still need.
         seconds: since the sweep began.
     """
 
@@ -74,37 +59,40 @@ def sweep(
     validation: Trajectories,
     settings: Settings,
     *,
-    room: Room = NO_MORE,
+    min_capacity: tuple[int, int] = (0, 0),
     width: int | None = None,
     block_seconds: float = 4.0,
     on_block: Callable[[FitState, Progress], None] | None = None,
 ) -> FitState:
-    """Take every lane to its end.
+    """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
-        states: stacked starts, one a lane (`training.start`, `lanes.stack`).
-        plans: stacked plans, one a lane.
-        train: the windows that plans index into; shared by all lanes.
-        room: that the program has at the least.
-        width: lanes in a chunk; see `LaneMap`.
+        states: stacked initial states, one per lane (`fitting.start`, `lanes.stack`).
+        plans: stacked run configurations, one per lane.
+        train: the windows that `plans` index into; shared by all lanes.
+        validation: shared by all lanes.
+        min_capacity: lanes and training windows to compile for at least. Smaller sweeps are padded and share the
+            program; padding of lanes needs a fixed width (see `LaneMap`).
+        width: lanes in a chunk; see `LaneMap`. On a GPU, lower it if a sweep does not fit into memory.
+        block_seconds: approximate duration of a block of epochs.
         on_block: called after each block with all states and the progress.
 
     Returns:
         The stacked final states as host arrays, in the order given. A lane whose loss was not finite has status
-        DIVERGED and the best epoch that it had; it changes no other lane.
+        DIVERGED and the best epoch before it; it affects no other lane.
 
     Raises:
-        ValueError: bad data, a plan that asks for more windows than `train` has or for less than a minibatch, or a
-            minibatch of one window where fields normalise it.
+        ValueError: invalid data, n_train below the batch size or above the number of windows, or a minibatch of one
+            window where a field normalises minibatches.
     """
     states, plans = jax.device_get((states, plans))
-    plans, block, shared, costs = _ready(states, plans, train, validation, settings, room, width)
+    plans, block, shared, costs = _prepare(states, plans, train, validation, settings, min_capacity, width)
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == fitting.RUNNING)):
         start = time.perf_counter()
-        # A device with less to do than the busiest trains its lanes longer, so that none of them waits.
+        # A device with less work than the busiest trains its lanes for more epochs, so that none is idle.
         epochs = np.zeros(len(costs), np.int32)
-        epochs[active] = more * block.slack((states, plans, epochs), shared, costs, active)
+        epochs[active] = more * block.load_balance(states, costs, active)
         states = _merge(states, active, block((states, plans, epochs), shared, costs, active))
         if on_block is not None:
             on_block(states, _progress(states, plans, time.perf_counter() - began))
@@ -112,70 +100,47 @@ def sweep(
     return states
 
 
-def compile_sweep(
-    states: FitState,
-    plans: RunConfig,
-    train: Trajectories,
-    validation: Trajectories,
-    settings: Settings,
-    room: Room = NO_MORE,
-) -> None:
-    """Compile what `sweep` of arguments of these shapes would; on another thread, say, while data are being made.
-
-    Raises:
-        ValueError: as `sweep`.
-    """
-    states, plans = jax.device_get((states, plans))
-    _ready(states, plans, train, validation, settings, room, None)
-
-
 def evaluate(
-    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, room: Room = NO_MORE
+    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
-    """L_MSE of each lane's field as deployed, on windows that all lanes share."""
-    return _errors(fields, windows, every, settings, room, range(count(fields)))
+    """L_MSE of each lane's field in inference mode, on windows shared by all lanes.
 
-
-def compile_evaluation(
-    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, room: Room = NO_MORE
-) -> None:
-    """Compile what `evaluate` of arguments of these shapes would."""
-    _errors(fields, windows, every, settings, room, ())
-
-
-def _errors(fields, windows, every: int, settings: Settings, room: Room, active) -> Float[np.ndarray, " active"]:
+    Args:
+        every: compare with every so many states of a window.
+        min_lanes: to compile for at least; see `sweep`.
+    """
     fields = jax.device_get(fields)
-    places = max(count(fields), room.lanes)
-    errors = _evaluation(settings, every, places, _shapes(lane(fields, 0), windows))
-    return errors(fields, (windows,), np.ones(count(fields)), active)
+    lanes = count(fields)
+    errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
+    return errors(fields, (windows,), np.ones(lanes), range(lanes))
 
 
-def _ready(
+def _prepare(
     states: FitState,
     plans: RunConfig,
     train: PyTree,
     validation: PyTree,
     settings: Settings,
-    room: Room,
+    min_capacity: tuple[int, int],
     width: int | None,
 ) -> tuple[RunConfig, LaneMap, tuple, np.ndarray]:
-    """Plans and shared data as the compiled block takes them, that block, and what an epoch of each lane costs."""
+    """The arguments of the compiled block, the block itself, and the cost of an epoch of each lane."""
     train = settings.objective.prepare(train, "train")
     validation = settings.objective.prepare(validation, "validation")
     check_minibatch(states.field, settings)
     _check(plans, train, settings)
-    plans, train = _padded(plans, train, room.windows)
+    plans, train = _padded(plans, train, min_capacity[1])
     shared = (train, validation)
-    places = max(count(states), room.lanes)
-    block = _block(settings, width, places, _shapes(lane((states, plans), 0), shared))
-    costs = np.asarray(plans.n_train) + len(validation) / 8  # a forward window costs an eighth of a trained one
+    lanes = max(count(states), min_capacity[0])
+    block = _block(settings, width, lanes, _shapes(lane((states, plans), 0), shared))
+    costs = np.asarray(plans.n_train) + len(validation) / 8  # a validation window costs an eighth of a training window
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
     return plans, block, shared, costs
 
 
 def _padded(plans: RunConfig, train: PyTree, windows: int) -> tuple[RunConfig, PyTree]:
-    """Plans and data as if there were so many windows; no plan asks for what is added."""
+    """Pad plans and data to a number of windows. No plan uses the padding."""
     listed = plans.subset.shape[-1]
     subset = np.pad(plans.subset, ((0, 0), (0, max(windows, listed) - listed)))
     if len(train) < windows:
@@ -184,31 +149,31 @@ def _padded(plans: RunConfig, train: PyTree, windows: int) -> tuple[RunConfig, P
 
 
 def _shapes(*trees: PyTree) -> tuple:
-    """What a program is compiled for."""
+    """The shapes, types and structure that a program is compiled for."""
     leaves = [leaf for leaf in jax.tree.leaves(trees) if eqx.is_array(leaf)]
     return (*((leaf.shape, leaf.dtype) for leaf in leaves), jax.tree.structure(trees))
 
 
-# A sweep of the same shapes, later in the same process, compiles nothing; one map a shape, so that old programs go.
+# A later sweep of the same shapes compiles nothing. One map per shape, so that unused programs are freed.
 @lru_cache(PROGRAMS)
-def _block(settings: Settings, width: int | None, places: int, shapes: tuple) -> LaneMap:
+def _block(settings: Settings, width: int | None, lanes: int, shapes: tuple) -> LaneMap:
     def block(lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:
         state, plan, epochs = lane
         return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)
 
-    return LaneMap(block, width, room=places)
+    return LaneMap(block, width, min_capacity=lanes)
 
 
 @lru_cache(PROGRAMS)
-def _evaluation(settings: Settings, every: int, places: int, shapes: tuple) -> LaneMap:
+def _evaluation(settings: Settings, every: int, lanes: int, shapes: tuple) -> LaneMap:
     def errors(field: AbstractVectorField, windows: Trajectories) -> Float[Array, ""]:
         return rollout_mse(field, windows, every, settings.solver)
 
-    return LaneMap(errors, room=places, compiler=FAST_COMPILE)
+    return LaneMap(errors, min_capacity=lanes, compiler=FAST_COMPILE)
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
-    """All states, the active lanes' replaced."""
+    """All states, with those of the active lanes replaced."""
 
     def put(old, new):
         old = np.array(old)
@@ -242,7 +207,7 @@ def _check(plans: RunConfig, train: PyTree, settings: Settings) -> None:
                 f"n_train={size} must lie between batch_size={settings.batch_size} and the number of windows: "
                 f"{len(train)} in train, {listed} in subset"
             )
-    # A gather would clamp such an index and train on another window in silence.
+    # A gather would clamp such an index and silently train on another window.
     outside = plans.subset[(plans.subset < 0) | (plans.subset >= len(train))]
     if outside.size:
-        raise ValueError(f"subset holds {outside[0]}, which is no index of the {len(train)} windows of train")
+        raise ValueError(f"subset holds {outside[0]}, which is not an index of the {len(train)} windows of train")

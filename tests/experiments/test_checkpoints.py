@@ -1,4 +1,4 @@
-"""Checkpoints of a sweep: two are kept, a damaged one is set aside, and no flipped bit is believed."""
+"""Checkpoints of a sweep: two are kept, and a damaged one is renamed and never loaded."""
 
 import random
 import subprocess
@@ -49,64 +49,63 @@ def test_what_is_loaded_is_the_last_save_bit_for_bit(tmp_path):
 
 def test_the_last_two_are_kept(tmp_path):
     saved(tmp_path, 4)
-    assert names(tmp_path) == ["000003", "000004"]
+    assert names(tmp_path) == ["000003.npz", "000004.npz"]
 
 
 def test_nothing_saved_is_nothing_found(tmp_path):
     assert loaded(tmp_path / "absent") == (None, [])
 
 
-@pytest.mark.filterwarnings("ignore::RuntimeWarning", "ignore::pytest.PytestUnraisableExceptionWarning")  # of orbax
-def test_no_flipped_bit_is_believed(tmp_path):
-    """A bit in every file of a checkpoint, each in turn: what is loaded is exact, or the checkpoint before it."""
+def test_a_flipped_bit_is_detected(tmp_path):
+    """Bits all over a checkpoint, each in turn: what is loaded is exact, or the checkpoint before it."""
     saved(tmp_path, 2)
-    rng, refused = random.Random(0), 0
-    for file in sorted(path for path in (tmp_path / "000002").rglob("*") if path.is_file() and path.stat().st_size):
-        content = bytearray(file.read_bytes())
-        place = rng.randrange(len(content))
+    file, rng = tmp_path / "000002.npz", random.Random(0)
+    intact = file.read_bytes()
+    for place in range(0, len(intact), 97):
+        content = bytearray(intact)
         content[place] ^= 1 << rng.randrange(8)
-        whole = file.read_bytes()
         file.write_bytes(content)
         (arrays, about), said = loaded(tmp_path)
         assert all(arrays[name].tobytes() == ARRAYS[name].tobytes() for name in ARRAYS)
         assert about == {"number": 2 - len(said)}
-        for aside in tmp_path.glob("000002.damaged-*"):
-            aside.rename(tmp_path / "000002")
-            refused += 1
-        file.write_bytes(whole)
-    assert refused >= 3  # among them the arrays and what is said about them
+    assert len(list(tmp_path.glob("000002.npz.damaged-*"))) > 10
+    file.write_bytes(intact)
     assert loaded(tmp_path)[0][1] == {"number": 2}
 
 
 @pytest.mark.parametrize("left", [0.0, 0.5])
-def test_a_truncated_checkpoint_is_named_and_set_aside(left, tmp_path):
+def test_a_truncated_checkpoint_is_named_and_renamed(left, tmp_path):
     saved(tmp_path, 2)
-    for file in (tmp_path / "000002").rglob("*"):
-        if file.is_file():
-            file.write_bytes(file.read_bytes()[: int(left * file.stat().st_size)])
-    (_, about), said = loaded(tmp_path)
+    file = tmp_path / "000002.npz"
+    file.write_bytes(file.read_bytes()[: int(left * file.stat().st_size)])
+    (_, about), (line,) = loaded(tmp_path)
     assert about == {"number": 1}
-    (line,) = said
-    assert line.startswith(f"{tmp_path / '000002'}: truncated or damaged, set aside as 000002.damaged-")
-    assert [name.split("-")[0] for name in names(tmp_path)] == ["000001", "000002.damaged"]
-
-
-def test_the_next_save_follows_what_was_set_aside(tmp_path):
-    saved(tmp_path, 2)
-    (tmp_path / "000002" / "about" / "metadata").write_text("{")
-    loaded(tmp_path)
+    assert line.startswith(f"{file}: truncated, damaged or not a hybrid_jax checkpoint")
+    assert "renamed to 000002.npz.damaged-" in line
+    assert [name.split("-")[0] for name in names(tmp_path)] == ["000001.npz", "000002.npz.damaged"]
     Checkpoints(tmp_path).save(ARRAYS, {"number": 9})
     assert loaded(tmp_path)[0][1] == {"number": 9}
 
 
-def test_deleting_leaves_what_was_set_aside(tmp_path):
+def test_checkpoints_of_the_version_before_are_moved_and_the_stage_starts_anew(tmp_path):
+    """It wrote a folder for each."""
+    (tmp_path / "old.begun" / "000001" / "arrays").mkdir(parents=True)
+    found, (line,) = loaded(tmp_path / "old.begun")
+    assert found is None
+    assert "of an earlier version, moved to old.begun.before-" in line
+    saved(tmp_path / "old.begun", 1).delete()
+    assert [name.split("-")[0] for name in names(tmp_path)] == ["old.begun.before"]
+
+
+def test_deleting_leaves_renamed_files(tmp_path):
     saved(tmp_path / "one", 2).delete()
     assert not (tmp_path / "one").exists()
     two = saved(tmp_path / "two", 2)
-    (tmp_path / "two" / "000002" / "about" / "metadata").write_text("{")
+    (tmp_path / "two" / ".000003.npz.1.part").touch()  # left by a kill
+    (tmp_path / "two" / "000002.npz").write_text("{")
     two.load(lambda line: None)
     two.delete()
-    assert [name.split("-")[0] for name in names(tmp_path / "two")] == ["000002.damaged"]
+    assert [name.split("-")[0] for name in names(tmp_path / "two")] == ["000002.npz.damaged"]
 
 
 FULL = """
@@ -128,8 +127,6 @@ def test_a_full_disk_leaves_what_was_saved(tmp_path):
     )
     assert full.returncode == 1
     assert len(full.stderr.splitlines()) == 1
-    assert "000003: the state cannot be saved: File too large" in full.stderr
+    assert "000003.npz: cannot be saved: File too large" in full.stderr
     assert loaded(tmp_path)[0][1] == {"number": 2}
-    # A thread of orbax that hears late of the failure may leave a folder behind, until the next save.
-    Checkpoints(tmp_path).save(ARRAYS, {"number": 3})
-    assert names(tmp_path) == ["000002", "000003"]
+    assert names(tmp_path) == ["000001.npz", "000002.npz"]

@@ -233,7 +233,7 @@ def test_a_second_run_trains_and_flies_nothing(folder):
     # Four models: pre-training, of the safe one in three stages, and two adaptations each; hover in three domains, and
     # away in two.
     assert again.stderr.count("as found in the cache") == 4 * 3 + 2 + 3 + 2, again.stderr
-    assert "lanes active" not in again.stderr
+    assert "runs active" not in again.stderr
     first, second = (json.loads((folder / out / "closed_loop" / "report.json").read_text()) for out in ("out", "again"))
     assert second["rows"] == [row for row in first["rows"] if row["reference"] == "hover"]
 

@@ -142,7 +142,7 @@ def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent
     run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
-            assert any("lanes active" in line for line in process.stderr)  # said after a few seconds of training
+            assert any("runs active" in line for line in process.stderr)  # said after a few seconds of training
             second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
             assert "another run is writing" in refused(second, "param_shift")
             process.send_signal(sent)

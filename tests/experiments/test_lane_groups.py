@@ -33,7 +33,7 @@ def test_every_lane_gets_its_own_result_from_one_program(width):
         return lone(one, factor)
 
     groups = LaneGroups(CALLS, width)
-    run = LaneMap(groups.mapped(function), 1, room=groups.room)
+    run = LaneMap(groups.mapped(function), 1, min_capacity=groups.room)
     for stacks in CALLS:
         grouped, where = groups.grouped(stacks)
         assert count(grouped) <= groups.room

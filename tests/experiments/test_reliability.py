@@ -70,11 +70,11 @@ class Place:
 
     def writes(self):
         """Whether a checkpoint is being written."""
-        return any(self.cache.glob("sweeps/*.begun/*.orbax-checkpoint-tmp*"))
+        return any(self.cache.glob("sweeps/*.begun/.*.part"))
 
     def checkpoints(self):
         try:
-            return sorted(path for path in self.cache.glob("sweeps/*.begun/*") if path.name.isdecimal())
+            return sorted(self.cache.glob("sweeps/*.begun/*.npz"))
         except FileNotFoundError:  # the sweep has ended while we looked
             return []
 
@@ -120,7 +120,7 @@ def killed(place, moment, delay):
 def test_a_killed_run_goes_on_by_itself_to_the_same_bits(number, place, whole):
     rows, spent = whole
     moment = MOMENTS[number % len(MOMENTS)]
-    # A checkpoint is written in some 50 ms.
+    # A checkpoint is written within some 50 ms.
     delay = random.Random(number).random() * spent.get(moment, 0.05)
     place.clear(flights=moment == "data")
     while not killed(place, moment, delay):  # the stage was shorter than when it was timed
@@ -174,12 +174,10 @@ def interrupted(place, checkpoints=2):
 @pytest.mark.usefixtures("begun")
 def test_a_truncated_checkpoint_is_set_aside_and_the_one_before_it_used(place, whole):
     last = place.checkpoints()[-1]
-    for path in last.rglob("*"):
-        if path.is_file():
-            os.truncate(path, path.stat().st_size // 2)
+    os.truncate(last, last.stat().st_size // 2)
     again = place.run()
     assert again.returncode == 0, again.stderr
-    assert f"{last}: truncated or damaged, set aside as {last.name}.damaged-" in again.stderr
+    assert f"{last}: truncated, damaged" in again.stderr
     assert "goes on where it was interrupted, at epoch" in again.stderr
     assert place.rows() == whole[0]
     assert [path.name.split("-")[0] for path in last.parent.iterdir()] == [f"{last.name}.damaged"]
@@ -188,7 +186,7 @@ def test_a_truncated_checkpoint_is_set_aside_and_the_one_before_it_used(place, w
 @pytest.mark.usefixtures("begun")
 def test_a_full_disk_ends_in_one_line_and_what_was_saved_is_used(place, whole):
     """No file may grow beyond 3 kB: the write of the next checkpoint fails as on a full disk."""
-    kept = {path: path.read_bytes() for path in place.checkpoints()[-1].rglob("*") if path.is_file()}
+    kept = {path: path.read_bytes() for path in place.checkpoints()}
     limited = ["sh", "-c", 'ulimit -f 6; exec "$@"', "sh", *place.command()]  # blocks of 512 bytes
     full = subprocess.run(limited, capture_output=True, text=True, cwd=ROOT)
     assert full.returncode == 2, full.stderr
@@ -199,8 +197,6 @@ def test_a_full_disk_ends_in_one_line_and_what_was_saved_is_used(place, whole):
     again = place.run()
     assert "goes on where it was interrupted, at epoch" in again.stderr
     assert place.rows() == whole[0]
-    # Not before: a thread of orbax that hears late of the failure may leave a folder behind, until the next save.
-    assert not place.writes()
 
 
 @pytest.mark.usefixtures("begun")

@@ -14,9 +14,9 @@ from rich.console import Console
 
 from experiments.paper.claims import EXPERIMENTS
 from experiments.paper.rows import DOMAINS, THETA, from_csv
-from experiments.reporting.environment import PACKAGES
 from experiments.reporting.report import FLOOR, load_report, print_report, write_report
 from experiments.reporting.report_tables import lane_notes, parameters
+from experiments.runner.environment import PACKAGES
 
 
 def test_report_json_keeps_the_contract(tmp_path):

@@ -25,13 +25,13 @@ from pathlib import Path
 sys.path.insert(0, "tests")
 import jax
 jax.config.update("jax_num_cpu_devices", 2)
-from hybrid_jax import hosts
+from hybrid_jax.sweep import hosts
 if len(sys.argv) > 2:
-    hosts.join(sys.argv[2], 2, int(sys.argv[3]))
+    hosts.initialize(sys.argv[2], 2, int(sys.argv[3]))
 import numpy as np
 from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
-from experiments import progress
+from experiments.runner import progress
 from experiments.runner.stages import Stages
 from hybrid_jax.io.archive import digest, named_leaves
 from hybrid_jax.io.datasets import Dataset
@@ -43,10 +43,10 @@ states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, lengt
 plans = stack([make_run_config(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
                ((0.03, 6000), (0.01, 4000), (0.02, 5000))])
 data = Dataset({"train": swings(40), "validation": swings(20, seed=1)}, {"config": {}})
-stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.first()))
+stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.is_main_process()))
 try:
     final = stages.run("a sweep", states, plans, Settings(batch_size=10), data)
-except hosts.Gone as error:
+except hosts.PeerLost as error:
     sys.exit(f"gone: {error}")
 print("bytes", len(jax.devices()), digest("", named_leaves(final)))
 """
@@ -118,8 +118,8 @@ def test_two_processes_find_the_rows_of_one_and_only_the_first_writes(alone, tmp
     assert rows(tmp_path / "out0") == rows(alone / "out")
     assert not list((tmp_path / "other").glob("*"))
     assert not list((tmp_path / "out1").iterdir())
-    assert "lanes" in texts[0][1]
-    assert "lanes" not in texts[1][1]
+    assert "runs," in texts[0][1]
+    assert "runs," not in texts[1][1]
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="cannot choose the cores of a process")
@@ -152,7 +152,7 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     folder = tmp_path / "killed"
     folder.mkdir()
     both = pair(programs, folder)
-    assert any("lanes active" in line for line in both[0].stderr)
+    assert any("runs active" in line for line in both[0].stderr)
     killed, other = both[victim], both[1 - victim]
     killed.send_signal(signal.SIGKILL)
     since = time.monotonic()

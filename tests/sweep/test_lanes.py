@@ -1,11 +1,10 @@
-"""Laws of lanes: dealt to devices so that none waits, in chunks that fit into memory, by a function traced once."""
+"""Lanes: scheduled on devices so that none waits, and traced once."""
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.sweep.lanes import LaneMap, count, deal, lane, slack, stack
+from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance, schedule, stack
 
 
 def test_lanes_are_stacked_and_picked():
@@ -17,55 +16,40 @@ def test_lanes_are_stacked_and_picked():
 
 
 @pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5)])
-def test_dealing_gives_every_lane_once_and_balances(devices, width):
+def test_schedule_is_complete_and_balanced(devices, width):
     rng = np.random.default_rng(0)
     costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
-    hands = deal(costs, active, devices, width, 40)
-    assert len(hands) == devices
-    assert sorted(np.concatenate(hands).tolist()) == active
-    chunks = [[hand[i : i + width] for i in range(0, len(hand), width)] for hand in hands]
-    loads = [sum(max(costs[chunk]) for chunk in hand) for hand in chunks]
-    # Dearest first to the idlest: two devices never differ by more than one chunk.
+    shards = schedule(costs, active, devices, width, 40)
+    assert len(shards) == devices
+    assert sorted(np.concatenate(shards).tolist()) == active
+    chunks = [[shard[i : i + width] for i in range(0, len(shard), width)] for shard in shards]
+    loads = [sum(max(costs[chunk]) for chunk in shard) for shard in chunks]
+    # Most expensive first, to the least loaded: two devices never differ by more than one chunk.
     assert max(loads) - min(loads) <= max(costs)
-    assert all(np.diff(costs[hand]).max(initial=-1) <= 0 for hand in hands)
+    assert all(np.diff(costs[shard]).max(initial=-1) <= 0 for shard in shards)
 
 
 def test_more_devices_than_lanes_leave_some_idle():
-    assert [hand.tolist() for hand in deal([3.0, 1.0], [1], 3, 1, 1)] == [[1], [], []]
+    assert [shard.tolist() for shard in schedule([3.0, 1.0], [1], 3, 1, 1)] == [[1], [], []]
 
 
-def test_no_device_is_dealt_more_chunks_than_it_has_room_for():
+def test_schedule_respects_the_capacity_of_a_device():
     costs = [100.0, *[1.0] * 9]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 10)] == [1, 9]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 1, 6)] == [4, 6]
-    assert [len(hand) for hand in deal(costs, range(10), 2, 2, 3)] == [4, 6]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 1, 10)] == [1, 9]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 1, 6)] == [4, 6]
+    assert [len(shard) for shard in schedule(costs, range(10), 2, 2, 3)] == [4, 6]
 
 
 @pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5), (4, 30)])
-def test_a_device_with_less_to_do_is_given_as_much_more(devices, width):
+def test_load_balance_equalises_the_work_of_devices(devices, width):
     rng = np.random.default_rng(1)
     costs, active = rng.uniform(1, 10, 40), sorted(rng.permutation(40)[:33].tolist())
-    hands = deal(costs, active, devices, width, 40)
-    times = slack(hands, costs, width)
-    busy = [sum(costs[i] * times[i] for i in hand[::width]) for hand in hands if len(hand)]
+    shards = schedule(costs, active, devices, width, 40)
+    times = load_balance(shards, costs, width)
+    busy = [sum(costs[i] * times[i] for i in shard[::width]) for shard in shards if len(shard)]
     assert busy == pytest.approx([max(busy)] * len(busy))
     assert times[active].min() == 1
     assert not np.delete(times, active).any()
-
-
-def test_a_chunk_is_halved_until_its_program_fits_into_memory():
-    """A lane sorts a megabyte on its way; the programs of both widths give the same."""
-    lanes, shared = {"x": np.arange(8, dtype=np.float32)}, (np.ones(2**18, np.float32),)
-
-    def function(lane, ones):
-        return jnp.sum(jnp.sort(ones * lane["x"]))
-
-    whole = LaneMap(function, width=0)
-    assert whole._needed(8, lanes, shared) > whole._needed(2, lanes, shared) > 2 * shared[0].nbytes
-    narrow = LaneMap(function, width=0, memory=int(whole._needed(2, lanes, shared)))
-    results = [mapped(lanes, shared, [1.0] * 8, range(8)) for mapped in (whole, narrow)]
-    assert [mapped._width(lanes, shared) for mapped in (whole, narrow)] == [8, 2]
-    np.testing.assert_allclose(results[0], results[1], rtol=1e-6)
 
 
 @pytest.mark.parametrize("width", [1, 3])

@@ -16,7 +16,7 @@ from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.sweep.lanes import lane, stack
-from hybrid_jax.sweep.training import Room, evaluate, sweep
+from hybrid_jax.sweep.training import evaluate, sweep
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
 from hybrid_jax.training.objective import Settings
@@ -107,15 +107,15 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
 
 
 def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
-    own, room = replace(SETTINGS, batch_size=4), Room(lanes=3, windows=40)
+    own, capacity = replace(SETTINGS, batch_size=4), (3, 40)
     states, plans = lane((starts(), stack(PLANS)), np.array([2]))
     few = states, replace(plans, subset=plans.subset % 20), TRAIN[:20]
     with jax.log_compiles(), caplog.at_level(logging.WARNING):
         shared = [
-            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, room=room),
-            sweep(*few, VALIDATION, own, width=1, room=room),
+            sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, min_capacity=capacity),
+            sweep(*few, VALIDATION, own, width=1, min_capacity=capacity),
         ]
-        errors = [evaluate(each.best, VALIDATION, 2, own, room) for each in shared]
+        errors = [evaluate(each.best, VALIDATION, 2, own, capacity[0]) for each in shared]
     compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert sum("jit(run)" in message for message in compiled) == 2  # one to train, one to test
     apart = [
