@@ -1,18 +1,16 @@
 """Record random flights of a true system as a dataset: python -m experiments.make_flights --help"""
 
-import sys
 from collections.abc import Callable, Mapping
 from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
+from experiments.reporting.tables import Table, print_tables
+from experiments.runner import command
 from hybrid_jax.io.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
@@ -120,28 +118,31 @@ class progress_bar(AbstractContextManager):
 
 
 def statistics_table(dataset: Dataset) -> Table:
-    """What was flown, left out and recorded, a column for each split."""
+    """Counts and statistics of the flights, a column for each split."""
     tallies, statistics = dataset.metadata["tallies"], dataset.metadata["statistics"]
-    table = Table("", *dataset.splits, title=f"{dataset.config['domain']}, seed {dataset.config['seed']}")
-    table.add_row("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))
-    for name in next(iter(tallies.values())):
-        table.add_row(name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
-    for name in next(iter(statistics.values())):
-        table.add_row(escape(name), *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
-    return table
+    lines = [("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))]
+    lines += [
+        (name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
+        for name in next(iter(tallies.values()))
+    ]
+    lines += [
+        (name, *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
+        for name in next(iter(statistics.values()))
+    ]
+    return Table(f"{dataset.config['domain']}, seed {dataset.config['seed']}", ("", *dataset.splits), lines)
+
+
+def make_flights(options: Options) -> None:
+    """Record what is not there yet, print the table."""
+    dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
+    if options.picture is not None:
+        picture(options.picture)
+    print_tables(Console(), [statistics_table(dataset)])
 
 
 def main() -> None:
-    """Read the command line, record what is not there yet, print the table."""
-    options = tyro.cli(Options, prog="python -m experiments.make_flights", description=Options.__doc__)
-    try:
-        dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
-        if options.picture is not None:
-            picture(options.picture)
-    except (ValueError, OSError) as error:
-        print(f"make_flights: {error}", file=sys.stderr)
-        sys.exit(2)
-    Console().print(statistics_table(dataset))
+    """The command line."""
+    command.call("make_flights", Options, make_flights)
 
 
 if __name__ == "__main__":

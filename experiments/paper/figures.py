@@ -14,7 +14,16 @@ from experiments.paper.claims import THETA_TOLERANCE
 from experiments.paper.lanes import THETA, Cell, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import DRAWABLE, FLOOR_LABEL, STYLE, Line, colour, error_legend, error_panel, legend_below
+from experiments.reporting.plots import (
+    DRAWABLE,
+    FLOOR_LABEL,
+    STYLE,
+    Line,
+    colour,
+    error_legend,
+    error_panel,
+    legend_below,
+)
 from experiments.reporting.results import Column, Results, Row
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}

@@ -68,9 +68,9 @@ def example_flight(
     panels = [first, *(figure.add_subplot(grid[row, 1], sharex=first) for row in range(1, 4))]
     speed = np.linalg.norm(states[:, VELOCITY], axis=1)
     named = (("altitude\n[m]", states[:, POSITION][:, 2]), ("speed\n[m/s]", speed), ("tilt\n[°]", tilt(states)))
-    for axes, (label, values) in zip(panels, named, strict=False):
+    for axes, (name, values) in zip(panels, named, strict=False):
         axes.plot(time, values, color=colour(HYBRID))
-        axes.set_ylabel(label)
+        axes.set_ylabel(name)
         axes.tick_params(labelbottom=False)
     _draw_rotors(panels[-1], time, inputs)
     figure.align_ylabels(panels)

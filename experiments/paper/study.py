@@ -12,10 +12,11 @@ from rich.console import Console
 from experiments.make_flights import chosen_flights, flights
 from experiments.paper.conditions import adaptation, annealing, fresh_fields, pretraining, settings
 from experiments.paper.config import AdaptationConfig, Config
-from experiments.paper.results import Lanes, rows_of, solution, trained
-from experiments.paper.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
 from experiments.paper.sensors import measured
 from experiments.paper.solved import Solve, constant_disturbance, solved
+from experiments.reporting.names import CONSTANT_DISTURBANCE, FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
+from experiments.reporting.results import Results
 from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -30,7 +31,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
-SOLVED: Mapping[str, Solve] = {"constant_disturbance": constant_disturbance}  # models that are not trained
+SOLVED: Mapping[str, Solve] = {CONSTANT_DISTURBANCE: constant_disturbance}  # models that are not trained
 
 
 @dataclass(frozen=True)
@@ -40,7 +41,7 @@ class Study:
     source: Dataset
     target: Dataset
     lanes: list[Lanes]
-    rows: list[Row]
+    rows: Results
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -70,9 +71,9 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             if start not in learned:
                 programs.wait_for(start)
                 learned[start] = pretrained(start, vehicle, config, stages, source)
-                lanes.append(_tested(start, "source_only", learned[start], config, stages, target))
+                lanes.append(_tested(start, SOURCE_ONLY, learned[start], config, stages, target))
             lanes += _adapted_lanes(model, learned[start].best, vehicle, config, stages, target)
-    rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
+    rows = with_rho(rows_of(lanes, domain_name(target)))
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
 
 
@@ -140,18 +141,13 @@ def capacity(config: Config) -> tuple[int, int]:
     return config.seeds * len(config.sizes), max(config.source_train, config.pooled())
 
 
-def source_of(model: str) -> str:
-    """The model whose pre-training an adaptation starts from."""
-    return SOURCE_OF.get(model, model)
-
-
 def _adapted_lanes(
     model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
 ) -> list[Lanes]:
     """The lanes of a model after learning from the target: trained on, and anew, or solved."""
     if model in SOLVED:
         return [_solved(model, source, config, stages, target)]
-    starts = {"fine_tuned": source, "target_only": fresh_fields(model, vehicle, config)}
+    starts = {FINE_TUNED: source, TARGET_ONLY: fresh_fields(model, vehicle, config)}
     finals = {mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()}
     return [_tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
 
@@ -163,7 +159,7 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
     before = pretraining(model, vehicle, config)
-    after = adaptation(model, "target_only", fresh, config)
+    after = adaptation(model, TARGET_ONLY, fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
@@ -172,11 +168,11 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
     errors = _errors(f"test {mode} {model}", final.best, config, stages, target)
-    return trained(model, mode, *places((0,) if mode == "source_only" else config.sizes, config), final, errors)
+    return trained(model, mode, *places((0,) if mode == SOURCE_ONLY else config.sizes, config), final, errors)
 
 
 def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    name = f"fine_tuned {model}"
+    name = f"{FINE_TUNED} {model}"
     found = solved(f"{name} {domain_name(target)}", SOLVED[model], source, config, stages, target)
     errors = _errors(f"test {name}", found.fields, config, stages, target)
     return solution(model, *places(config.sizes, config), found, errors)

@@ -1,4 +1,4 @@
-"""The tables of the paper's experiments: errors and ρ by N, methods ranked beside Table 2, θ_p, ablations, run notes."""
+"""The tables of the paper's experiments: errors and ρ by N, the ranking beside Table 2, θ_p, ablations; notes."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
@@ -9,7 +9,6 @@ from experiments.paper.lanes import (
     CELL,
     DOMAINS,
     MODELS,
-    MODES,
     THETA,
     Cell,
     by_domain,
@@ -169,10 +168,8 @@ def truth_in(truth: Mapping[str, Any] | None, domain: str) -> Mapping[str, float
 
 def _parameters(rows: Results, place: str, truth: Mapping[str, float] | None) -> Table:
     groups = {(label(m), label(mode), str(n) if n else EMPTY): group for (m, mode, n), group in cells(rows).items()}
-    columns = {
-        f"{name} [{UNITS[name]}]": lambda group, name=name: _theta_text(group, name, truth and truth[name])
-        for name in THETA
-    }
+    true = dict.fromkeys(THETA) if truth is None else truth
+    columns = {f"{k} [{UNITS[k]}]": lambda group, k=k: _theta_text(group, k, true[k]) for k in THETA}
     given = any(row["theta_interval"] is not None for row in rows)
     of = f" ({over_seeds(rows)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
     table = tabulate(f"Recovered physical parameters θ_p{place}{of}", groups, columns, ("model", "mode", "N"))
