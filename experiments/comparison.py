@@ -13,23 +13,19 @@ from rich.console import Console
 from experiments.coverage import Config as CoverageConfig
 from experiments.coverage import coverage
 from experiments.external_force import sine_floor
-from experiments.paper import figures
-from experiments.paper.claims import COMPARISON, claims
+from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
-from experiments.paper.introduction import introduction
+from experiments.paper.figures import ranking
 from experiments.paper.lanes import Lanes, rows_of, save_models, source_of, with_rho
 from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
-from experiments.paper.outcome import CLAIMS_TITLE, FLOOR, floor_notes
+from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
-from experiments.paper.tables import parameters, ranking, run_notes
-from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER, NO_PHYSICS
 from experiments.reporting.plots import save_figures
-from experiments.reporting.report import Report, write_report
+from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.environment import environment
 from experiments.runner.options import Count, distinct, factors
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
@@ -132,22 +128,13 @@ def compared(case: Case, methods: Sequence[Method]) -> list[Lanes]:
 
 def write(config: ComparisonConfig, rows: Results, stages: Stages, flights: dict[str, Any], covered: Results) -> None:
     """Write the figure and the report; print its tables."""
-    out, verdicts = config.out / NAME, claims(rows, NAME, None)
-    truth = {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
+    out, truth = config.out / NAME, {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
-    drawn = figures.ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=verdicts,
-        figures=save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")}),
-        notes=[*run_notes(rows), *stages.notes(), GIVEN_NETWORK, *coverage_notes(covered), *floor_notes(floor)],
-        extra={"truth_theta": truth, "flights": flights, "coverage": covered.rows, FLOOR: floor},
-        head=introduction(NAME, rows),
-        tables=[*ranking(rows), verdict_table(verdicts, CLAIMS_TITLE), *parameters(rows, truth)],
-    )
+    drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
+    figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
+    notes = [*stages.notes(), GIVEN_NETWORK, *coverage_notes(covered)]
+    extra = {"flights": flights, "coverage": covered.rows}
+    report = paper_report(NAME, config, stages.seconds, rows, truth, figures, notes, floor, extra)
     write_report(out, report, Console())
 
 

@@ -1,6 +1,7 @@
-"""What an experiment on one target leaves in its folder: the report, the figures and the models."""
+"""What an experiment leaves in its folder: the report, the figures and the models."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -9,25 +10,25 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 import hybrid_jax
-from experiments.paper.claims import claims
-from experiments.paper.config import AdaptationConfig
+from experiments.paper.claims import COMPARISON, claims
+from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.introduction import introduction
 from experiments.paper.lanes import Lanes, save_models
 from experiments.paper.study import EVERY, Study
-from experiments.paper.tables import by_size, parameters, run_notes
+from experiments.paper.tables import by_size, parameters, ranking, run_notes
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results
 from experiments.runner.environment import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 
 FLIGHT_SECONDS = 11.0
-CLAIMS_TITLE = "Claims of the paper"
 FLOOR = "wind_sine_mse"  # the key of report.json for the share of L^T_MSE that is the wind's sine
 
 
@@ -41,30 +42,48 @@ def write_outcome(
     """
     out, truth = config.out / experiment, nominal(domain.vehicle)
     save_models(out / "models", found.lanes, found.rows)
-    verdicts = claims(found.rows, experiment, truth)
-    report = Report(
-        experiment=experiment,
-        config=config.described(),
-        environment=environment(found.seconds),
-        rows=found.rows,
-        claims=verdicts,
-        figures=save_figures(out, draw(title, domain, config, found, truth, floor)),
-        notes=[*run_notes(found.rows), *found.notes, *floor_notes(floor)],
-        extra={
-            "truth_theta": truth,
-            "flights": {"source": found.source.metadata, "target": found.target.metadata},
-            **({FLOOR: floor} if floor else {}),
-        },
-        head=introduction(experiment, found.rows),
-        tables=[*by_size(found.rows), verdict_table(verdicts, CLAIMS_TITLE), *parameters(found.rows, truth)],
+    figures = save_figures(out, draw(title, domain, config, found, truth, floor))
+    flights = {"source": found.source.metadata, "target": found.target.metadata}
+    report = paper_report(
+        experiment, config, found.seconds, found.rows, truth, figures, found.notes, floor, {"flights": flights}
     )
     write_report(out, report, Console())
 
 
-def floor_notes(floor: float) -> list[str]:
-    """A sentence on the error that the wind's sine makes, if there is any."""
-    words = f"About {floor:.2e} of a test error in the wind is due to its sine, which no model without a clock can see."
-    return [words] if floor else []
+def paper_report(
+    experiment: str,
+    config: Config,
+    seconds: Mapping[str, float],
+    rows: Results,
+    truth: Mapping[str, Any] | None,
+    figures: Mapping[str, str],
+    notes: Sequence[str] = (),
+    floor: float = 0.0,
+    extra: Mapping[str, Any] | None = None,
+) -> Report:
+    """The report of an experiment of the paper.
+
+    Args:
+        seconds: of each stage.
+        truth: the true θ_p, by domain where there are several.
+        figures: caption by file.
+        floor: as in `write_outcome`.
+    """
+    verdicts = claims(rows, experiment, truth)
+    headline = ranking if experiment == COMPARISON else by_size
+    sine = f"About {floor:.2e} of a test error in the wind is due to its sine, which no model without a clock can see."
+    return Report(
+        experiment=experiment,
+        config=config.described(),
+        environment=environment(seconds),
+        rows=rows,
+        claims=verdicts,
+        figures=figures,
+        notes=[*run_notes(rows), *notes, *([sine] if floor else [])],
+        extra={"truth_theta": truth, **(extra or {}), **({FLOOR: floor} if floor else {})},
+        head=introduction(experiment, rows),
+        tables=[*headline(rows), verdict_table(verdicts, "Claims of the paper"), *parameters(rows, truth)],
+    )
 
 
 def draw(

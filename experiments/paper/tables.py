@@ -168,7 +168,7 @@ def truth_in(truth: Mapping[str, Any] | None, domain: str) -> Mapping[str, float
 
 def _parameters(rows: Results, place: str, truth: Mapping[str, float] | None) -> Table:
     groups = {(label(m), label(mode), str(n) if n else EMPTY): group for (m, mode, n), group in cells(rows).items()}
-    true = dict.fromkeys(THETA) if truth is None else truth
+    true: Mapping[str, float | None] = dict.fromkeys(THETA) if truth is None else truth
     columns = {f"{k} [{UNITS[k]}]": lambda group, k=k: _theta_text(group, k, true[k]) for k in THETA}
     given = any(row["theta_interval"] is not None for row in rows)
     of = f" ({over_seeds(rows)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""

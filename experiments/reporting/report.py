@@ -23,20 +23,23 @@ _OPTIONAL = {"format": int, "tags": list, "not_judged": list, "figures": dict, "
 
 @dataclass(frozen=True)
 class Report:
-    """One experiment's outcome.
+    """One experiment's outcome. Configuration, environment and `extra` are stored as JSON values.
 
     Attributes:
         experiment: its name.
-        config: the configuration as JSON values.
+        config: the configuration.
         environment: see `environment`.
         rows: a row per run.
         claims: verdicts on what was to be shown.
         figures: path of a picture relative to the report → its caption.
         notes: sentences for the end of the page.
-        extra: further keys of report.json, JSON values.
+        extra: further keys of report.json.
         head: title and introduction of the page, Markdown.
         tables: of the page and the terminal.
         more_rows: further rows of rows.csv, which report.json holds in `extra`.
+
+    Raises:
+        ValueError: a value has no JSON form.
     """
 
     experiment: str
@@ -51,6 +54,10 @@ class Report:
     tables: Sequence[Table] = field(default=(), compare=False)
     more_rows: Results = field(default_factory=Results, compare=False)
 
+    def __post_init__(self):
+        for name in ("config", "environment", "figures", "notes", "extra"):
+            object.__setattr__(self, name, json_value(getattr(self, name)))
+
 
 def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
     """Write report.json, rows.csv and report.md into the folder `out`, each atomically, report.json last.
@@ -59,7 +66,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
         console: where to print the tables and the notes, if anywhere.
 
     Raises:
-        ValueError: `extra` takes a key of the report's own, or a value has no JSON form; then nothing was written.
+        ValueError: `extra` takes a key of the report's own; then nothing was written.
         OSError: the folder cannot be written.
     """
     record = json_text(to_json(report))
@@ -135,8 +142,8 @@ def page(report: Report) -> str:
         captions = {path: plain(caption) for path, caption in report.figures.items()}
         parts += ["## Figures", *(f"![{caption}]({path})\n\n*{caption}*" for path, caption in captions.items())]
     parts += ["## Notes", "\n".join(f"- {plain(note)}" for note in report.notes)] if report.notes else []
-    parts += ["## Environment", markdown(Table("", ("", ""), list(_flat(json_value(report.environment)))))]
-    config = json.dumps(json_value(report.config), indent=1, ensure_ascii=False)
+    parts += ["## Environment", markdown(Table("", ("", ""), list(_flat(report.environment))))]
+    config = json.dumps(report.config, indent=1, ensure_ascii=False)
     return "\n\n".join([*parts, "## Configuration", f"```json\n{config}\n```"]) + "\n"
 
 

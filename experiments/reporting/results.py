@@ -4,7 +4,7 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, overload
 
@@ -135,8 +135,9 @@ class Results:
 
         A number that is not finite is `null`; a cell is empty where a row has no such number.
         """
-        flat = [_flat(row) for row in self.rows]
         nested = {name for row in self.rows for name, value in row.items() if isinstance(value, dict)}
+        ends = {name for name in nested for row in self.rows for v in (row.get(name) or {}).values() if _is_pair(v)}
+        flat = [_flat(row, ends) for row in self.rows]
         names = list(dict.fromkeys(name for row in flat for name in row if name not in nested))
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
@@ -171,21 +172,28 @@ def _at(row: Row, path: str) -> Any:
     return value
 
 
-def _flat(row: Row) -> dict[str, Any]:
-    """Column → value; nested columns by the names of their entries."""
+def _flat(row: Row, intervals: Container[str]) -> dict[str, Any]:
+    """Column → value; nested columns by the names of their entries, those of intervals by the names of the ends."""
     found: dict[str, Any] = {}
     for name, value in row.items():
-        found |= _entries("", value) if isinstance(value, dict) else {name: value}
+        own = _entries("", value, name in intervals) if isinstance(value, dict) else {name: value}
+        # The first of one name stands: an interval that is None in every row must not hide its parameter.
+        found |= {key: each for key, each in own.items() if key not in found}
     return found
 
 
-def _entries(name: str, value: Any) -> dict[str, Any]:
+def _entries(name: str, value: Any, pairs: bool) -> dict[str, Any]:
     if isinstance(value, dict):
-        parts = [_entries(f"{name} {inner}".strip(), each) for inner, each in value.items()]
+        parts = [_entries(f"{name} {inner}".strip(), each, pairs) for inner, each in value.items()]
         return {key: each for part in parts for key, each in part.items()}
-    if isinstance(value, list) and len(value) == 2:
-        return {f"{name}_low": value[0], f"{name}_high": value[1]}
+    if pairs:
+        low, high = value or (None, None)
+        return {f"{name}_low": low, f"{name}_high": high}
     return {name: value}
+
+
+def _is_pair(value: Any) -> bool:
+    return isinstance(value, list) and len(value) == 2
 
 
 def _cell(value: Any) -> str:
