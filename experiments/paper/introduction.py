@@ -2,22 +2,8 @@
 
 from experiments.paper.claims import COMPARISON
 from experiments.paper.lanes import BASELINES, by_domain
-from experiments.reporting.names import (
-    CONSTANT_DISTURBANCE,
-    EXPERT_AUGMENTATION,
-    FINE_TUNED,
-    HYBRID,
-    LAST_LAYER,
-    LEAST_SQUARES,
-    LINEAR_RESIDUAL,
-    NO_PHYSICS,
-    PHYSICS_ONLY,
-    SOURCE_ONLY,
-    TARGET_ONLY,
-    THETA_D_ONLY,
-    THETA_P_ONLY,
-    label,
-)
+from experiments.reporting import names
+from experiments.reporting.names import label
 from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
 
@@ -29,23 +15,23 @@ QUESTIONS = {
     "tested on windows of 0.1 s (Sec. 4.7 and Table 2 of the paper, and baselines that the paper does not have).",
 }
 ABOUT = {
-    HYBRID: "rigid-body physics f_p(x, u; θ_p) plus a small network f_d(x, u; θ_d), both trained",
-    NO_PHYSICS: "the same network alone",
-    PHYSICS_ONLY: "the rigid-body physics alone, its θ_p trained",
-    EXPERT_AUGMENTATION: "the source's hybrid; an encoder estimates its θ_p from the flight's last states and inputs, "
-    "trained on rollouts with random θ_p (Wehenkel et al., 2023)",
-    THETA_P_ONLY: "the source's hybrid, of which only θ_p is trained on, by Adam",
-    THETA_D_ONLY: "the source's hybrid, of which only the network is trained on, by Adam",
-    LAST_LAYER: "the source's hybrid, of which only the network's last layer is refitted, by ridge regression, as in "
-    "Neural-Fly",
-    LEAST_SQUARES: "the source's hybrid, of which only θ_p is refitted, by nonlinear least squares "
+    names.HYBRID: "rigid-body physics f_p(x, u; θ_p) plus a small network f_d(x, u; θ_d), both trained",
+    names.NO_PHYSICS: "the same network alone",
+    names.PHYSICS_ONLY: "the rigid-body physics alone, its θ_p trained",
+    names.EXPERT_AUGMENTATION: "the source's hybrid; an encoder estimates its θ_p from the flight's last states and "
+    "inputs, trained on rollouts with random θ_p (Wehenkel et al., 2023)",
+    names.THETA_P_ONLY: "the source's hybrid, of which only θ_p is trained on, by Adam",
+    names.THETA_D_ONLY: "the source's hybrid, of which only the network is trained on, by Adam",
+    names.LAST_LAYER: "the source's hybrid, of which only the network's last layer is refitted, by ridge regression, "
+    "as in Neural-Fly",
+    names.LEAST_SQUARES: "the source's hybrid, of which only θ_p is refitted, by nonlinear least squares "
     "(Levenberg–Marquardt)",
-    CONSTANT_DISTURBANCE: "the source's hybrid, of which θ_p and a constant disturbance (six accelerations) are fitted "
-    "by nonlinear least squares",
-    LINEAR_RESIDUAL: "the source's hybrid, unchanged, plus a linear map fitted to its errors",
-    FINE_TUNED: "trained on many flights from before the change, then on N trajectories from after it",
-    TARGET_ONLY: "trained on the N trajectories from after the change only",
-    SOURCE_ONLY: "trained on flights from before the change only",
+    names.CONSTANT_DISTURBANCE: "the source's hybrid, of which θ_p and a constant disturbance (six accelerations) are "
+    "fitted by nonlinear least squares",
+    names.LINEAR_RESIDUAL: "the source's hybrid, unchanged, plus a linear map fitted to its errors",
+    names.FINE_TUNED: "trained on many flights from before the change, then on N trajectories from after it",
+    names.TARGET_ONLY: "trained on the N trajectories from after the change only",
+    names.SOURCE_ONLY: "trained on flights from before the change only",
 }
 
 

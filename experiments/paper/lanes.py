@@ -10,24 +10,8 @@ import numpy as np
 
 import hybrid_jax
 from experiments.paper.solved import Solved
-from experiments.reporting.names import (
-    CONSTANT_DISTURBANCE,
-    EXPERT_AUGMENTATION,
-    EXTERNAL_FORCE,
-    FINE_TUNED,
-    HYBRID,
-    LAST_LAYER,
-    LEAST_SQUARES,
-    LINEAR_RESIDUAL,
-    NO_PHYSICS,
-    PARAMETER_SHIFT,
-    PHYSICS_ONLY,
-    SOURCE_ONLY,
-    TARGET_ONLY,
-    THETA_D_ONLY,
-    THETA_P_ONLY,
-    label,
-)
+from experiments.reporting import names
+from experiments.reporting.names import label
 from experiments.reporting.results import Results, Row
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.sim.flight import DT
@@ -35,13 +19,18 @@ from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED, FitState
 
 THETA = ("Ix", "Iy", "k")
-DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+DOMAINS = (names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)
 BASELINES = (
-    *(EXPERT_AUGMENTATION, THETA_P_ONLY, THETA_D_ONLY, LAST_LAYER, LEAST_SQUARES, CONSTANT_DISTURBANCE),
-    LINEAR_RESIDUAL,
+    names.EXPERT_AUGMENTATION,
+    names.THETA_P_ONLY,
+    names.THETA_D_ONLY,
+    names.LAST_LAYER,
+    names.LEAST_SQUARES,
+    names.CONSTANT_DISTURBANCE,
+    names.LINEAR_RESIDUAL,
 )
-MODELS = (HYBRID, NO_PHYSICS, PHYSICS_ONLY, *BASELINES)
-MODES = (FINE_TUNED, TARGET_ONLY, SOURCE_ONLY)
+MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
+MODES = (names.FINE_TUNED, names.TARGET_ONLY, names.SOURCE_ONLY)
 CELL = ("model", "mode", "n_train")
 TAGS = ("domain", *CELL, "seed")
 Cell = tuple[str, str, int]  # model, mode, n_train
@@ -88,7 +77,7 @@ def trained(
 
 def solution(model: str, sizes: Sequence[int], seeds: Sequence[int], found: Solved, errors: np.ndarray) -> Lanes:
     """The models of a method that is solved instead of trained, tested."""
-    return Lanes(model, FINE_TUNED, sizes, seeds, found.fields, errors, *found[1:], theta=theta_of(found.fields))
+    return Lanes(model, names.FINE_TUNED, sizes, seeds, found.fields, errors, *found[1:], theta=theta_of(found.fields))
 
 
 def physics_in(field: Any) -> Any:
@@ -119,7 +108,7 @@ def with_rho(rows: Results) -> Results:
     Raises:
         ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.
     """
-    source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=SOURCE_ONLY)}
+    source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=names.SOURCE_ONLY)}
 
     def rho(row: Row) -> float | None:
         key = row["domain"], source_of(row["model"]), row["seed"]
@@ -134,7 +123,7 @@ def with_rho(rows: Results) -> Results:
 
 def source_of(model: str) -> str:
     """The model whose pre-training an adaptation starts from."""
-    return HYBRID if model in BASELINES else model
+    return names.HYBRID if model in BASELINES else model
 
 
 def gain(row: Row) -> float:
@@ -173,7 +162,11 @@ def ranked(rows: Results) -> dict[Cell, Results]:
 def method_label(cell: Cell) -> str:
     """A cell as a method for readers, without its N: an adapted model needs no mode, nor does a baseline."""
     model, mode, _ = cell
-    return label(model) if mode == FINE_TUNED or (mode == SOURCE_ONLY and model in BASELINES) else label(model, mode)
+    return (
+        label(model)
+        if mode == names.FINE_TUNED or (mode == names.SOURCE_ONLY and model in BASELINES)
+        else label(model, mode)
+    )
 
 
 def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:

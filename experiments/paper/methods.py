@@ -14,20 +14,7 @@ from experiments.paper.config import Config
 from experiments.paper.lanes import Lanes, physics_in, solution, theta_of, trained
 from experiments.paper.solved import Solve, by_lane, constant_disturbance, least_squares, solved, subsets
 from experiments.paper.study import domain_name, places
-from experiments.reporting.names import (
-    CONSTANT_DISTURBANCE,
-    EXPERT_AUGMENTATION,
-    FINE_TUNED,
-    HYBRID,
-    LAST_LAYER,
-    LEAST_SQUARES,
-    LINEAR_RESIDUAL,
-    NO_PHYSICS,
-    PHYSICS_ONLY,
-    SOURCE_ONLY,
-    THETA_D_ONLY,
-    THETA_P_ONLY,
-)
+from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
@@ -80,11 +67,11 @@ def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field:
 
     def method(case: Case, name: str) -> Lanes:
         config = case.config
-        starts, plans = adaptation(model, FINE_TUNED, mark(case.pretrained[model].best), config)
-        final = case.stages.run(f"{FINE_TUNED} {name} {case.name}", starts, plans, settings(config), case.target)
+        starts, plans = adaptation(model, names.FINE_TUNED, mark(case.pretrained[model].best), config)
+        final = case.stages.run(f"{names.FINE_TUNED} {name} {case.name}", starts, plans, settings(config), case.target)
         whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
         errors = case.tested(name, whole.best)
-        return with_intervals(case, trained(name, FINE_TUNED, *places(config.sizes, config), whole, errors))
+        return with_intervals(case, trained(name, names.FINE_TUNED, *places(config.sizes, config), whole, errors))
 
     return method
 
@@ -93,8 +80,8 @@ def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
     """Adaptation of the hybrid by what solves it instead of training."""
 
     def method(case: Case, name: str) -> Lanes:
-        config, start = case.config, case.pretrained[HYBRID].best
-        found = solved(f"{FINE_TUNED} {name} {case.name}", solve, start, config, case.stages, case.target)
+        config, start = case.config, case.pretrained[names.HYBRID].best
+        found = solved(f"{names.FINE_TUNED} {name} {case.name}", solve, start, config, case.stages, case.target)
         errors = case.tested(name, found.fields)
         return with_intervals(case, solution(name, *places(config.sizes, config), found, errors))
 
@@ -106,8 +93,8 @@ def source_only(model: str) -> Callable[[Case], Lanes]:
 
     def method(case: Case) -> Lanes:
         final = case.pretrained[model]
-        errors = case.tested(f"{SOURCE_ONLY} {model}", final.best)
-        return trained(model, SOURCE_ONLY, *places((0,), case.config), final, errors)
+        errors = case.tested(f"{names.SOURCE_ONLY} {model}", final.best)
+        return trained(model, names.SOURCE_ONLY, *places((0,), case.config), final, errors)
 
     return method
 
@@ -125,7 +112,7 @@ def augmented(case: Case, name: str) -> Lanes:
 
     experts = case.experts
     errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: by_lane(one, experts.best, windows))
-    lanes = trained(name, SOURCE_ONLY, *places((0,), case.config), experts, errors)
+    lanes = trained(name, names.SOURCE_ONLY, *places((0,), case.config), experts, errors)
     return replace(lanes, theta=theta_of(physics))
 
 
@@ -134,7 +121,7 @@ def with_intervals(case: Case, lanes: Lanes) -> Lanes:
 
     It takes a network as given, and a disturbance would be too: there is none where θ_p and one were fitted together.
     """
-    without = (THETA_D_ONLY, CONSTANT_DISTURBANCE, *CLOSED_FORM)
+    without = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, *CLOSED_FORM)
     if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:
         return lanes
     solver = settings(case.config).solver
@@ -164,17 +151,17 @@ def _ridge(method) -> Callable[[Case, str], Lanes]:
 
 
 CLOSED_FORM = {
-    LAST_LAYER: _ridge(ridge.last_layer),
-    LINEAR_RESIDUAL: _ridge(ridge.linear_residual),
+    names.LAST_LAYER: _ridge(ridge.last_layer),
+    names.LINEAR_RESIDUAL: _ridge(ridge.linear_residual),
 }
 METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
-    HYBRID: tuned(HYBRID),
-    NO_PHYSICS: tuned(NO_PHYSICS),
-    PHYSICS_ONLY: tuned(PHYSICS_ONLY),
-    EXPERT_AUGMENTATION: augmented,
-    THETA_P_ONLY: tuned(HYBRID, lambda field: Hybrid(field.physics, Frozen(field.residual))),
-    THETA_D_ONLY: tuned(HYBRID, lambda field: Hybrid(Frozen(field.physics), field.residual)),
-    LEAST_SQUARES: found_by(least_squares),
-    CONSTANT_DISTURBANCE: found_by(constant_disturbance),
+    names.HYBRID: tuned(names.HYBRID),
+    names.NO_PHYSICS: tuned(names.NO_PHYSICS),
+    names.PHYSICS_ONLY: tuned(names.PHYSICS_ONLY),
+    names.EXPERT_AUGMENTATION: augmented,
+    names.THETA_P_ONLY: tuned(names.HYBRID, lambda field: Hybrid(field.physics, Frozen(field.residual))),
+    names.THETA_D_ONLY: tuned(names.HYBRID, lambda field: Hybrid(Frozen(field.physics), field.residual)),
+    names.LEAST_SQUARES: found_by(least_squares),
+    names.CONSTANT_DISTURBANCE: found_by(constant_disturbance),
     **CLOSED_FORM,
 }
