@@ -1,4 +1,4 @@
-"""Figures of flights: predicted paths over the ground (Figs. 2 and 4) and an example of the data (Fig. 7)."""
+"""Figures of flights: predicted paths in the horizontal plane (Figs. 2 and 4) and an example of the data (Fig. 7)."""
 
 from collections.abc import Mapping
 from typing import Any

@@ -1,4 +1,4 @@
-"""The methods of Table 2 and more, each a function from what it may use to its trained and tested lanes."""
+"""The methods of Table 2 and more baselines: each a function from a case to trained and tested models."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -37,11 +37,11 @@ Method = Literal[
 
 @dataclass(frozen=True)
 class Case:
-    """What a method may use in one target domain.
+    """The data and models that a method may use in one target domain.
 
     Attributes:
-        pretrained: by model, the final states of its pre-training, one lane a seed.
-        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation takes part.
+        pretrained: by model, the final states of its pre-training, one per seed.
+        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
         target: splits train (the pool), validation and test_with_past.
     """
 
@@ -63,7 +63,7 @@ class Case:
 
 
 def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field: field) -> Callable[[Case, str], Lanes]:
-    """Fine-tuning by Adam of what `mark` does not freeze of a pre-trained model."""
+    """Fine-tune a pre-trained model by Adam, except the parts that `mark` freezes."""
 
     def method(case: Case, name: str) -> Lanes:
         config = case.config
@@ -77,7 +77,7 @@ def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field:
 
 
 def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
-    """Adaptation of the hybrid by what solves it instead of training."""
+    """Adapt the hybrid by a solver instead of training."""
 
     def method(case: Case, name: str) -> Lanes:
         config, start = case.config, case.pretrained[names.HYBRID].best
@@ -89,7 +89,7 @@ def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
 
 
 def source_only(model: str) -> Callable[[Case], Lanes]:
-    """The pre-trained model as it is."""
+    """The pre-trained model, unchanged."""
 
     def method(case: Case) -> Lanes:
         final = case.pretrained[model]
@@ -100,7 +100,7 @@ def source_only(model: str) -> Callable[[Case], Lanes]:
 
 
 def augmented(case: Case, name: str) -> Lanes:
-    """Expert Augmentation: θ_p of each test window is read off its past; no target data are learned from."""
+    """Expert Augmentation: the encoder estimates θ_p of each test window from its past; it uses no target data."""
     assert case.experts is not None
     solver = settings(case.config).solver
     windows = case.target.splits["test_with_past"]
@@ -117,9 +117,9 @@ def augmented(case: Case, name: str) -> Lanes:
 
 
 def with_intervals(case: Case, lanes: Lanes) -> Lanes:
-    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p was adapted.
+    """The models with the 95 % interval of θ_p from the windows of their adaptation, if θ_p was adapted.
 
-    It takes a network as given, and a disturbance would be too: there is none where θ_p and one were fitted together.
+    The interval treats the network as fixed. It would do so with a disturbance too, so models that fitted one get none.
     """
     without = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, *CLOSED_FORM)
     if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:

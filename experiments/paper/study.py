@@ -1,4 +1,4 @@
-"""The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
+"""The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -36,7 +36,7 @@ SOLVED: Mapping[str, Solve] = {CONSTANT_DISTURBANCE: constant_disturbance}  # mo
 
 @dataclass(frozen=True)
 class Study:
-    """What an experiment found: the flights, every trained lane, the rows, seconds by stage, and notes on these."""
+    """The outcome of an experiment: flights, trained models, rows, seconds by stage, and notes on these."""
 
     source: Dataset
     target: Dataset
@@ -50,7 +50,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     """Run the protocol on a target domain; finished stages come from the cache.
 
     Args:
-        vehicle: what the engineer knows of the vehicle; its nominal θ_p is where the models start from.
+        vehicle: as known before the change; models start around its nominal θ_p.
     """
     stages = stages_of(config, console)
 
@@ -78,7 +78,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
-    """A model after pre-training on source flight, one lane a seed."""
+    """A model after pre-training on source flight, one run per seed."""
     shared = settings(config), source, capacity(config)
     found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
     for factor in config.rates.decay:
@@ -90,13 +90,13 @@ def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, sou
 def adapted(
     model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> FitState:
-    """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
+    """A model after training on target flight, one run for each size and seed; see `places`."""
     lanes = adaptation(model, mode, fields, config)
     return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, capacity(config))
 
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
-    """The flights of a domain, from the cache or the simulator, as sensors of the configured noise see them."""
+    """The flights of a domain, from the cache or the simulator, with the configured measurement noise."""
     found = stages.timed(
         f"flights {domain.name}",
         lambda: from_first(lambda: flights(domain, splits, config.data_seed, config.cache)),
@@ -105,7 +105,7 @@ def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: 
 
 
 def from_first(read: Callable[[], Dataset]) -> Dataset:
-    """The dataset that `read` gives on process 0: the others need no file, and all learn from the same bits."""
+    """The dataset that `read` returns on process 0; the others receive the same bits and need no file."""
 
     def parts() -> tuple[Any, Arrays]:
         found = read()
@@ -122,17 +122,17 @@ def from_first(read: Callable[[], Dataset]) -> Dataset:
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the source."""
+    """The splits of the source."""
     return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the target; the train split is the pool from which every seed draws."""
+    """The splits of the target; every seed draws from the train split."""
     return adaptation_splits(config) | {"test": SplitSpec(config.test, 100)}
 
 
 def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the target to adapt to."""
+    """The splits of the target for adaptation."""
     return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
@@ -144,7 +144,7 @@ def capacity(config: Config) -> tuple[int, int]:
 def _adapted_lanes(
     model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
 ) -> list[Lanes]:
-    """The lanes of a model after learning from the target: trained on, and anew, or solved."""
+    """A model after adaptation to the target: fine-tuned and target-only, or solved."""
     if model in SOLVED:
         return [_solved(model, source, config, stages, target)]
     starts = {FINE_TUNED: source, TARGET_ONLY: fresh_fields(model, vehicle, config)}
@@ -153,7 +153,7 @@ def _adapted_lanes(
 
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
-    """Compile all that training and testing a model will run: of windows and models, a program knows shapes alone."""
+    """Compile all programs that training and testing a model will run; they depend on shapes only."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
@@ -186,10 +186,10 @@ def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Sta
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:
-    """The size and the seed of each lane, in the order in which `conditions` makes them."""
+    """The size and the seed of each run, in the order of `conditions`."""
     return [n for n in sizes for _ in range(config.seeds)], [*range(config.seeds)] * len(sizes)
 
 
 def domain_name(dataset: Dataset) -> str:
-    """Where a dataset was flown."""
+    """The domain of a dataset."""
     return str(dataset.config["domain"])
