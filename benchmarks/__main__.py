@@ -1,4 +1,4 @@
-"""Every benchmark, and one table of the ratios that matter: python -m benchmarks --help"""
+"""Run all benchmarks and print one table of their ratios: python -m benchmarks --help"""
 
 import subprocess
 import sys
@@ -11,8 +11,7 @@ from typing import Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from benchmarks.timing import Ratio, ratio_table
-from experiments.runner.command import BAD_INPUT, check_folder
+from benchmarks.timing import BAD_INPUT, Ratio, check_folder, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_whole
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
@@ -21,32 +20,32 @@ PEERS = "training_peers", "environment_peers"
 
 @dataclass(frozen=True)
 class Options:
-    """Run every benchmark, each in a process of its own, and print one table of ratios: about eleven minutes on two
-    quiet cores. What a benchmark measures is told by `python -m benchmarks.rollout --help` and so on.
+    """Run every benchmark in its own process and print one table of ratios: about eleven minutes on two idle cores.
+    `python -m benchmarks.rollout --help` describes what a benchmark measures.
     """
 
     preset: Literal["full", "smoke"] = "full"
-    """full: what is reported. smoke: does it work; its numbers say nothing."""
+    """full: the reported numbers. smoke: a functional check; its numbers mean nothing."""
     out: Path | None = None
     """Also write the numbers of all benchmarks to this file as JSON, and figures beside it."""
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
-    """Also run those against rivals, training_peers and environment_peers, on one core: some eight minutes more, mostly
-    in `torch.compile`. A rival that is not installed is named and skipped: pip install -e '.[peers]'."""
+    """Also run training_peers and environment_peers, which compare with other libraries on one core: about eight
+    minutes more, mostly in `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
 
 
 def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
-    """The report of one benchmark; its tables are shown on stderr when it is done, its figures are put beside `out`.
+    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`.
 
     Raises:
-        RuntimeError: it failed, for instance because two programs do not compute the same.
+        RuntimeError: it failed, for example because two programs do not compute the same.
     """
     with TemporaryDirectory() as folder:
         report = Path(folder) / f"{name}.json"
         command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]
         if subprocess.run(command, stdout=sys.stderr, check=False).returncode:
-            raise RuntimeError(f"benchmark {name} failed; what it says stands above")
+            raise RuntimeError(f"benchmark {name} failed; see its output above")
         for figure in report.parent.glob(f"{name}.[!j]*"):
             if out is not None:
                 write_whole(out.with_name(f"{out.stem}-{figure.name}"), figure.read_bytes())
@@ -54,7 +53,7 @@ def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
 
 
 def ratios_of(reports: Sequence[dict[str, Any]]) -> list[Ratio]:
-    """The ratios of all reports, each with the name of its benchmark."""
+    """The ratios of all reports, prefixed by the benchmark."""
     return [
         Ratio(f"{report['benchmark']}: {ratio['what']}", ratio["value"], ratio["at_most"], ratio["at_least"])
         for report in reports
@@ -63,13 +62,13 @@ def ratios_of(reports: Sequence[dict[str, Any]]) -> list[Ratio]:
 
 
 def absences(reports: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each rival that a benchmark skipped: which, and what would change that."""
+    """A line for each library that a benchmark skipped, with the command that installs it."""
     rows = [(report["benchmark"], row) for report in reports for row in report["rows"]]
     return [f"{name}: {row['rival']}: {row['skipped']}" for name, row in rows if "skipped" in row]
 
 
 def main() -> None:
-    """The command line. Bad input ends in one line on stderr and exit code 2, a benchmark that fails in 1."""
+    """The command line. Exit code 2 and one line on stderr for bad input, 1 if a benchmark fails."""
     options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
     try:
         if options.out is not None:

@@ -8,8 +8,6 @@ is the time in which JAX traces, lowers, compiles or reads a program from the ca
 import json
 import os
 import shutil
-import subprocess
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -17,7 +15,7 @@ from typing import Any
 
 from rich.table import Table
 
-from benchmarks.timing import Findings, Ratio, run
+from benchmarks.timing import Findings, Ratio, run, run_together
 from hybrid_jax.runtime import PROGRAMS
 
 COLD, CACHED = 15.0, 2.0  # s, to reach
@@ -70,17 +68,10 @@ def measure_run(preset: Preset, cache: Path, folder: Path) -> dict[str, Any]:
     """
     probe = folder / "probe.json"
     arguments = [f"experiments.{preset.experiment}", "--preset", "smoke", "--out", str(folder), "--cache", str(cache)]
-    # Were programs kept where a variable says, nothing would be cold.
+    command = ["-c", PROBE.replace("MODULE", repr(arguments[0])), *arguments[1:], *preset.options]
+    # PROGRAMS would name a cache that is not empty.
     elsewhere = {name: value for name, value in os.environ.items() if name != PROGRAMS}
-    finished = subprocess.run(
-        [sys.executable, "-c", PROBE.replace("MODULE", repr(arguments[0])), *arguments[1:], *preset.options],
-        env=elsewhere | {"HYBRID_JAX_PROBE": str(probe)},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    if finished.returncode:
-        raise RuntimeError(f"{preset.experiment} failed: {finished.stderr[-500:]}")
+    run_together(preset.experiment, [command], elsewhere | {"HYBRID_JAX_PROBE": str(probe)})
     found = json.loads(probe.read_text())
     programs = sum(name.endswith("backend_compile_duration") for name, *_ in found["stages"])
     return {"programs": programs, "waited_seconds": waited(found["stages"]), "run_seconds": found["seconds"]}

@@ -23,19 +23,13 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from benchmarks.subjects import make_windows, protocol
+from benchmarks.subjects import BATCH, SETTINGS, Model, make_windows, training_run, training_runs
 from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run
-from experiments.paper.conditions import pretraining, settings
-from experiments.paper.config import Model
-from hybrid_jax.dynamics.base import Hybrid
-from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.sweep.lanes import LaneMap, lane
+from hybrid_jax.sweep.lanes import LaneMap
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import gradient_step
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS
 
-BATCH = 100
 VALIDATION = 100
 
 
@@ -74,14 +68,12 @@ Case = tuple[Call, int]  # what is timed, and the bytes that it needs
 
 def epoch_of(model: Model, seeds: int, windows: int) -> Case:
     """One epoch of so many lanes over so many windows each, as `hybrid_jax.sweep` runs it."""
-    config = protocol(seeds, windows)
-    chosen = settings(config)
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return fitting.run(state, plan, train, validation, chosen, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)
 
-    mapped, lanes = LaneMap(epoch), pretraining(model, IRIS, config)
+    mapped, lanes = LaneMap(epoch), training_runs(model, seeds, windows)
     shared = many_windows(windows), many_windows(VALIDATION)
     return lambda: mapped(lanes, shared, [1.0] * seeds, range(seeds)), bytes_of((lanes, shared))
 
@@ -94,13 +86,9 @@ def many_windows(count: int) -> Trajectories:
 
 def step_of(model: Model, steps: int, hidden: int) -> Case:
     """One gradient step on windows of so many intervals, of a model with so many hidden units."""
-    config = protocol(1, BATCH)
-    state, plan = (lane(stacked, 0) for stacked in pretraining(model, IRIS, config))
-    network = state.field.residual if model == "hybrid" else state.field
-    wide = residual_network(13, 4, jax.random.key(0), hidden=hidden, scaling=network.scaling)
-    start = fitting.start(Hybrid(state.field.physics, wide) if model == "hybrid" else wide, jax.random.key(1))
-    arguments = start.field, start.adam, plan, make_windows(BATCH, steps)
-    call, _, needed = compiled_with_memory(partial(gradient_step, settings=settings(config)), *arguments)
+    state, plan = training_run(model, BATCH, hidden)
+    arguments = state.field, state.adam, plan, make_windows(BATCH, steps)
+    call, _, needed = compiled_with_memory(partial(gradient_step, settings=SETTINGS), *arguments)
     return call, needed
 
 

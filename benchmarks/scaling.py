@@ -10,8 +10,6 @@ import json
 import os
 import socket
 import statistics
-import subprocess
-import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass
@@ -21,7 +19,7 @@ from typing import Any
 
 from rich.table import Table
 
-from benchmarks.timing import Findings, Ratio, run
+from benchmarks.timing import Findings, Ratio, run, run_together
 from hybrid_jax.runtime import configure, cores
 
 REACH = 1.8 / 2  # of each further device: what a second core is to add
@@ -86,47 +84,32 @@ def take_part(order: str) -> None:
 
 def timed_epochs(place: Place, preset: Preset) -> tuple[float, float]:
     """The seconds of an epoch of all lanes, and until the first block was there."""
-    from dataclasses import replace
-
-    from benchmarks.subjects import make_windows, protocol
-    from experiments.paper.conditions import pretraining, settings
+    from benchmarks.subjects import SETTINGS, make_windows, training_runs
     from hybrid_jax.sweep.training import sweep
-    from hybrid_jax.vehicle import IRIS
 
     lanes = preset.lanes * place.processes * place.devices
-    config = replace(protocol(lanes, preset.windows), max_epochs=5 + 2 * preset.epochs)
     marks: list[tuple[int, float]] = []
     began = time.perf_counter()
 
     def mark(states, progress) -> None:
         marks.append((progress.epochs, time.perf_counter()))
 
-    states, plans = pretraining("hybrid", IRIS, config)
+    states, plans = training_runs("hybrid", lanes, preset.windows, max_epochs=5 + 2 * preset.epochs)
     windows = make_windows(preset.windows, 10)
-    sweep(states, plans, windows, windows, settings(config), on_block=mark, block_seconds=1.0)
+    sweep(states, plans, windows, windows, SETTINGS, on_block=mark, block_seconds=1.0)
     (first, start), (last, end) = marks[0], marks[-1]
     return (end - start) / (last - first), start - began
 
 
 def seconds_at(place: Place, preset: Preset, cache: str) -> dict[str, float]:
-    """What process 0 of a place saw.
+    """The seconds that process 0 of a place measured.
 
     Raises:
         RuntimeError: a process failed.
     """
     shared = {"place": asdict(place), "preset": asdict(preset), "address": free_address(), "cache": cache}
     orders = [json.dumps(shared | {"process": i}) for i in range(place.processes)]
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", PROCESS, order], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-        )
-        for order in orders
-    ]
-    outputs = [process.communicate() for process in started]
-    for process, (_, error) in zip(started, outputs, strict=True):
-        if process.returncode:
-            raise RuntimeError(f"{place}: {error[-500:]}")
-    return json.loads(outputs[0][0].splitlines()[-1])
+    return json.loads(run_together(str(place), [["-c", PROCESS, order] for order in orders])[0].splitlines()[-1])
 
 
 def free_address() -> str:

@@ -19,14 +19,11 @@ import jax
 import numpy as np
 from rich.table import Table
 
-from benchmarks.subjects import make_windows, protocol
+from benchmarks.subjects import SETTINGS, Model, make_windows, training_runs
 from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch
-from experiments.paper.conditions import pretraining, settings
-from experiments.paper.config import Model
 from hybrid_jax.sweep.lanes import WIDTH, LaneMap, lane
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState
-from hybrid_jax.vehicle import IRIS
 
 # Losses after some steps of Adam, which divides by small numbers, in float32 with sums in another order.
 AGREEMENT = 1e-3
@@ -65,15 +62,13 @@ Place = tuple[int, int]  # devices, width
 
 def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Program:
     """One epoch of the first so many of `lanes` lanes, as `hybrid_jax.sweep` runs a block of epochs."""
-    config = protocol(preset.lanes[-1], preset.n_train)
-    chosen = settings(config)
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return fitting.run(state, plan, train, validation, chosen, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)
 
     mapped = LaneMap(epoch, width, jax.local_devices()[:devices])
-    start = lane(pretraining(preset.model, IRIS, config), np.arange(lanes))
+    start = lane(training_runs(preset.model, preset.lanes[-1], preset.n_train), np.arange(lanes))
     shared = make_windows(preset.n_train, 10), make_windows(preset.validation, 10)
     return lambda active: mapped(start, shared, [1.0] * lanes, range(active))
 

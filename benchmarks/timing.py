@@ -1,15 +1,17 @@
-"""What every benchmark does alike: compile apart, compare results, time in turns, print tables, write JSON.
+"""Shared by all benchmarks: compile separately, compare results, time in turns, print tables, write JSON.
 
-The calls that are compared take turns, so that a busy moment of the machine hits all alike, and what counts is the
-median. A ratio of two calls is the median of the ratios within each turn. Set the cores with taskset.
+Calls that are compared take turns, so that load on the machine affects all of them, and medians are reported. A ratio
+of two calls is the median of the ratios within each turn. Set the cores with taskset.
 """
 
 import os
 import statistics
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
+from datetime import UTC, datetime
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -22,33 +24,32 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from experiments.paper.figures import save_figure
-from experiments.runner.command import BAD_INPUT, check_folder
-from experiments.runner.environment import environment
+from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import json_text, write_whole
-from hybrid_jax.runtime import PROGRAMS, configure, cores
+from hybrid_jax.runtime import PROGRAMS, configure, cores, hardware
 
 Call = Callable[[], Any]
-DISAGREEMENT = 1  # exit code
+DISAGREEMENT, BAD_INPUT = 1, 2  # exit codes
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 
 
 class Disagreement(RuntimeError):
-    """Two programs that were to be timed against each other do not compute the same."""
+    """Two programs to be compared do not compute the same."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """What to measure and where to write it."""
+    """Measure one benchmark."""
 
     preset: str = "full"
-    """full: what is reported. smoke: does it work, in seconds; its numbers say nothing."""
+    """full: the reported numbers. smoke: a functional check in seconds; its numbers mean nothing."""
     out: Path | None = None
     """Also write the numbers to this file as JSON, and a figure, if there is one, beside it."""
 
 
 @dataclass(frozen=True)
 class Ratio:
-    """One number to keep an eye on, and what it should reach."""
+    """A measured number and its bounds."""
 
     what: str
     value: float
@@ -57,7 +58,7 @@ class Ratio:
 
     @property
     def holds(self) -> bool | None:
-        """Whether it is reached; None where nothing is asked for."""
+        """Whether the bounds hold; None without bounds."""
         if self.at_most is None and self.at_least is None:
             return None
         return (self.at_most is None or self.value <= self.at_most) and (
@@ -67,7 +68,7 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Findings:
-    """What a benchmark measured: rows of JSON values, the same for reading, the ratios that matter, and a figure."""
+    """The results of a benchmark: rows of JSON values, tables of the same, ratios, and a figure."""
 
     rows: list[dict[str, Any]]
     tables: list[Table]
@@ -82,27 +83,27 @@ class Times:
     seconds: Mapping[Any, Sequence[float]]
 
     def median(self, name: Any) -> float:
-        """Of one call [s]."""
+        """The median of one call [s]."""
         return statistics.median(self.seconds[name])
 
     def medians(self) -> dict[Any, float]:
-        """Of every call [s]."""
+        """The medians of all calls [s]."""
         return {name: self.median(name) for name in self.seconds}
 
     def ratio(self, name: Any, other: Any) -> float:
-        """How many times as long as the other a call takes: the median over the turns."""
+        """The time of a call over that of another: the median over the turns."""
         return statistics.median(a / b for a, b in zip(self.seconds[name], self.seconds[other], strict=True))
 
 
 def stopwatch(call: Callable[[], Any]) -> tuple[Any, float]:
-    """What the call returns, once it is computed, and the seconds that took."""
+    """The result of a call, once computed, and its duration [s]."""
     before = time.perf_counter()
     result = jax.block_until_ready(call())
     return result, time.perf_counter() - before
 
 
 def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
-    """Time each call once a turn, forwards and backwards by turns. Call each once before: this warms nothing up."""
+    """Time each call once per turn, in alternating order. Call each once before: there is no warm-up."""
     taken: dict[Any, list[float]] = {name: [] for name in calls}
     for turn in range(turns):
         for name in list(calls)[:: -1 if turn % 2 else 1]:
@@ -111,20 +112,20 @@ def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
 
 
 def compiled(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
-    """A call of the compiled function on arguments that lie on the device, and the seconds of tracing and compiling."""
+    """A call of the compiled function on device arrays, and the seconds of tracing and compiling."""
     call, seconds, _ = compiled_with_memory(function, *arguments)
     return call, seconds
 
 
 def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float, int]:
-    """As `compiled`, and the bytes that the program needs beside its arguments and results."""
+    """As `compiled`, and the bytes that the program needs besides its arguments and results."""
     arguments = jax.device_put(arguments)
     program, seconds = stopwatch(lambda: jax.jit(function).lower(*arguments).compile())
     return lambda: program(*arguments), seconds, program.memory_analysis().temp_size_in_bytes
 
 
 def repeated(call: Call, turns: int, budget: float) -> float:
-    """The median seconds of a call, after one that warms up; fewer turns, but three, once the budget [s] is spent."""
+    """The median seconds of a call, after a warm-up: up to `turns` times, but at least 3, within a budget [s]."""
     call()
     taken: list[float] = []
     while len(taken) < turns and (len(taken) < 3 or sum(taken) < budget):
@@ -146,6 +147,25 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     return worst
 
 
+def run_together(what: str, commands: Sequence[Sequence[str]], variables: Mapping[str, str] | None = None) -> list[str]:
+    """Run Python processes at the same time; the standard output of each.
+
+    Args:
+        commands: the arguments of each interpreter.
+        variables: of their environment; by default those of this process.
+
+    Raises:
+        RuntimeError: a process failed; the end of its standard error.
+    """
+    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": variables}
+    started = [subprocess.Popen([sys.executable, *command], **pipes) for command in commands]
+    outputs = [process.communicate() for process in started]
+    for process, (_, error) in zip(started, outputs, strict=True):
+        if process.returncode:
+            raise RuntimeError(f"{what} failed: {error[-500:]}")
+    return [output for output, _ in outputs]
+
+
 def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Callable[[Any], Findings]) -> None:
     """The command line: measure a preset, print, write. Bad input ends in one line on stderr and exit code 2."""
     options = tyro.cli(Options, prog=f"python -m benchmarks.{name}", description=about)
@@ -154,7 +174,7 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     except ValueError as error:
         _end(name, error, BAD_INPUT)
     began = time.perf_counter()
-    # An empty cache, so that every compilation that is timed is one.
+    # An empty cache, so that timed compilations are real.
     os.environ.pop(PROGRAMS, None)
     with TemporaryDirectory() as cache:
         configure(Path(cache))
@@ -167,7 +187,23 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
         report = _report(name, options.preset, findings, time.perf_counter() - began)
         write_whole(options.out, json_text(report))
         if findings.figure is not None:
-            save_figure(findings.figure, options.out.with_suffix(""))
+            findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
+            findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
+
+
+def check_folder(option: str, folder: Path) -> None:
+    """Create a folder and check that it can be written, before work begins.
+
+    Raises:
+        ValueError: it cannot be created or written.
+    """
+    probe = folder / f".writable.{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
 
 
 def _check(options: Options, presets: Mapping[str, Any]) -> None:
@@ -176,7 +212,7 @@ def _check(options: Options, presets: Mapping[str, Any]) -> None:
     if options.out is None:
         return
     if options.out.is_dir():
-        raise ValueError(f"--out {options.out}: is a folder, a file is wanted")
+        raise ValueError(f"--out {options.out}: is a folder, a file is needed")
     check_folder("--out", options.out.parent)
 
 
@@ -193,7 +229,7 @@ def _print(findings: Findings, console: Console) -> None:
 
 
 def ratio_table(ratios: Sequence[Ratio]) -> Table:
-    """What is reached and what is not."""
+    """Ratios and their bounds."""
     table = Table("ratio", "", "reach", "", title=f"on {cores()} cores")
     for ratio in ratios:
         bounds = (("≤", ratio.at_most), ("≥", ratio.at_least))
@@ -207,7 +243,12 @@ def _report(name: str, preset: str, findings: Findings, seconds: float) -> dict[
     return {
         "benchmark": name,
         "preset": preset,
-        "environment": environment({name: seconds}),
+        "environment": {
+            "date": datetime.now(UTC).isoformat(timespec="seconds"),
+            "versions": versions(*PACKAGES),
+            "hardware": hardware(),
+            "seconds": {name: round(seconds, 3)},
+        },
         "cores_used": cores(),
         "rows": findings.rows,
         "ratios": [asdict(ratio) | {"holds": ratio.holds} for ratio in findings.ratios],

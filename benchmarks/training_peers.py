@@ -33,16 +33,12 @@ from rich.markup import escape
 from rich.table import Table
 
 from benchmarks.peers import installed, keep_to_one_core, skipped
-from benchmarks.subjects import make_windows, protocol
+from benchmarks.subjects import SETTINGS, make_windows, training_run
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run, stopwatch
 from benchmarks.training_step import AGREEMENT
-from experiments.paper.conditions import pretraining, settings
-from experiments.paper.config import Config
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import RK4
-from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training.fitting import gradient_step
-from hybrid_jax.vehicle import IRIS
 
 OURS, TORCHDIFFEQ, BY_HAND, COMPILED = "ours", "PyTorch, torchdiffeq", "PyTorch by hand", "PyTorch, torch.compile"
 RIVALS = TORCHDIFFEQ, BY_HAND, COMPILED
@@ -104,9 +100,9 @@ def missing(preset: Preset) -> list[dict[str, Any]]:
     return rows
 
 
-def our_first(subject: tuple, config: Config, solver: diffrax.AbstractSolver) -> dict[str, Any]:
+def our_first(subject: tuple, solver: diffrax.AbstractSolver) -> dict[str, Any]:
     """What our first step comes to by some integrator."""
-    step = partial(gradient_step, settings=replace(settings(config), solver=solver))
+    step = partial(gradient_step, settings=replace(SETTINGS, solver=solver))
     field, adam, value = compiled(step, *subject)[0]()
     physics, network, running = adam.mu.physics, adam.mu.residual, field.residual.norm.running
     moment = {
@@ -120,9 +116,9 @@ def our_first(subject: tuple, config: Config, solver: diffrax.AbstractSolver) ->
     return {"loss": value, "first_moment": moment, "mean": running.mean, "variance": running.variance}
 
 
-def our_steps(subject: tuple, config: Config, in_a_row: int) -> Steps:
+def our_steps(subject: tuple, in_a_row: int) -> Steps:
     """Ours, in the loop of `training`."""
-    step = partial(gradient_step, settings=settings(config))
+    step = partial(gradient_step, settings=SETTINGS)
 
     def loop(field, adam, plan, windows):
         def body(_, learner):
@@ -132,7 +128,7 @@ def our_steps(subject: tuple, config: Config, in_a_row: int) -> Steps:
         return jax.lax.fori_loop(0, in_a_row, body, (field, adam))
 
     call, seconds = compiled(loop, *subject)
-    return Steps(call, our_first(subject, config, RK4()), seconds)
+    return Steps(call, our_first(subject, RK4()), seconds)
 
 
 def rival_steps(subject: tuple, preset: Preset, names: Sequence[str]) -> dict[str, Steps]:
@@ -171,12 +167,11 @@ def prepare(preset: Preset, names: Sequence[str]) -> tuple[dict[str, Steps], dic
     Raises:
         Disagreement: it is too much.
     """
-    config = protocol(1, preset.windows)
-    state, plan = (lane(stacked, 0) for stacked in pretraining("hybrid", IRIS, config))
+    state, plan = training_run("hybrid", preset.windows)
     subject = state.field, state.adam, plan, make_windows(preset.windows, preset.intervals)
-    ours = our_steps(subject, config, preset.in_a_row)
+    ours = our_steps(subject, preset.in_a_row)
     rivals = rival_steps(subject, preset, names) if names else {}
-    alike = {TORCHDIFFEQ: our_first(subject, config, ThreeEighths())} if TORCHDIFFEQ in names else {}
+    alike = {TORCHDIFFEQ: our_first(subject, ThreeEighths())} if TORCHDIFFEQ in names else {}
     differences = {
         name: agree(f"steps of {name} and ours", alike.get(name, ours.result), rival.result, AGREEMENT)
         for name, rival in rivals.items()

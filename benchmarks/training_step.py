@@ -22,14 +22,10 @@ from rich.table import Table
 
 from benchmarks import plain
 from benchmarks.operations import count_operations
-from benchmarks.subjects import make_windows, protocol
+from benchmarks.subjects import SETTINGS, Model, make_windows, training_run
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run
-from experiments.paper.conditions import pretraining, settings
-from experiments.paper.config import Model
 from hybrid_jax.dynamics.base import trainable
-from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training.fitting import gradient_step
-from hybrid_jax.vehicle import IRIS
 
 PRODUCT = "matrix product"  # beside the names of models
 # Sums of 100 windows × 40 evaluations in another order, in float32; and 1e-4 of a leaf's largest entry moves no rate.
@@ -88,10 +84,9 @@ class Contest:
 
 def prepare(model: Model, preset: Preset) -> Contest:
     """Both steps from the start of the protocol's pre-training."""
-    config = protocol(1, preset.windows)
-    state, plan = (lane(stacked, 0) for stacked in pretraining(model, IRIS, config))
+    state, plan = training_run(model, preset.windows)
     arguments = state.field, state.adam, plan, make_windows(preset.windows, preset.steps)
-    ours = partial(gradient_step, settings=settings(config))
+    ours = partial(gradient_step, settings=SETTINGS)
     programs = {"ours": compiled(ours, *arguments), "plain": compiled(plain.training_step, *arguments)}
     calls = {name: call for name, (call, _) in programs.items()}
     difference = compare(f"steps of {model}", calls["ours"](), calls["plain"]())

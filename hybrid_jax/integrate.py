@@ -80,6 +80,14 @@ def integrate(
     return jax.lax.scan(interval, x0, u)[1]
 
 
+def rk4_step(
+    derivative: Derivative, x: Float[Array, " d *b"], u: Float[Array, " m *b"], dt: float
+) -> Float[Array, " d *b"]:
+    """The state after one step of RK4 over dt [s] with the input held, as in an interval of `rollout`."""
+    term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
+
+
 def _bounded(solver: diffrax.AbstractSolver) -> diffrax.AbstractSolver:
     """The solver with its stages in a loop of bounded length.
 

@@ -9,25 +9,30 @@ import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.export.step import one_step
-from hybrid_jax.integrate import Derivative, check_field
-from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.export.sizes import sizes_of
+from hybrid_jax.integrate import Derivative, check_field, rk4_step
 
 if TYPE_CHECKING:
     import casadi
 
 
 def casadi_function(
-    field: AbstractVectorField, *, state_size: int = STATE_SIZE, input_size: int = INPUT_SIZE, name: str = "f"
+    field: AbstractVectorField, *, state_size: int | None = None, input_size: int | None = None, name: str = "f"
 ) -> "casadi.Function":
-    """ẋ = f(x, u) of a field as deployed, from x (d × 1) and u (m × 1) to xdot (d × 1), in double precision.
+    """ẋ = f(x, u) of a field in inference mode, from x (d × 1) and u (m × 1) to xdot (d × 1), in double precision.
 
-    Any field of the library, and one of your own that is made of operations that CasADi has: its program is followed
-    operation by operation, so that CasADi knows every entry and differentiates it. `.save`, `.generate` and the like
-    are CasADi's own.
+    The field's program is translated operation by operation into symbolic expressions, which CasADi differentiates,
+    saves (`.save`) and translates to C (`.generate`).
+
+    Args:
+        field: any field of the library, or a custom one made of operations that CasADi has.
+        state_size: d; by default what the field knows (see `sizes_of`).
+        input_size: m; likewise.
+        name: of the function.
 
     Raises:
-        ValueError: a field that does not take such x and u, or has an operation that CasADi has not; says which.
+        ValueError: unknown sizes, a field that does not accept such x and u, or an operation that CasADi does not
+            have, by its name.
         ImportError: casadi is not installed.
     """
     return _function(field, lambda double: double, state_size, input_size, name, "xdot")
@@ -37,37 +42,38 @@ def casadi_step(
     field: AbstractVectorField,
     dt: float,
     *,
-    state_size: int = STATE_SIZE,
-    input_size: int = INPUT_SIZE,
+    state_size: int | None = None,
+    input_size: int | None = None,
     name: str = "F",
 ) -> "casadi.Function":
-    """x⁺ = F(x, u), one step of the library's RK4 over dt [s] with u held; its output is xnext, else `casadi_function`.
+    """x⁺ = F(x, u), one step of RK4 over dt [s] with u held; its output is xnext. Otherwise as `casadi_function`.
 
     Raises:
-        ValueError: dt that is not positive; as `casadi_function`.
+        ValueError: dt is not positive; and as `casadi_function`.
         ImportError: casadi is not installed.
     """
     checks.positive("dt", dt, "a positive number of seconds")
     return _function(
-        field, lambda double: partial(one_step, double, dt=float(dt)), state_size, input_size, name, "xnext"
+        field, lambda double: partial(rk4_step, double, dt=float(dt)), state_size, input_size, name, "xnext"
     )
 
 
-def _function(field, whole, state_size: int, input_size: int, name: str, output: str) -> "casadi.Function":
+def _function(
+    field, whole, state_size: int | None, input_size: int | None, name: str, output: str
+) -> "casadi.Function":
     try:
         import casadi as ca
 
         from hybrid_jax.export.casadi_operations import evaluate
     except ImportError as error:
         raise ImportError("CasADi functions need casadi: pip install 'hybrid_jax[casadi]'") from error
-    checks.count("state_size", state_size)
-    checks.count("input_size", input_size, least=0)
+    sizes = sizes_of(field, state_size, input_size)
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
-    symbols = [ca.SX.sym("x", state_size), ca.SX.sym("u", input_size)]
-    # In double precision throughout: otherwise the constants of the physics would be rounded to single on the way.
+    symbols = [ca.SX.sym("x", sizes[0]), ca.SX.sym("u", sizes[1])]
+    # In double precision throughout, so that the constants of the physics are not rounded.
     with jax.enable_x64(True):
-        program = jax.make_jaxpr(whole(_double(field, state_size, input_size)))(*map(_like, (state_size, input_size)))
+        program = jax.make_jaxpr(whole(_double(field, *sizes)))(*map(_like, sizes))
         result = evaluate(program, symbols)
     return ca.Function(name, symbols, [result], ["x", "u"], [output])
 

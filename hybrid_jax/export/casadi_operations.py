@@ -1,7 +1,7 @@
-"""JAX's programs in CasADi's symbols, operation by operation.
+"""Translate JAX programs into CasADi expressions, operation by operation.
 
-A value is an array of numbers as long as it is known. One that depends on the symbols is a column of all its entries,
-in JAX's order (the last axis runs fastest), and its shape.
+A value that does not depend on the symbols is a NumPy array. One that does is a column of its entries, in row-major
+order, and its shape.
 """
 
 from collections.abc import Callable, Sequence
@@ -27,10 +27,10 @@ Column = ca.SX | ca.DM
 
 
 def evaluate(program: ClosedJaxpr, symbols: Sequence[ca.SX]) -> ca.SX:
-    """The result of a program of vectors to one vector, as a dense column.
+    """The result of a program from vectors to one vector, as a dense column.
 
     Raises:
-        ValueError: an operation that has no counterpart.
+        ValueError: an operation has no counterpart in CasADi.
     """
     (result,) = _run(program.jaxpr, program.consts, [Entries(one, (one.numel(),)) for one in symbols])
     return ca.densify(ca.SX(_column(result)))
@@ -69,7 +69,7 @@ def _results(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
 
 
 def _known(equation: JaxprEqn, inputs: Sequence[Any]) -> list[Any]:
-    """The results of an operation on numbers, by JAX."""
+    """Evaluate an operation on numbers by JAX."""
     found = equation.primitive.bind(*map(jnp.asarray, inputs), **equation.params)
     return [np.asarray(one) for one in (found if equation.primitive.multiple_results else [found])]
 
@@ -90,7 +90,7 @@ def _column(value: Value) -> Column:
 
 
 def _taken(column: Column, places: np.ndarray) -> Column:
-    """The entries at these places, one after the other, as a column."""
+    """The entries at these indices, as a column."""
     return column[places.ravel().tolist(), 0]
 
 
@@ -99,12 +99,12 @@ def _shape(value: Value) -> tuple[int, ...]:
 
 
 def _places(value: Value) -> np.ndarray:
-    """Where in its column each entry of a value stands, in the value's shape."""
+    """The index in its column of each entry of a value, in the value's shape."""
     return np.arange(int(np.prod(_shape(value)))).reshape(_shape(value))
 
 
 def _spread(value: Value, shape: tuple[int, ...]) -> Column:
-    """The column with entries repeated along axes of length 1, as in NumPy; one alone goes with any shape as it is."""
+    """The column of a value broadcast to a shape, as in NumPy; CasADi broadcasts single entries itself."""
     column = _column(value)
     if _shape(value) == shape or column.numel() == 1:
         return column
@@ -112,12 +112,12 @@ def _spread(value: Value, shape: tuple[int, ...]) -> Column:
 
 
 def _moved(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    """What only puts entries elsewhere: JAX does it to their places, and the entries follow."""
+    """Operations that only move entries: JAX moves their indices, then the entries are taken at these."""
     columns, sent, count = [], list(inputs), 0
     for i in MOVES[equation.primitive.name](len(inputs)):
         places = _places(inputs[i])
         columns.append(_column(inputs[i]))
-        sent[i] = (count + places).astype(float)  # of the type of the entries, which JAX looks at
+        sent[i] = (count + places).astype(float)  # of the type of the entries, which JAX checks
         count += places.size
     if any(isinstance(value, Entries) for value in sent):
         raise _refusal(equation, " at a place that depends on x or u")
@@ -132,7 +132,7 @@ def _moved(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
 
 
 def _linear(equation: JaxprEqn, inputs: list[Value]) -> Column:
-    """What is linear in its data, each as a matrix times its column."""
+    """Operations that are linear in their data, as a matrix times each column."""
     data = LINEAR[equation.primitive.name]
     if any(isinstance(value, Entries) for i, value in enumerate(inputs) if i not in data):
         raise _refusal(equation, " at a place that depends on x or u")
@@ -156,15 +156,15 @@ def _folded(value: Value, axes: Sequence[int], fold: Callable) -> Column:
 
 
 def _product(left: Value, right: Value, dimension_numbers) -> Column:
-    """The sums of products over the contracted axes; its axes are the common ones, the left's and the right's."""
+    """dot_general: the axes of the result are the batch axes, those of the left and those of the right."""
     (of_left, of_right), (common_left, common_right) = dimension_numbers
     rows, columns = _matrices(left, of_left, common_left), _matrices(right, of_right, common_right)
-    # CasADi counts columns first, JAX rows: the transpose puts the entries into JAX's order.
+    # CasADi is column-major and JAX row-major, hence the transpose.
     return ca.vertcat(*(ca.vec(ca.mtimes(a, b.T).T) for a, b in zip(rows, columns, strict=True)))
 
 
 def _matrices(value: Value, contracted: Sequence[int], common: Sequence[int]) -> list[Column]:
-    """One matrix (free × contracted) for each index of the common axes."""
+    """One matrix (free × contracted) for each index of the batch axes."""
     free = [axis for axis in range(len(_shape(value))) if axis not in (*contracted, *common)]
     places = np.transpose(_places(value), (*common, *free, *contracted))
     sizes = [int(np.prod([_shape(value)[axis] for axis in axes])) for axes in (common, free, contracted)]
@@ -197,10 +197,10 @@ def _plain(operation: Callable) -> Callable:
     return lambda equation, *inputs: operation(*inputs)
 
 
-# Operations that call a program within the program; a custom derivative gives way to CasADi's.
+# Operations that call another program. Custom derivatives are replaced by CasADi's.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
 _FIRST, _ALL = (lambda count: (0,)), range
-# Name → of how many inputs, which ones hold entries that are moved; the others say where to.
+# Name → from the number of inputs, the indices of those whose entries are moved.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
     "reshape": _FIRST,
     "squeeze": _FIRST,

@@ -1,8 +1,8 @@
 """Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library.
 
-A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`. They
-are a list of operations on arrays, the parameters among them; loading them runs no Python of the file, and a program
-that calls anything outside itself is neither written nor loaded.
+A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`: a list
+of operations on arrays, the parameters included. Loading a file runs no Python of it. Programs with external calls are
+neither written nor loaded.
 """
 
 import importlib.util
@@ -23,28 +23,27 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
-from hybrid_jax.export.step import one_step
-from hybrid_jax.integrate import Derivative, check_field
+from hybrid_jax.export.sizes import sizes_of
+from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 
 FORMAT = "hybrid_jax program 1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
-BATCH = "b"  # the name of the axis of a batch, whose length stays open
-_OWN_CALLS = ("shape_assertion",)  # JAX's own checks of an open length
+BATCH = "b"  # name of the batch axis, whose length is symbolic
+_OWN_CALLS = ("shape_assertion",)  # JAX's checks of a symbolic length
 
 
 @dataclass(frozen=True)
 class Program:
-    """ẋ = f(x, u), or x⁺ = F(x, u), as read from a file; `jax.jit` takes it, `jax.vmap` and `jax.grad` do not.
+    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`.
 
     Attributes:
-        dt: how long a step is [s]; None for a field.
+        dt: length of a step [s]; None for a field.
         state_size: d.
         input_size: m.
         batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: on which it runs.
-        about: JSON values: what was known about the model.
+        about: JSON values that describe the model.
     """
 
     dt: float | None
@@ -76,22 +75,24 @@ def export_field(
     path: str | Path,
     field: AbstractVectorField,
     *,
-    state_size: int = STATE_SIZE,
-    input_size: int = INPUT_SIZE,
+    state_size: int | None = None,
+    input_size: int | None = None,
     batched: bool = False,
     platforms: tuple[str, ...] = ("cpu",),
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ẋ = f(x, u) of a field as deployed, in single precision, to a file that `load_program` reads.
+    """Write ẋ = f(x, u) of a field in inference mode, in single precision, to a file that `load_program` reads.
 
     Args:
-        batched: whether it is to take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: of PLATFORMS; only those that the program will ever run on, each makes the file longer.
-        about: JSON values that travel with it.
+        state_size: d; by default what the field knows (see `sizes_of`).
+        input_size: m; likewise.
+        batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
+        platforms: a subset of PLATFORMS; each makes the file longer.
+        about: JSON values to store with the program.
 
     Raises:
-        ValueError: a field that does not take such x and u, a platform that is none, what is not JSON, or a program
-            that would call something outside itself, such as LAPACK.
+        ValueError: unknown sizes, a field that does not accept such x and u, an unknown platform, `about` that is not
+            JSON, or a program with an external call, such as to LAPACK.
         ImportError: flatbuffers is not installed (extra `export`).
         OSError: the folder cannot be written.
     """
@@ -103,16 +104,16 @@ def export_step(
     field: AbstractVectorField,
     dt: float,
     *,
-    state_size: int = STATE_SIZE,
-    input_size: int = INPUT_SIZE,
+    state_size: int | None = None,
+    input_size: int | None = None,
     batched: bool = False,
     platforms: tuple[str, ...] = ("cpu",),
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write x⁺ = F(x, u), one step of the library's RK4 over dt [s] with the input held; all else as `export_field`.
+    """Write x⁺ = F(x, u), one step of RK4 over dt [s] with the input held. Otherwise as `export_field`.
 
     Raises:
-        ValueError: dt that is not positive; as `export_field`.
+        ValueError: dt is not positive; and as `export_field`.
         ImportError, OSError: as `export_field`.
     """
     checks.positive("dt", dt, "a positive number of seconds")
@@ -120,10 +121,10 @@ def export_step(
 
 
 def load_program(path: str | Path) -> Program:
-    """Read what `export_field` or `export_step` wrote; no Python of the file is run.
+    """Read a file of `export_field` or `export_step`; no Python of the file is run.
 
     Raises:
-        ValueError: the file is missing, damaged, no program, or one that calls something outside itself; one line.
+        ValueError: the file is missing, damaged, not a program, or a program with an external call; one line.
         ImportError: flatbuffers is not installed (extra `export`).
     """
     _need_flatbuffers()
@@ -135,25 +136,24 @@ def load_program(path: str | Path) -> Program:
         if dt is not None:
             checks.positive("dt", dt)
         batched, state_size, input_size = _sizes(exported)
-    except Exception as error:  # of forged bytes, JAX's parser raises whatever it meets
+    except Exception as error:  # JAX's parser raises errors of any type
         raise ValueError(f"{path}: not a program of a field or a step: {checks.first_line(error)}") from error
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
 
 
 def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, about) -> None:
     _need_flatbuffers()
-    checks.count("state_size", state_size)
-    checks.count("input_size", input_size, least=0)
+    sizes = sizes_of(field, state_size, input_size)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
         raise ValueError(
             f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.short_repr(platforms)}"
         )
-    with jax.enable_x64(False), _nowhere():
+    with jax.enable_x64(False), _without_source_locations():
         single = jax.tree.map(
             lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_inexact_array(leaf) else leaf, field
         )
         batch = jax.export.symbolic_shape(BATCH) if batched else ()
-        x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in (state_size, input_size))
+        x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
         check_field(single, *(jax.ShapeDtypeStruct(like.shape[-1:], like.dtype) for like in (x, u)))
         derivative = _of_rows(single) if batched else single
         exported = jax.export.export(jax.jit(_program(derivative, dt)), platforms=platforms)(x, u)
@@ -163,8 +163,8 @@ def _export(path, field, dt: float | None, state_size, input_size, batched, plat
 
 
 @contextmanager
-def _nowhere() -> Iterator[None]:
-    """Without it a program names the files and lines that it was traced from, in folders that are nobody's business."""
+def _without_source_locations() -> Iterator[None]:
+    """Leave out the paths and lines of the source that a program is traced from."""
     name = "jax_traceback_in_locations_limit"
     before = getattr(jax.config, name)
     jax.config.update(name, 0)
@@ -175,31 +175,31 @@ def _nowhere() -> Iterator[None]:
 
 
 def _program(derivative: Derivative, dt: float | None) -> Derivative:
-    whole = derivative if dt is None else partial(one_step, derivative, dt=dt)
-    return lambda x, u: whole(x, u)  # what is compiled must have a hash, which a field has not
+    whole = derivative if dt is None else partial(rk4_step, derivative, dt=dt)
+    return lambda x, u: whole(x, u)  # jax.jit needs a hashable function
 
 
 def _of_rows(field: AbstractVectorField) -> Derivative:
-    """The field on a batch, one sample a row."""
+    """The field on a batch, one sample per row."""
     return lambda x, u: jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
 
 
 def _check_calls(exported: jax.export.Exported) -> None:
-    """Refuse a program that is not whole in itself: it would run on this machine's libraries, or not at all.
+    """Refuse a program that depends on libraries of a machine.
 
     Raises:
-        ValueError: what it calls.
+        ValueError: it has an external call, by its name.
     """
     for call in re.findall(r"custom_call\W*(\w*)", exported.mlir_module()):
         if call not in _OWN_CALLS:
-            raise ValueError(f"field: its program calls {call or 'something'}, which is no operation of StableHLO")
+            raise ValueError(f"field: its program calls {call or 'something'}, which is not an operation of StableHLO")
 
 
 def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
-    """(batched, d, m) of a program from x and u to something like x.
+    """(batched, d, m) of a program (x, u) → ẋ or x⁺.
 
     Raises:
-        ValueError: it is of another kind.
+        ValueError: it has another signature.
     """
     x, u = exported.in_avals
     (result,) = exported.out_avals

@@ -15,12 +15,12 @@ from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
 from hybrid_jax.sim.quadrotor import CHUNK, Quadrotor
 from hybrid_jax.state import POSITION, VELOCITY
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 DT = pilot.PERIOD  # s
-CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), so that windows see the wind at every phase
+CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of the wind
 
-# A flight that leaves these bounds, or whose centre is below ground, has gone wrong.
+# Bounds of a sound flight of the Iris; those of other vehicles are scaled.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
 
 
@@ -28,10 +28,10 @@ class Flights(NamedTuple):
     """n flights of t decisions, float64.
 
     Attributes:
-        states: from take-off on.
+        states: from the start on.
         inputs: held from one state to the next [rad/s].
         lowest_rotor: the altitude of the lowest rotor at each state [m].
-        start: time of take-off [s].
+        start: time of the first state [s].
     """
 
     states: Float[Array | np.ndarray, "*n t+1 13"]
@@ -41,12 +41,15 @@ class Flights(NamedTuple):
 
 
 def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
-    """Random closed-loop flights at 100 Hz; float64 on the CPU whatever the caller's precision and device.
+    """Simulate random closed-loop flights at 100 Hz, always in float64 and on the CPU.
 
     Flight i depends on the key and i alone.
 
+    Args:
+        seconds: duration of each flight.
+
     Raises:
-        ValueError: no flights, no time or no key.
+        ValueError: flights or seconds are not positive, or key is not a random key.
     """
     checks.count("flights", flights)
     checks.positive("seconds", seconds)
@@ -58,24 +61,28 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         truth = domain.quadrotor()
         keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpu)))(jnp.arange(-(-flights // CHUNK) * CHUNK))
         # Chunks of one size share one compilation.
-        parts = [_fly_chunk(truth, parameters_of(IRIS), chunk, steps) for chunk in keys.reshape(-1, CHUNK)]
+        parts = [
+            _fly_chunk(truth, parameters_of(domain.nominal), chunk, steps, domain.nominal)
+            for chunk in keys.reshape(-1, CHUNK)
+        ]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(jax.jit, static_argnames="steps", compiler_options=FASTEST_COMPILE)
-def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int) -> Flights:
-    return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps))(keys)
+@partial(jax.jit, static_argnames=("steps", "vehicle"), compiler_options=FASTEST_COMPILE)
+def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle) -> Flights:
+    return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps, vehicle))(keys)
 
 
-def _fly_once(truth: Quadrotor, nominal: Parameters, key: PRNGKeyArray, steps: int) -> Flights:
+def _fly_once(truth: Quadrotor, nominal: Parameters, key: PRNGKeyArray, steps: int, vehicle: Vehicle) -> Flights:
+    scale = pilot.scale_of(vehicle)
     key_plan, key_start, key_clock = jax.random.split(key, 3)
-    plan = pilot.draw_plan(key_plan, steps)
-    x0 = pilot.starting_state(key_start, plan)
+    plan = pilot.draw_plan(key_plan, steps, scale)
+    x0 = pilot.starting_state(key_start, plan, scale)
     start = jax.random.uniform(key_clock, maxval=CLOCK)
 
     def decide(carry, now):
         memory, x, t = carry
-        memory, u = pilot.act(memory, x, now, nominal, IRIS.max_rotor_speed)
+        memory, u = pilot.act(memory, x, now, nominal, vehicle.max_rotor_speed, scale)
         x = truth.step(x, u, t, DT)
         return (memory, x, t + DT), (x, u)
 
@@ -85,11 +92,12 @@ def _fly_once(truth: Quadrotor, nominal: Parameters, key: PRNGKeyArray, steps: i
     return Flights(states, u, altitudes.min(axis=1), start)
 
 
-def gone_wrong(states: Float[Array | np.ndarray, "n t 13"]) -> np.ndarray:
-    """Which flights (n,) diverged, left the arena, were too fast or crashed."""
+def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
+    """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed."""
+    scale = pilot.scale_of(vehicle)
     finite = np.isfinite(states).all(axis=(1, 2))
     p, v = states[..., POSITION], states[..., VELOCITY]
-    far = np.linalg.norm(p[..., :2], axis=-1) > MAX_DISTANCE
-    fast = np.linalg.norm(v, axis=-1) > MAX_SPEED
-    outside = (p[..., 2] > MAX_ALTITUDE) | (p[..., 2] < 0)
+    far = np.linalg.norm(p[..., :2], axis=-1) > MAX_DISTANCE * scale.length
+    fast = np.linalg.norm(v, axis=-1) > MAX_SPEED * scale.speed
+    outside = (p[..., 2] > MAX_ALTITUDE * scale.length) | (p[..., 2] < 0)
     return ~finite | (far | fast | outside).any(axis=1)

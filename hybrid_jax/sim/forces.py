@@ -1,7 +1,6 @@
-"""What acts on the true vehicle beyond rotor thrust, reaction torque and gravity.
+"""Forces on the true vehicle besides rotor thrust, reaction torque and gravity.
 
-A force is a function (x, u, t, parameters) → Wrench. To add one, write the function and put it into the tuple that
-`Quadrotor` takes.
+A force is a function (x, u, t, parameters) → Wrench. To add one, add the function to the `forces` of a `Domain`.
 """
 
 import math
@@ -38,7 +37,7 @@ class Wrench(NamedTuple):
 
 
 class Parameters(eqx.Module):
-    """The numbers of one true vehicle as array leaves, so that they can be traced, swept and vmapped; SI units.
+    """The parameters of a true vehicle as array leaves, so that they can be traced and vmapped; SI units.
 
     Attributes:
         mass: [kg].
@@ -64,7 +63,7 @@ class Parameters(eqx.Module):
 
 
 def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) -> Parameters:
-    """The parameters of a vehicle, in the precision that is on when this is called."""
+    """The parameters of a vehicle, in the current precision."""
     return Parameters(
         mass=jnp.asarray(vehicle.mass),
         inertia=jnp.asarray(vehicle.inertia),
@@ -95,7 +94,7 @@ def wind(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
 
 
 def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wrench:
-    """The thrust that the ground adds to each rotor over k u², and its torque (Eq. 11)."""
+    """The thrust that ground effect adds to k u² of each rotor, and its torque (Eq. 11)."""
     gain = thrust_gain(rotor_altitudes(x, parameters.rotor_positions), parameters.rotor_radius)
     excess = (gain - 1) * parameters.thrust_coefficient * u**2
     q = normalise(x[QUATERNION])
@@ -106,7 +105,7 @@ def ground_effect(x: State, u: Input, t: Scalar, parameters: Parameters) -> Wren
 def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Float[Array, "*rotors"]:
     """T/T∞ = 1 / (1 − (R / 4h)²) (Cheeseman and Bennett 1955) of rotors at altitude h [m] over level ground.
 
-    h is floored at R/2, where the gain is 4/3: the formula is meant for h > R/2 and diverges at R/4.
+    h is floored at R/2, where the gain is 4/3: the formula is valid for h > R/2 and diverges at R/4.
     """
     height = jnp.maximum(altitude, rotor_radius / 2)
     return 1 / (1 - (rotor_radius / (4 * height)) ** 2)

@@ -1,4 +1,4 @@
-"""iris.xml with the numbers of a Vehicle: for C MuJoCo, and as traced numbers for MJX."""
+"""iris.xml with the constants of a vehicle, for C MuJoCo, and with traced parameters, for MJX."""
 
 # MuJoCo's compiled modules carry no type stubs.
 # pyright: reportAttributeAccessIssue=false
@@ -35,7 +35,7 @@ def build_model(vehicle: Vehicle) -> mujoco.MjModel:
 
 
 def _draw_arm(body: mujoco.MjsBody, x: float, y: float, radius: float) -> None:
-    """An arm from the hub, a motor, and above it a propeller in the disc it sweeps; nothing weighs or collides."""
+    """Draw an arm, a motor, a propeller and its disc, without mass or collisions."""
     kind = mujoco.mjtGeom
     disc = "front" if x > 0 else "rear"
     root = [0.35 * x, 0.22 * y, -0.008]
@@ -57,14 +57,14 @@ def _iris() -> mujoco.MjModel:
 
 
 def bare_model() -> mjx.Model:
-    """The scene for MJX in the precision that is on; its vehicle's numbers are to be replaced."""
+    """The scene for MJX in the current precision; see `with_parameters`."""
     # Concrete even while tracing, so that MJX sees the model's structure as constants.
     with jax.ensure_compile_time_eval():
         return mjx.put_model(_iris())
 
 
 def with_parameters(model: mjx.Model, parameters: Parameters) -> mjx.Model:
-    """The MJX model with every number of the vehicle replaced by that of the parameters, which may be traced."""
+    """The MJX model with the parameters of a vehicle, which may be traced."""
     p = parameters
     thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
     ratio = p.spin * p.torque_coefficient / p.thrust_coefficient

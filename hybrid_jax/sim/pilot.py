@@ -1,22 +1,28 @@
-"""A pilot for random flight: it wanders between waypoints, sometimes close to the ground, and shakes the vehicle.
+"""A pilot for random flight between waypoints, sometimes close to the ground, with dither on all axes.
 
-A `Plan` holds all that is random and is drawn before take-off; `act` is the closed loop, a cascade of position,
-velocity, attitude and rate control at 100 Hz. The pilot knows the nominal vehicle only: a shifted one or wind it merely
-tolerates.
+A `Plan` holds all that is random and is drawn before take-off. `act` is the closed loop: a cascade of position,
+velocity, attitude and rate control at 100 Hz for the nominal vehicle. It tolerates parameter shifts and wind.
+
+The constants below are those for the Iris. `Scale` adapts them to vehicles of another size.
 """
 
+import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax.rotation import body_z, conjugate, from_axis_angle, multiply, normalise
 from hybrid_jax.sim.forces import Parameters
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 PERIOD = 0.01  # s, one decision
+FASTEST = 1 / 3  # scale of time below which the rate loop would be too fast for PERIOD
 
 # Waypoints: a box around home, each held for a while and approached at its own speed.
 ARENA = 6.0  # m, |x| and |y|
@@ -46,8 +52,43 @@ ASTRAY, SAFE_ALTITUDE = 13.0, 1.5  # m from home, m: beyond the one go up to the
 DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no more than this share of the altitude
 
 
+@dataclass(frozen=True)
+class Scale:
+    """The size of a vehicle over that of the Iris. All 1 for the Iris; static, so that its program stays the same.
+
+    Froude scaling: flights of vehicles of different size are geometrically similar at the same tilt and thrust over
+    weight, with times proportional to the root of lengths. A small vehicle is slowed down to what 100 Hz can control.
+    """
+
+    length: float = 1.0
+
+    @property
+    def time(self) -> float:
+        """Scale of durations."""
+        return max(math.sqrt(self.length), FASTEST)
+
+    @property
+    def speed(self) -> float:
+        """Scale of velocities."""
+        return self.length / self.time
+
+    @property
+    def acceleration(self) -> float:
+        """Scale of accelerations."""
+        return self.length / self.time**2
+
+
+def scale_of(vehicle: Vehicle) -> Scale:
+    """The scale of a vehicle, from the distance of its outermost rotor."""
+
+    def arm(vehicle: Vehicle) -> float:
+        return max(math.hypot(x, y) for x, y in vehicle.rotor_positions)
+
+    return Scale(arm(vehicle) / arm(IRIS))
+
+
 class Plan(NamedTuple):
-    """What the pilot means to do at each decision of one flight.
+    """The reference and the dither at each decision of one flight.
 
     Attributes:
         position: reference [m, world].
@@ -63,28 +104,28 @@ class Plan(NamedTuple):
 
 
 class Memory(eqx.Module):
-    """What the pilot carries from one decision to the next: the integral of the position error [m/s², world]."""
+    """The state of the controller: the integral of the position error [m/s², world]."""
 
     integral: Float[Array, "3"]
 
 
-def draw_plan(key: PRNGKeyArray, steps: int) -> Plan:
+def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
     """A random plan of `steps` decisions."""
     key_targets, key_dither = jax.random.split(key)
-    target, limit = _draw_waypoints(key_targets, steps)
-
-    hardest = jnp.array(ACCELERATION)
+    target, limit = _draw_waypoints(key_targets, steps, scale)
+    turn = 1 / scale.time**2
+    hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, turn])
 
     def follow(carry, waypoint):
         place, rate = carry
         goal, fastest = waypoint
-        wanted = _shorten(1.6 * (goal - place), fastest)
-        rate = rate + PERIOD * jnp.clip(5.0 * (wanted - rate), -hardest, hardest)
+        wanted = _shorten(1.6 / scale.time * (goal - place), fastest)
+        rate = rate + PERIOD * jnp.clip(5.0 / scale.time * (wanted - rate), -hardest, hardest)
         place = place + PERIOD * rate
         return (place, rate), (place, rate)
 
     _, (place, rate) = jax.lax.scan(follow, (target[0], jnp.zeros(4)), (target, limit))
-    return Plan(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps))
+    return Plan(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
 
 
 def _shorten(velocity: Float[Array, "4"], fastest: Float[Array, "3"]) -> Float[Array, "4"]:
@@ -94,38 +135,48 @@ def _shorten(velocity: Float[Array, "4"], fastest: Float[Array, "3"]) -> Float[A
     return jnp.concatenate([plane, jnp.clip(velocity[2:], -fastest[1:], fastest[1:])])
 
 
-def _draw_waypoints(key: PRNGKeyArray, steps: int) -> tuple[Float[Array, "t 4"], Float[Array, "t 3"]]:
-    """Waypoint (x, y, z, heading) and limits (cruise, climb, turn) in force at each decision."""
-    count = int(steps * PERIOD / HOLD[0]) + 2
-    # One draw for all: each call of a random function costs a third of a second to compile.
+def _draw_waypoints(key: PRNGKeyArray, steps: int, scale: Scale) -> tuple[Float[Array, "t 4"], Float[Array, "t 3"]]:
+    """Waypoint (x, y, z, heading) and limits (cruise, climb, turn) at each decision."""
+    count = int(steps * PERIOD / (HOLD[0] * scale.time)) + 2
+    # One draw for all, because each call of a random function takes a third of a second to compile.
     draw = jax.random.uniform(key, (9, count))
-    altitude = jnp.where(draw[2] < LOW_SHARE, _between(LOW, draw[3]), _between(HIGH, draw[3]))
-    place = [ARENA * (2 * draw[0] - 1), ARENA * (2 * draw[1] - 1), altitude, HEADING * (2 * draw[4] - 1)]
-    limit = [_between(CRUISE, draw[5]), _between(CLIMB, draw[6]), _between(TURN, draw[7])]
-    departure = jnp.cumsum(_between(HOLD, draw[8]))
+    low, high = (_between(bounds, draw[3], scale.length) for bounds in (LOW, HIGH))
+    altitude = jnp.where(draw[2] < LOW_SHARE, low, high)
+    arena = ARENA * scale.length
+    place = [arena * (2 * draw[0] - 1), arena * (2 * draw[1] - 1), altitude, HEADING * (2 * draw[4] - 1)]
+    limit = [
+        _between(CRUISE, draw[5], scale.speed),
+        _between(CLIMB, draw[6], scale.speed),
+        _between(TURN, draw[7], 1 / scale.time),
+    ]
+    departure = jnp.cumsum(_between(HOLD, draw[8], scale.time))
     current = jnp.searchsorted(departure, PERIOD * jnp.arange(steps))
     return jnp.stack(place, axis=1)[current], jnp.stack(limit, axis=1)[current]
 
 
-def _between(bounds: tuple[float, float], share: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    return bounds[0] + (bounds[1] - bounds[0]) * share
+def _between(bounds: tuple[float, float], share: Float[Array, "*n"], scale: float) -> Float[Array, "*n"]:
+    return bounds[0] * scale + (bounds[1] - bounds[0]) * scale * share
 
 
-def _draw_dither(key: PRNGKeyArray, steps: int) -> Float[Array, "t 4"]:
+def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t 4"]:
     share_of_band, share_of_turn = jax.random.uniform(key, (2, TONES, 4))
-    frequency, phase = _between(BAND, share_of_band), 2 * jnp.pi * share_of_turn
+    frequency, phase = _between(BAND, share_of_band, 1 / scale.time), 2 * jnp.pi * share_of_turn
     time = PERIOD * jnp.arange(steps)[:, None, None]
-    return jnp.sqrt(2 / TONES) * jnp.array(DITHER) * jnp.sin(2 * jnp.pi * frequency * time + phase).sum(axis=1)
+    rms = np.array(DITHER) * np.array([*[1 / scale.time**2] * 3, scale.acceleration])
+    return jnp.sqrt(2 / TONES) * jnp.array(rms) * jnp.sin(2 * jnp.pi * frequency * time + phase).sum(axis=1)
 
 
-def act(memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: float) -> tuple[Memory, Input]:
-    """One decision: rotor speeds [rad/s] in [0, max_speed] for the plan's entry of now."""
-    error = _retreat(plan.position, x[POSITION]) - x[POSITION]
-    integral = jnp.clip(memory.integral + PERIOD * INTEGRAL_GAIN * error, -INTEGRAL_LIMIT, INTEGRAL_LIMIT)
-    wanted = POSITION_GAIN * error + VELOCITY_GAIN * (plan.velocity - x[VELOCITY]) + integral
-    climbing = _flare(wanted[2], x[POSITION][2], x[VELOCITY][2])
-    lift = _limit_tilt(wanted.at[2].set(climbing + nominal.gravity), x[POSITION][2], nominal.gravity)
-    spin_up = _angular_acceleration(x, lift, plan.heading) + plan.dither[:3]
+def act(
+    memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
+) -> tuple[Memory, Input]:
+    """One decision: rotor speeds [rad/s] in [0, max_speed] for the current entry of the plan."""
+    error = _retreat(plan.position, x[POSITION], scale) - x[POSITION]
+    limit, time = INTEGRAL_LIMIT * scale.acceleration, scale.time
+    integral = jnp.clip(memory.integral + PERIOD * (INTEGRAL_GAIN / time**3) * error, -limit, limit)
+    wanted = POSITION_GAIN / time**2 * error + VELOCITY_GAIN / time * (plan.velocity - x[VELOCITY]) + integral
+    climbing = _flare(wanted[2], x[POSITION][2], x[VELOCITY][2], scale)
+    lift = _limit_tilt(wanted.at[2].set(climbing + nominal.gravity), x[POSITION][2], nominal.gravity, scale)
+    spin_up = _angular_acceleration(x, lift, plan.heading, scale) + plan.dither[:3]
     rates = x[BODY_RATES]
     torque = nominal.inertia * spin_up + jnp.cross(rates, nominal.inertia * rates)
     along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + plan.dither[3]
@@ -133,35 +184,39 @@ def act(memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: fl
     return Memory(integral), allocate(thrust, torque, nominal, max_speed)
 
 
-def _retreat(place: Float[Array, "3"], position: Float[Array, "3"]) -> Float[Array, "3"]:
-    """The place to go to [m, world]: higher up for a pilot whom wind has carried off while low, and so level."""
-    carried_off = jnp.linalg.norm(position[:2]) > ASTRAY
-    return place.at[2].set(jnp.where(carried_off, jnp.maximum(place[2], SAFE_ALTITUDE), place[2]))
+def _retreat(place: Float[Array, "3"], position: Float[Array, "3"], scale: Scale) -> Float[Array, "3"]:
+    """The reference position [m, world], raised to a safe altitude if wind has blown the vehicle far away."""
+    blown_away = jnp.linalg.norm(position[:2]) > ASTRAY * scale.length
+    return place.at[2].set(jnp.where(blown_away, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))
 
 
-def _flare(wanted: Float[Array, ""], altitude: Float[Array, ""], climb: Float[Array, ""]) -> Float[Array, ""]:
-    """At least the vertical acceleration [m/s²] that ends the descent in time, once that is no longer gentle."""
+def _flare(wanted: Float[Array, ""], altitude: Float[Array, ""], climb: Float[Array, ""], scale: Scale):
+    """At least the vertical acceleration [m/s²] that stops the descent above ground, once that exceeds GENTLE."""
     sink = jnp.minimum(climb, 0.0)
-    needed = sink**2 / (2 * jnp.maximum(altitude - CLEARANCE, 0.03))
-    return jnp.where(needed > GENTLE, jnp.maximum(wanted, needed), wanted)
+    needed = sink**2 / (2 * jnp.maximum(altitude - CLEARANCE * scale.length, 0.03 * scale.length))
+    return jnp.where(needed > GENTLE * scale.acceleration, jnp.maximum(wanted, needed), wanted)
 
 
-def _limit_tilt(lift: Float[Array, "3"], altitude: Float[Array, ""], gravity: Float[Array, ""]) -> Float[Array, "3"]:
-    """Bound the asked acceleration [m/s², world] to tilts that a careful pilot dares this low, and to upward thrust."""
+def _limit_tilt(
+    lift: Float[Array, "3"], altitude: Float[Array, ""], gravity: Float[Array, ""], scale: Scale
+) -> Float[Array, "3"]:
+    """Limit the commanded acceleration [m/s², world] to upward thrust and to tilts that keep rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
-    lowest = jnp.arcsin(jnp.clip(DIP * altitude / ARM, 0.05, 1.0))
+    lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
     sideways = jnp.linalg.norm(lift[:2]) + 1e-9
-    scale = jnp.minimum(1.0, up * jnp.tan(jnp.minimum(lowest, MAX_TILT)) / sideways)
-    return jnp.concatenate([lift[:2] * scale, up[None]])
+    factor = jnp.minimum(1.0, up * jnp.tan(jnp.minimum(lowest, MAX_TILT)) / sideways)
+    return jnp.concatenate([lift[:2] * factor, up[None]])
 
 
-def _angular_acceleration(x: State, lift: Float[Array, "3"], heading: Float[Array, ""]) -> Float[Array, "3"]:
-    """Turn thrust towards lift and the nose towards heading [rad]: angular acceleration [rad/s², body]."""
+def _angular_acceleration(
+    x: State, lift: Float[Array, "3"], heading: Float[Array, ""], scale: Scale
+) -> Float[Array, "3"]:
+    """The angular acceleration [rad/s², body] that turns thrust towards lift and the nose towards heading [rad]."""
     yaw = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
     wanted = multiply(_shortest_turn(lift / jnp.linalg.norm(lift)), yaw)
     error = multiply(conjugate(x[QUATERNION]), wanted)
-    rates = jnp.array(ATTITUDE_GAIN) * 2 * jnp.sign(error[0]) * error[1:]
-    return jnp.array(RATE_GAIN) * (rates - x[BODY_RATES])
+    rates = jnp.array(np.array(ATTITUDE_GAIN) / scale.time) * 2 * jnp.sign(error[0]) * error[1:]
+    return jnp.array(np.array(RATE_GAIN) / scale.time) * (rates - x[BODY_RATES])
 
 
 def _shortest_turn(direction: Float[Array, "3"]) -> Float[Array, "4"]:
@@ -178,10 +233,10 @@ def allocate(thrust: Float[Array, ""], torque: Float[Array, "3"], nominal: Param
     return jnp.sqrt(jnp.clip(squared, 0.0, max_speed**2))
 
 
-def starting_state(key: PRNGKeyArray, plan: Plan) -> State:
+def starting_state(key: PRNGKeyArray, plan: Plan, scale: Scale) -> State:
     """Near the start of a plan, slightly tilted, drifting and turning."""
     draw = jax.random.normal(key, (3, 3))
     level = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), plan.heading[0])
     tilted = multiply(level, from_axis_angle(draw[0] / jnp.linalg.norm(draw[0]), jnp.asarray(0.05)))
-    velocity = 0.3 * draw[1].at[2].set(0.0)
-    return jnp.concatenate([plan.position[0], tilted, velocity, 0.3 * draw[2]])
+    velocity = 0.3 * scale.speed * draw[1].at[2].set(0.0)
+    return jnp.concatenate([plan.position[0], tilted, velocity, 0.3 / scale.time * draw[2]])

@@ -1,4 +1,4 @@
-"""The true vehicle: MuJoCo MJX gives the accelerations, a classical RK4 of our own integrates them.
+"""The dynamics of the true vehicle: accelerations by MuJoCo MJX, integrated by classical RK4.
 
 MJX freezes xfrc_applied within a step, which makes any of its integrators first order in drag. Here every RK4 stage
 recomputes the forces.
@@ -17,15 +17,15 @@ from hybrid_jax.sim.forces import Force, Parameters, Scalar
 from hybrid_jax.sim.model import bare_model, with_parameters
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
 
-CHUNK = 64  # flights integrated side by side: the widest that stays in one core's cache
+CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
 
 
 class Quadrotor(eqx.Module):
     """ẋ = f(x, u, t) of one vehicle under a tuple of forces.
 
     Attributes:
-        parameters: its numbers; array leaves, so that vmap runs over vehicles.
-        forces: functions of `hybrid_jax.sim.forces` or your own, added up.
+        parameters: array leaves, so that vmap can run over vehicles.
+        forces: summed; those of `hybrid_jax.sim.forces` or custom functions.
     """
 
     parameters: Parameters
@@ -56,8 +56,8 @@ class Quadrotor(eqx.Module):
         """The states at the end of each interval, from x0 at time t0 [s] with u[i] held over interval i.
 
         Raises:
-            ValueError: shapes that do not agree, or what is known before it is compiled: a number that is not finite,
-                dt that is not positive, x0 without a unit quaternion.
+            ValueError: shapes do not agree; or, outside of compiled code, a number is not finite, dt is not positive,
+                or x0 has no unit quaternion.
         """
         x0, u = self._checked(x0, u, dt, windows=())
 
@@ -71,7 +71,7 @@ class Quadrotor(eqx.Module):
     def rollouts(
         self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
     ) -> Float[Array, "n t 13"]:
-        """`rollout` of n flights, `chunk` of them side by side.
+        """`rollout` of n flights, in vectorised chunks.
 
         Raises:
             ValueError: as `rollout`.
@@ -81,7 +81,7 @@ class Quadrotor(eqx.Module):
         return jax.lax.map(lambda one: self.rollout(one[0], one[1], one[2], dt), (x0, u, t0), batch_size=chunk)
 
     def _checked(self, x0, u, dt, windows: tuple[int, ...]) -> tuple[Float[Array, "*n 13"], Float[Array, "*n t 4"]]:
-        """x0 and u as JAX arrays, of so many windows."""
+        """x0 and u as JAX arrays, with leading axes `windows`."""
         x0, u = checks.floating("x0", x0), checks.floating("u", u)
         if (
             x0.shape != (*windows, STATE_SIZE)

@@ -1,4 +1,4 @@
-"""Random flights cut into the windows that models learn from: splits of disjoint flights, and how they came about."""
+"""Datasets of random flights: windows in splits of disjoint flights, with statistics and configuration."""
 
 import zlib
 from collections.abc import Callable, Mapping
@@ -16,15 +16,16 @@ from hybrid_jax.sim.flight import DT, Flights, fly, gone_wrong
 from hybrid_jax.sim.quadrotor import CHUNK
 from hybrid_jax.sim.survey import survey
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
+from hybrid_jax.vehicle import IRIS, Vehicle
 
-RECIPE = 1  # raise it when the same configuration no longer gives the same flights
+RECIPE = 1  # increment when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
-SPARE = 2  # fly this many times the windows asked for, so that few of those kept are neighbours
+SPARE = 2  # fly this many times the requested windows, so that few of those kept are neighbours
 
 
 @dataclass(frozen=True)
 class SplitSpec:
-    """How many windows a split has, and of how many intervals of 0.01 s each."""
+    """The number of windows of a split, and of intervals of 0.01 s in each."""
 
     windows: int
     steps: int
@@ -36,8 +37,8 @@ class SplitSpec:
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
 
-# The paper's sets. The target's train split is the pool that nested subsets are the first N of; test_with_past holds
-# 10 steps of past for Expert Augmentation and the 10 to predict.
+# The paper's sets. Nested training subsets are the first N of the target's train split. test_with_past holds 10 past
+# steps for Expert Augmentation and 10 to predict.
 SOURCE_SPLITS = {"train": SplitSpec(10_000, 10), "validation": SplitSpec(1000, 10)}
 TARGET_SPLITS = {
     "train": SplitSpec(1000, 10),
@@ -49,7 +50,7 @@ TARGET_SPLITS = {
 
 @dataclass
 class Tally:
-    """What was flown for a split, flights that went wrong included, and which of its windows were sound."""
+    """Numbers of flights and windows made for a split, and of those rejected."""
 
     flights: int = 0
     dropped_flights: int = 0
@@ -63,15 +64,18 @@ Progress = Callable[[float], None]
 def record(
     domain: Domain, splits: Mapping[str, SplitSpec], key: PRNGKeyArray, progress: Progress = lambda share: None
 ) -> tuple[dict[str, Trajectories], dict[str, Tally]]:
-    """Fly until every split has its windows, each split from flights of its own: windows (float32) and tally by split.
+    """Simulate flights until every split has its windows. Splits share no flights.
 
     A split depends on the domain's name, its own name and size and the key, not on the other splits.
 
     Args:
-        progress: called with the share of the windows that is done, 0 … 1.
+        progress: called with the finished share of the work, 0 … 1.
+
+    Returns:
+        Windows (float32) and tallies by split.
 
     Raises:
-        ValueError: flights of this domain all go wrong.
+        ValueError: no flight of this domain stays in bounds.
     """
     windows, tallies = {}, {}
     total, done = sum(spec.windows * spec.steps for spec in splits.values()), 0
@@ -84,16 +88,16 @@ def record(
 
 
 def record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Trajectories, Tally]:
-    """Shuffled windows that touch but do not overlap, from as many flights as it takes.
+    """Shuffled, non-overlapping windows of as many flights as needed.
 
     Raises:
-        ValueError: flights of this domain all go wrong.
+        ValueError: no flight of this domain stays in bounds.
     """
     key_flights, key_order = jax.random.split(key)
     tally, parts = Tally(), []
     while tally.windows < SPARE * spec.windows:
         flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally.flights))
-        parts += cut(flights, spec.steps, tally)
+        parts += cut(flights, spec.steps, tally, domain.nominal)
         if not parts:
             raise ValueError(f"domain {domain.name}: none of {tally.flights} flights stayed in bounds")
     windows = concatenate(parts)
@@ -101,13 +105,13 @@ def record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Tr
     return windows[order], tally
 
 
-def cut(flights: Flights, steps: int, tally: Tally) -> list[Trajectories]:
-    """The sound windows of the sound flights, float32; counts in the tally what was flown and left out."""
+def cut(flights: Flights, steps: int, tally: Tally, vehicle: Vehicle = IRIS) -> list[Trajectories]:
+    """The valid windows of the valid flights (float32). Counts flights and windows in the tally."""
     parts = []
-    wrong = gone_wrong(flights.states)
+    wrong = gone_wrong(flights.states, vehicle)
     for states, inputs, lowest in zip(*(leaf[~wrong] for leaf in flights[:3]), strict=True):
         windows = windows_of(states.astype(np.float32), inputs.astype(np.float32), DT, steps=steps)
-        # A tilted rotor below ground is no flight that ground effect describes.
+        # With a rotor below ground, the model of ground effect does not apply.
         reach = steps * np.arange(len(windows))[:, None] + np.arange(steps + 1)
         sound = (lowest[reach] >= 0).all(axis=1)
         parts.append(windows[sound])
@@ -119,7 +123,7 @@ def cut(flights: Flights, steps: int, tally: Tally) -> list[Trajectories]:
 
 
 def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> dict[str, Any]:
-    """All that fixes the windows, as JSON would hold it."""
+    """Everything that determines the windows, as JSON values."""
     return domain.describe() | {
         "recipe": RECIPE,
         "splits": {name: asdict(spec) for name, spec in splits.items()},
@@ -132,10 +136,10 @@ def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) ->
 def make_dataset(
     domain: Domain, splits: Mapping[str, SplitSpec], seed: int, progress: Progress = lambda share: None
 ) -> Dataset:
-    """Record a domain and write down how: configuration, versions, what was left out, statistics of the windows.
+    """Record a dataset, with configuration, versions, tallies and statistics as metadata.
 
     Raises:
-        ValueError: a negative seed, or a domain whose flights all go wrong.
+        ValueError: seed is negative, or no flight of this domain stays in bounds.
     """
     checks.count("seed", seed, least=0)
     windows, tallies = record(domain, splits, jax.random.key(seed), progress)

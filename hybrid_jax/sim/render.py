@@ -1,7 +1,7 @@
-"""Pictures of the vehicle. `python -m hybrid_jax.sim.render FILE.png` draws it (Fig. 6) with MuJoCo's own renderer.
+"""Render the vehicle with MuJoCo (Fig. 6): `python -m hybrid_jax.sim.render FILE.png`.
 
-MuJoCo chooses its OpenGL when it is first imported, so `picture` and `frames` draw in a process of its own and try one
-way after the other.
+MuJoCo chooses its OpenGL backend when it is first imported, so `picture` and `frames` render in a separate process and
+try one backend after the other.
 """
 
 # MuJoCo's compiled modules carry no type stubs.
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Float, UInt8
 
 WIDTH, HEIGHT = 1600, 1200  # pixels
-WAYS = ("egl", "osmesa")
+BACKENDS = ("egl", "osmesa")
 ALTITUDE = 0.30  # m
 FRAME_WIDTH, FRAME_HEIGHT = 320, 240
 FRAMES = "--frames"
@@ -28,7 +28,7 @@ def picture(path: str | Path) -> None:
     """Write the rendered vehicle as a PNG of 1600 × 1200 pixels.
 
     Raises:
-        ValueError: the name does not end in .png, or this machine cannot draw without a screen; says what to install.
+        ValueError: the name does not end in .png, or no off-screen backend works; says what to install.
     """
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: a picture's name must end in .png")
@@ -36,10 +36,14 @@ def picture(path: str | Path) -> None:
 
 
 def frames(poses: Float[np.ndarray, "n 7"], place: Float[np.ndarray, "3"]) -> UInt8[np.ndarray, "n h w 3"]:
-    """The vehicle in these poses, position [m] and quaternion, seen from ahead, and a red mark at a place [m].
+    """Images of the vehicle in the given poses, seen from ahead, with a red mark.
+
+    Args:
+        poses: position [m] and quaternion (w, x, y, z), world frame.
+        place: of the mark [m, world].
 
     Raises:
-        ValueError: this machine cannot draw without a screen; says what to install.
+        ValueError: no off-screen backend works; says what to install.
     """
     with tempfile.TemporaryDirectory() as folder:
         asked, drawn = Path(folder) / "poses.npy", Path(folder) / "frames.npy"
@@ -49,21 +53,21 @@ def frames(poses: Float[np.ndarray, "n 7"], place: Float[np.ndarray, "3"]) -> UI
 
 
 def _drawn(arguments: list[str], what: str | Path) -> None:
-    """Run this module in a process of its own, in whichever way works."""
+    """Run this module in a separate process, with the first backend that works."""
     chosen = os.environ.get("MUJOCO_GL")
-    for way in (chosen,) if chosen else WAYS:
-        environment = {**os.environ, "MUJOCO_GL": way}
+    for backend in (chosen,) if chosen else BACKENDS:
+        environment = {**os.environ, "MUJOCO_GL": backend}
         command = [sys.executable, "-m", "hybrid_jax.sim.render", *arguments]
         if subprocess.run(command, env=environment, capture_output=True, check=False).returncode == 0:
             return
     raise ValueError(
-        f"{what}: no renderer without a screen works here: install the system package libosmesa6 or libegl1 "
-        "(set MUJOCO_GL to osmesa or egl to insist on one)"
+        f"{what}: no off-screen renderer works here: install the system package libosmesa6 or libegl1 "
+        "(set MUJOCO_GL to osmesa or egl to choose one)"
     )
 
 
 def draw(path: str | Path) -> None:
-    """Render in this process, with the OpenGL that MUJOCO_GL names."""
+    """Render in this process, with the backend in MUJOCO_GL."""
     import matplotlib.image
     import mujoco
 
@@ -80,7 +84,7 @@ def draw(path: str | Path) -> None:
 
 
 def draw_frames(asked: str | Path, drawn: str | Path) -> None:
-    """Render in this process the poses in a file of `frames`, into another file."""
+    """Render the poses in one file of `frames` into another, in this process."""
     import mujoco
 
     from hybrid_jax.sim.model import build_model
@@ -106,8 +110,7 @@ def draw_frames(asked: str | Path, drawn: str | Path) -> None:
 
 
 def main(arguments: list[str]) -> int:
-    """The command line: draw, here where MUJOCO_GL says how, otherwise in whichever way works. Exit code 2 and one line
-    if none does."""
+    """The command line. Renders in this process if MUJOCO_GL is set. Exit code 2 and one line if no backend works."""
     if len(arguments) == 3 and arguments[0] == FRAMES:
         draw_frames(*arguments[1:])
         return 0

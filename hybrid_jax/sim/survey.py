@@ -1,18 +1,18 @@
-"""What a set of recorded windows contains: speeds, tilts, altitudes, how much of it is in ground effect."""
+"""Statistics of recorded windows: speeds, tilts, altitudes and the share in ground effect."""
 
 import numpy as np
 
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
 
-# Centre altitude, averaged over the window [m]. The thrust gain there is 0.4 % and more, 2.6 % and more.
+# Mean altitude of the centre over a window [m]. Below, ground effect adds at least 0.4 % and 2.6 % of thrust.
 GROUND_EFFECT_BELOW = 0.5
 STRONG_GROUND_EFFECT_BELOW = 0.2
 PERCENTILES = (1, 50, 99)
 
 
 def survey(windows: Trajectories) -> dict[str, float]:
-    """Shares in [0, 1] and percentiles over all states of the windows, by name and unit."""
+    """Shares in [0, 1] and percentiles over all states, by name and unit."""
     x = np.asarray(windows.x)
     altitude = x[..., POSITION][..., 2]
     height = altitude.mean(axis=1)

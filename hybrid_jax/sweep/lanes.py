@@ -90,7 +90,7 @@ class LaneMap:
         self,
         function: Callable[..., PyTree],
         width: int | None = None,
-        devices: Sequence[jax.Device] | None = None,
+        devices: Sequence[Any] | None = None,
         min_capacity: int = 0,
         compiler: dict[str, bool | int] | None = None,
     ):

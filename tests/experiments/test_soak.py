@@ -45,7 +45,8 @@ def soak(sizes):
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
 def test_memory_is_flat_after_the_warm_up():
     """In a process of its own, two shapes in turn."""
-    code = "import sys; sys.path.insert(0, 'tests'); from test_soak import soak; print(*soak([10, 15]))"
+    paths = "import sys; sys.path[:0] = ['tests', 'tests/experiments']"
+    code = f"{paths}; from test_soak import soak; print(*soak([10, 15]))"
     root = Path(__file__).parents[2]
     run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)
     assert run.returncode == 0, run.stderr

@@ -77,6 +77,9 @@ FIELDS = {
 }
 
 
+SIZES = {"state_size": 13, "input_size": 4}
+
+
 def samples(count=3, seed=1):
     """States (n, 13) and inputs (n, 4)."""
     rng = np.random.default_rng(seed)

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import BODY, FIELDS, KEY, PER_ROTOR, double, samples
+from fields import BODY, FIELDS, KEY, PER_ROTOR, SIZES, double, samples
 
 from hybrid_jax import Hybrid, residual_network
 from hybrid_jax.export import casadi_function, casadi_step
@@ -28,7 +28,7 @@ def jacobian(function):
 @pytest.mark.parametrize("name", FIELDS)
 def test_it_has_the_values_and_the_derivatives_of_the_field(name):
     """The derivatives along a random direction: one wrong entry of the Jacobian shows in it."""
-    function = casadi_function(FIELDS[name])
+    function = casadi_function(FIELDS[name], **SIZES)
     slopes, (dx, du) = jacobian(function), (part[0] for part in samples(seed=2))
     with jax.enable_x64(True):
         field = double(FIELDS[name])
@@ -93,7 +93,7 @@ def everything(x, u):
 
 
 def test_a_field_of_one_s_own_may_use_what_casadi_has():
-    function = casadi_function(everything)
+    function = casadi_function(everything, **SIZES)
     with jax.enable_x64(True):
         for x, u in zip(*samples(), strict=True):
             expected = np.asarray(jax.jit(everything)(x, u))
@@ -117,7 +117,7 @@ def looped(x, u):
 )
 def test_an_operation_that_casadi_has_not_is_named(field, said):
     with pytest.raises(ValueError, match=rf"^field: its .*{said}.* has no counterpart in CasADi$"):
-        casadi_function(field)
+        casadi_function(field, **SIZES)
 
 
 def test_what_makes_no_sense_is_refused():
@@ -127,6 +127,8 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="name must be one"):
         casadi_function(BODY, name="1 f")
     with pytest.raises(ValueError, match="field: ResidualNetwork does not take"):
-        casadi_function(residual_network(2, 1, KEY))
+        casadi_function(residual_network(2, 1, KEY), **SIZES)
+    with pytest.raises(ValueError, match="state_size must be given: function does not know its size"):
+        casadi_function(solved)
     with pytest.raises(ValueError, match="state_size must be"):
         casadi_function(Hybrid(BODY, BODY), state_size=0)

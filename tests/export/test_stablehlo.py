@@ -5,7 +5,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import BODY, FIELDS, KEY, samples
+from fields import BODY, FIELDS, KEY, SIZES, samples
 
 from hybrid_jax import residual_network, rollout_batch, save
 from hybrid_jax.export import export_field, export_step, load_program
@@ -37,7 +37,7 @@ def close(found, expected):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_program_is_the_field(name, path):
-    export_field(path, FIELDS[name], about={"seed": 3})
+    export_field(path, FIELDS[name], **SIZES, about={"seed": 3})
     program = load_program(path)
     for x, u in zip(*samples(2), strict=True):
         close(program(x, u), FIELDS[name](jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)))
@@ -107,6 +107,7 @@ def test_shapes_that_are_no_batch_are_refused(shapes, path):
     [
         ({"state_size": 2}, "field: RigidBody does not take"),
         ({"state_size": 0}, "state_size must be"),
+        ({"input_size": 1.5}, "input_size must be"),
         ({"platforms": ("abacus",)}, "platforms must be a tuple of some of cpu"),
         ({"platforms": ()}, "platforms must be"),
         ({"about": {"a": np.ones(2)}}, "must be JSON"),
@@ -123,8 +124,12 @@ def solved(x, u):
     return jnp.linalg.solve(jnp.eye(13) + jnp.outer(x, x), x)
 
 
+def test_sizes_are_given_or_known_by_the_field(path):
+    assert "input_size must be given" in refusal(path, lambda path: export_field(path, solved, state_size=13))
+
+
 def test_a_program_that_calls_a_library_is_not_written(path):
-    assert "calls lapack" in refusal(path, lambda path: export_field(path, solved))
+    assert "calls lapack" in refusal(path, lambda path: export_field(path, solved, **SIZES))
 
 
 def forged(path, function, *shapes, **metadata):

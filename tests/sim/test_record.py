@@ -7,10 +7,10 @@ import pytest
 from experiments import make_flights
 from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import record as recording
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import Flights, fly, gone_wrong
 from hybrid_jax.sim.record import SplitSpec, Tally, cut, make_dataset, record
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 
 def specs(dataset):
@@ -37,6 +37,22 @@ def test_same_seed_same_bytes_other_seed_other_bytes(source):
     other = make_dataset(SOURCE, specs(source), seed=4)
     assert content_hash(again) == content_hash(source)
     assert not np.isin(other.splits["train"].x0[:, 0], source.splits["train"].x0[:, 0]).any()
+
+
+# A Crazyflie-like vehicle: a 55th of the mass of the Iris, a fifth of its size.
+SMALL = Vehicle(
+    mass=0.027, inertia=(1.66e-5, 1.66e-5, 2.93e-5), thrust_coefficient=2.88e-8, torque_coefficient=1.8e-10,
+    rotor_positions=((0.033, -0.033), (-0.033, 0.033), (0.033, 0.033), (-0.033, -0.033)), spin=(-1.0, -1.0, 1.0, 1.0),
+    rotor_radius=0.023, max_rotor_speed=2400.0,
+)  # fmt: skip
+
+
+def test_a_small_vehicle_flies_as_well_as_the_iris():
+    flights = fly(Domain("small", SMALL), 16, 11.0, jax.random.key(0))
+    assert not gone_wrong(flights.states, SMALL).any()
+    assert not (flights.lowest_rotor < 0).any()
+    speed = np.linalg.norm(flights.states[..., 7:10], axis=-1)
+    assert 1.5 < np.percentile(speed, 99) < 4  # that of the Iris, times the root of the scale
 
 
 def test_a_split_does_not_depend_on_the_others(source):

@@ -240,7 +240,7 @@ def test_bad_data_are_refused_by_name():
 
 DEVICES = """
 import sys
-sys.path.insert(0, "tests")
+sys.path[:0] = ["tests", "tests/sweep"]
 import jax
 jax.config.update("jax_num_cpu_devices", int(sys.argv[1]))
 import numpy as np
