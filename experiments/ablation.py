@@ -1,9 +1,8 @@
-"""What the method rests on: one choice at a time is changed, everything else stays, ten seeds each.
+"""Ablations of the hybrid method: one choice at a time is changed, ten seeds each.
 
 python -m experiments.ablation --help
 """
 
-import json
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
@@ -11,20 +10,21 @@ import numpy as np
 from rich.console import Console
 
 from experiments.external_force import sine_floor
-from experiments.paper.ablations import Trial, by_choice, figure, records, tables, to_csv
+from experiments.paper import figures
 from experiments.paper.conditions import settings
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
-from experiments.paper.figures import save_figure
-from experiments.paper.results import Lanes, rows_of, trained
-from experiments.paper.rows import Row, with_rho
+from experiments.paper.lanes import Lanes, rows_of, trained, with_rho
 from experiments.paper.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
-from experiments.reporting.report import print_tables
-from experiments.reporting.report_page import sections
+from experiments.paper.tables import ablation_tables
+from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY
+from experiments.reporting.plots import save_figures
+from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results
+from experiments.reporting.tables import print_tables
 from experiments.runner import command
 from experiments.runner.environment import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
-from hybrid_jax.io.files import json_text, json_value, write_atomic
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sweep import hosts
@@ -37,15 +37,14 @@ NAME = "ablation"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 HEAD = """# ablation
 
-One choice of the hybrid method is changed at a time, everything else stays at its default. Each value is pre-trained on
+One choice of the hybrid method is changed at a time; everything else keeps its default. Each value is pre-trained on
 source flight and fine-tuned on N trajectories of each target: other moments of inertia (parameter shift), and a side
 wind (external force).
 
 L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖²: on the source's validation windows of 0.1 s after pre-training, and on test flights of
-1 s in the target, before (source-only) and after fine-tuning. Test flights are the truth, whatever the sensors' noise.
-"""
+1 s in the target, before (source-only) and after fine-tuning. Test flights have no sensor noise."""
 NOTES = [
-    "Seconds are those that the stages of a value took when they ran; one that several values share counts in each.",
+    "Seconds are those that the stages of a value took when they ran; a stage shared by several values counts in each.",
     "Off: mean of the recovered parameter over the true one, less 1.",
 ]
 Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
@@ -121,40 +120,38 @@ def varied(choice: str, config: Kind) -> dict[str, Kind]:
 
 
 def experiment(config: AblationConfig, console: Console) -> None:
-    """Run every value of every choice and write what came of it, after each choice."""
-    trials: list[Trial] = []
+    """Run every value of every choice; write the report after each choice."""
+    rows = Results()
     seconds: dict[str, float] = {}
-    # Made before the first one runs: a value that does not go with the other options is refused at once.
+    # All configurations are made first, so that a value that contradicts another option is refused before any run.
     changed = {choice: varied(choice, config) for choice in config.over}
     for choice, values in changed.items():
         for value, other in values.items():
             console.print(f"{choice}: {value}", style="bold", highlight=False)
             stages = stages_of(config, console)
-            trials.append(tried(choice, value, other, config, stages))
+            rows += run(other, stages).tagged(choice=choice, value=value, default=other == config)
             seconds[f"{choice}, {value}"] = sum(stages.seconds.values())
         if hosts.is_main_process():
-            write(config, trials, seconds)
+            write(config, rows, seconds)
     if hosts.is_main_process():
-        print_tables(Console(), tables(trials, truth()))
+        print_tables(Console(), ablation_tables(rows, truth()))
 
 
-def tried(choice: str, value: str, config: AblationConfig, default: AblationConfig, stages: Stages) -> Trial:
-    """The hybrid, pre-trained and fine-tuned under a changed configuration."""
-    source = flown(SOURCE, source_splits(config), config, stages)
-    shared = settings(config)
-    learned = pretrained("hybrid", IRIS, config, stages, source)
-    rows: list[Row] = []
+def run(config: AblationConfig, stages: Stages) -> Results:
+    """The rows of the hybrid, pre-trained and fine-tuned in a configuration."""
+    learned = pretrained(HYBRID, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages))
+    rows = Results()
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        final = adapted("hybrid", "fine_tuned", learned.best, config, stages, target)
+        final = adapted(HYBRID, FINE_TUNED, learned.best, config, stages, target)
 
-        def lanes(mode: str, sizes, found: FitState, target=target) -> Lanes:
-            errors = evaluate(found.best, target.splits["test"], EVERY, shared)
-            return trained("hybrid", mode, *places(sizes, config), found, errors)
+        def tested(mode: str, sizes: tuple[int, ...], found: FitState, test=target.splits["test"]) -> Lanes:
+            errors = evaluate(found.best, test, EVERY, settings(config))
+            return trained(HYBRID, mode, *places(sizes, config), found, errors)
 
-        both = (lanes("source_only", (0,), learned), lanes("fine_tuned", config.sizes, final))
-        rows += with_rho([row for group in both for row in rows_of(group, domain.name)])
-    return Trial(choice, value, config == default, [float(mse) for mse in learned.best_mse], rows)
+        both = [tested(SOURCE_ONLY, (0,), learned), tested(FINE_TUNED, config.sizes, final)]
+        rows += with_rho(rows_of(both, domain.name))
+    return rows
 
 
 def truth() -> dict[str, dict[str, float]]:
@@ -162,38 +159,33 @@ def truth() -> dict[str, dict[str, float]]:
     return {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
 
 
-def write(config: AblationConfig, trials: list[Trial], seconds: dict[str, float]) -> None:
-    """All that is known so far: the figure of each choice, report.json, rows.csv, report.md."""
+def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> None:
+    """Write the figure of each choice and the report of all rows so far."""
     out = config.out / NAME
     floors = {EXTERNAL_FORCE.name: sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))}
-    for choice, group in by_choice(trials).items():
-        title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
-        save_figure(figure(group, title, floors), out / choice)
-    for name, content in contents(config, trials, environment(seconds)).items():
-        write_atomic(out / name, content)
-
-
-def contents(config: AblationConfig, trials: list[Trial], where: dict[str, Any]) -> dict[str, str]:
-    """The text of each file."""
-    used = json_value(config.described())
-    captions = {f"{choice}.png": f"Test errors of all seeds, by {choice}" for choice in by_choice(trials)}
-    record = {
-        "experiment": NAME,
-        "config": used,
-        "environment": where,
-        "rows": records(trials),
-        "claims": [],
-        "figures": captions,
-        "notes": NOTES,
+    drawn = {
+        choice: (
+            figures.ablation(group, f"{choice.capitalize()}: test error over 1 s after fine-tuning", floors),
+            f"Test errors of all seeds, by {choice}",
+        )
+        for choice, group in rows.group("choice").items()
     }
-    shown = json.dumps(used, indent=1, ensure_ascii=False)
-    page = sections(HEAD.strip(), tables(trials, truth()), captions, NOTES, json_value(where), shown)
-    return {"rows.csv": to_csv(trials), "report.md": page, "report.json": json_text(json_value(record))}
+    report = Report(
+        experiment=NAME,
+        config=config.described(),
+        environment=environment(seconds),
+        rows=rows,
+        figures=save_figures(out, drawn),
+        notes=NOTES,
+        head=HEAD,
+        tables=ablation_tables(rows, truth()),
+    )
+    write_report(out, report)
 
 
 def main() -> None:
     """The command line."""
-    about = "What matters, what does not, and where the method breaks."
+    about = "Which choices of the method matter, and where it breaks."
     command.run(NAME, about, experiment, presets=PRESETS)
 
 

@@ -1,43 +1,33 @@
-"""Table 2 and more (paper, Sec. 4.7): every method adapts the same source model, in both experiments.
+"""Table 2 and more baselines (paper, Sec. 4.7): every method adapts the same source model, in both experiments.
 
 python -m experiments.comparison --help
 """
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
 import numpy as np
 from rich.console import Console
 
 from experiments.coverage import Config as CoverageConfig
-from experiments.coverage import CoverageRow, coverage
+from experiments.coverage import coverage
 from experiments.external_force import sine_floor
-from experiments.paper.claims import COMPARISON, claims
-from experiments.paper.comparison_figures import standings
+from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
-from experiments.paper.config import (
-    FROM_ZERO,
-    QUICK,
-    SMOKE,
-    Config,
-    Encoding,
-    Stopping,
-    check_numbers,
-    distinct,
-    factors,
-    preset_like,
-)
-from experiments.paper.figures import save_figure
+from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
+from experiments.paper.figures import ranking
+from experiments.paper.lanes import Lanes, rows_of, save_models, source_of, with_rho
 from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
-from experiments.paper.results import Lanes, rows_of, save_models
-from experiments.paper.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
-from experiments.reporting.report import FLOOR, Report, print_report, write_report
+from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER, NO_PHYSICS
+from experiments.reporting.plots import save_figures
+from experiments.reporting.report import write_report
+from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.environment import environment
+from experiments.runner.options import Count, distinct, factors
 from experiments.runner.stages import Stages, stages_of
-from hybrid_jax import checks
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
@@ -51,16 +41,9 @@ from hybrid_jax.vehicle import IRIS
 
 NAME, TITLE = COMPARISON, "Adapting with 100 trajectories, tested over 0.1 s"
 GIVEN_NETWORK = (
-    "An interval of θ_p takes the network as given: where both were trained, the spread over seeds shows how far they "
-    "can trade with each other, which the interval does not."
+    "An interval of θ_p treats the network as fixed: where both were trained, only the spread over seeds shows how far "
+    "one can compensate for the other."
 )
-ENCODING_RULES = {
-    "hidden": checks.count,
-    "rate": checks.not_negative,
-    "weight": checks.not_negative,
-    "stopping": FROM_ZERO,
-    "max_epochs": checks.count,
-}
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 
 
@@ -75,20 +58,18 @@ class ComparisonConfig(Config):
     methods: tuple[Method, ...] = get_args(Method)
     """Which methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)
-    repeats: int = 100
+    repeats: Count = 100
     """Recordings of the simulation that checks the intervals of θ_p; see `python -m experiments.coverage`."""
 
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--methods", self.methods)
-        checks.count("--repeats", self.repeats)
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)
-        check_numbers("--encoding.", self.encoding, ENCODING_RULES)
-        if "no_physics" in self.methods and self.residual_outputs != "all":
+        if NO_PHYSICS in self.methods and self.residual_outputs != "all":
             raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
-        if "last_layer" in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
+        if LAST_LAYER in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
             raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")
 
 
@@ -100,14 +81,14 @@ PRESETS = {
 
 
 def experiment(config: ComparisonConfig, console: Console) -> None:
-    """Run all methods in both domains and write what came of it."""
+    """Run all methods in both domains and write the report."""
     stages = stages_of(config, console)
     learned, experts = source_models(config, stages)
-    out, rows, datasets = config.out / NAME, list[Row](), dict[str, Any]()
+    out, rows, datasets = config.out / NAME, Results(), dict[str, Any]()
     for domain in DOMAINS:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
         lanes = compared(Case(config, stages, learned, experts, target), config.methods)
-        found = with_rho([row for group in lanes for row in rows_of(group, domain.name)])
+        found = with_rho(rows_of(lanes, domain.name))
         if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)
         rows, datasets = rows + found, datasets | {domain.name: target.metadata}
@@ -122,16 +103,16 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, FitState], FitState | None]:
     """What is pre-trained on the source: a model for each method that starts from one, and the experts."""
     source = flown(SOURCE, source_splits(config), config, stages)
-    models = dict.fromkeys(["hybrid", *(SOURCE_OF.get(method, method) for method in config.methods)])
+    models = dict.fromkeys([HYBRID, *map(source_of, config.methods)])
     learned = {model: pretrained(model, IRIS, config, stages, source) for model in models}
-    if "expert_augmentation" not in config.methods:
+    if EXPERT_AUGMENTATION not in config.methods:
         return learned, None
     with_past = past_splits(train=config.source_train, validation=config.validation)
     longer = flown(SOURCE, with_past, config, stages)
     renamed = Dataset({name.removesuffix("_with_past"): longer.splits[name] for name in with_past}, longer.metadata)
     past, _ = split(renamed.splits["train"], PAST)
     learning = replace(settings(config), objective=Augmentation(PAST))
-    lanes = augmentation(learned["hybrid"].best, past, config.encoding, config)
+    lanes = augmentation(learned[HYBRID].best, past, config.encoding, config)
     return learned, stages.run("expert augmentation", *lanes, learning, renamed)
 
 
@@ -145,38 +126,26 @@ def compared(case: Case, methods: Sequence[Method]) -> list[Lanes]:
     return [source_only(model)(case) for model in case.pretrained] + [METHODS[name](case, name) for name in methods]
 
 
-def write(
-    config: ComparisonConfig, rows: list[Row], stages: Stages, flights: dict[str, Any], covered: list[CoverageRow]
-) -> None:
-    """The figure, the report and, in the terminal, its tables."""
-    out = config.out / NAME
-    seen = DT * np.arange(1, PAST + 1)
-    floor = sine_floor(IRIS.mass, seen)
-    save_figure(standings(rows, TITLE, {EXTERNAL_FORCE.name: floor}), out / "standings")
-    report = Report(
-        experiment=NAME,
-        config=config.described(),
-        environment=environment(stages.seconds),
-        rows=rows,
-        claims=claims(rows, NAME, None),
-        truth_theta={domain.name: nominal(domain.vehicle) for domain in DOMAINS},
-        figures={"standings.png": "Test errors of all seeds of every method (paper, Table 2)"},
-        notes=[*stages.notes(), GIVEN_NETWORK, *coverage_notes(covered)],
-        extra={"flights": flights, "coverage": [asdict(row) for row in covered], FLOOR: floor},
-    )
-    write_report(out, report)
-    print_report(Console(), report)
+def write(config: ComparisonConfig, rows: Results, stages: Stages, flights: dict[str, Any], covered: Results) -> None:
+    """Write the figure and the report; print its tables."""
+    out, truth = config.out / NAME, {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
+    floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
+    drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
+    figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
+    notes = [*stages.notes(), GIVEN_NETWORK, *coverage_notes(covered)]
+    extra = {"flights": flights, "coverage": covered.rows}
+    report = paper_report(NAME, config, stages.seconds, rows, truth, figures, notes, floor, extra)
+    write_report(out, report, Console())
 
 
-def coverage_notes(covered: Sequence[CoverageRow]) -> list[str]:
-    """How often the 95 % intervals of θ_p held the truth in simulation."""
-    by_case: dict[tuple[str, str], list[str]] = {}
-    for row in covered:
-        by_case.setdefault((row.case, row.noise_on), []).append(f"{row.parameter} {row.coverage:.0%}")
-    return [
-        f"95 % intervals of θ_p held the truth, {case}, noise on {where}: {', '.join(words)}."
-        for (case, where), words in by_case.items()
-    ]
+def coverage_notes(covered: Results) -> list[str]:
+    """How often the 95 % intervals of θ_p contained the truth in simulation."""
+
+    def shares(rows: Results) -> str:
+        return ", ".join(f"{row['parameter']} {row['coverage']:.0%}" for row in rows)
+
+    groups = covered.group("case", "noise_on").items()
+    return [f"95 % intervals of θ_p contained the truth, {c}, noise on {n}: {shares(rows)}." for (c, n), rows in groups]
 
 
 def main() -> None:

@@ -1,29 +1,28 @@
-"""Are the intervals of θ_p honest? Repeated flights of known truth, and how often the truth is inside.
+"""Coverage of the intervals of θ_p: how often they contain the truth, over repeated flights of a known vehicle.
 
 python -m experiments.coverage --help
 """
 
 import itertools
-import math
-import sys
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
-from rich.table import Table
 
 from experiments.paper.sensors import Noise, measure
-from experiments.runner.command import BAD_INPUT, INTERRUPTED, check_folder
+from experiments.reporting.results import Results
+from experiments.reporting.tables import Table, print_tables, tabulate
+from experiments.runner import command
+from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
 from experiments.runner.progress import PartLine
-from hybrid_jax import checks, rotation
+from hybrid_jax import rotation
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -45,13 +44,13 @@ NoiseOn = Literal["targets", "all"]
 class Flight:
     """How the windows are flown: a vehicle near hover that leans into its velocity; standard deviations."""
 
-    speed: float = 2.0
+    speed: NotNegative = 2.0
     """[m/s], along each axis, a third of it vertically."""
-    tilt: float = 0.1
+    tilt: NotNegative = 0.1
     """[rad], about each axis, beside the lean that balances the drag in steady flight."""
-    body_rates: float = 1.0
+    body_rates: NotNegative = 1.0
     """[rad/s], along each axis."""
-    rotor_speed: float = 40.0
+    rotor_speed: NotNegative = 40.0
     """[rad/s], of each rotor about hover, drawn anew in each interval."""
 
 
@@ -63,11 +62,11 @@ class Config:
     whether the intervals are honest, the second how far they mislead when the physics is wrong.
     """
 
-    repeats: int = 100
+    repeats: Count = 100
     """Independent recordings, each with its own fit."""
     n_train: int = 100
     """Windows in a recording."""
-    steps: int = 10
+    steps: Count = 10
     """Intervals of 0.01 s in a window."""
     level: float = 0.95
     """Of the intervals: what the coverage should be."""
@@ -78,39 +77,14 @@ class Config:
     """targets: the start of each window is known exactly, as the fit takes it to be. all: it is measured as well."""
     noise: Noise = field(default_factory=Noise)
     flight: Flight = Flight()
-    drag: float = 0.4
+    drag: NotNegative = 0.4
     """[kg/s] of the truth that the model does not know: v̇ −= drag v / m."""
-    seed: int = 0
+    seed: CountFromZero = 0
     """Everything random follows from it; the same flights and noise in every case."""
-    batch: int = 1
+    batch: Count = 1
     """Repeats that are computed side by side: one on a CPU, many on a GPU."""
     out: Path = Path("runs")
     """Folder for the results; a folder `coverage` is made in it."""
-
-
-@dataclass(frozen=True)
-class CoverageRow:
-    """One parameter in one case.
-
-    Attributes:
-        case: "exact physics" or "unknown drag".
-        noise_on: "targets" or "all".
-        parameter: of θ_p.
-        coverage: share of the repeats whose interval contains the truth.
-        standard_error: of the coverage, binomial.
-        bias: mean of θ̂ − θ [% of θ].
-        half_width: mean of half the interval's length [% of θ].
-        converged: share of the repeats whose fit converged; the others count as misses.
-    """
-
-    case: str
-    noise_on: str
-    parameter: str
-    coverage: float
-    standard_error: float
-    bias: float
-    half_width: float
-    converged: float
 
 
 class Dragged(AbstractVectorField):
@@ -132,8 +106,8 @@ class Repeat(NamedTuple):
     converged: Bool[Array, ""]
 
 
-def coverage(config: Config, console: Console) -> list[CoverageRow]:
-    """The rows of every case: exact physics and unknown drag, with noise on what was asked for.
+def coverage(config: Config, console: Console) -> Results:
+    """The rows of every case: exact physics and unknown drag, with noise on what was asked for; see `_rows`.
 
     Args:
         console: where progress is drawn.
@@ -154,7 +128,8 @@ def coverage(config: Config, console: Console) -> list[CoverageRow]:
 
         found = [[one(*case, keys) for keys in parts] for case in cases]
     whole = (jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *each) for each in found)
-    return [row for case, repeats in zip(cases, whole, strict=True) for row in _rows(*case, repeats)]
+    rows = [row for case, repeats in zip(cases, whole, strict=True) for row in _rows(*case, repeats)]
+    return Results(rows, ("case", "noise_on", "parameter"))
 
 
 def check(config: Config) -> None:
@@ -165,22 +140,11 @@ def check(config: Config) -> None:
     """
     if config.n_train <= len(LEARNED):
         raise ValueError(f"--n-train must be more than the {len(LEARNED)} parameters, got {config.n_train}")
-    for name in ("repeats", "steps", "batch"):
-        if getattr(config, name) < 1:
-            raise ValueError(f"--{name} must be at least 1, got {getattr(config, name)}")
-    checks.count("--seed", config.seed, 0)
     if not 0 < config.level < 1:
         raise ValueError(f"--level must be between 0 and 1, got {config.level}")
     if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
         raise ValueError(f"--noise-on must be targets, all or both, got {' '.join(config.noise_on) or 'nothing'}")
-    sizes = {"drag": config.drag} | {
-        f"{group}.{name}": size
-        for group in ("noise", "flight")
-        for name, size in asdict(getattr(config, group)).items()
-    }
-    for name, size in sizes.items():
-        if not 0 <= size < math.inf:
-            raise ValueError(f"--{name.replace('_', '-')} must be a finite number of at least 0, got {size}")
+    check_numbers("--", config)
 
 
 def recording(
@@ -242,58 +206,48 @@ def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Arr
     return jax.lax.map(one, keys, batch_size=min(config.batch, len(keys)))
 
 
-def _rows(case: str, noise_on: str, repeats: Repeat) -> list[CoverageRow]:
+def _rows(case: str, noise_on: str, repeats: Repeat) -> list[dict[str, Any]]:
+    """A row for each parameter: shares; bias, half-width [% of the truth]. A repeat that did not converge is a miss."""
     share = repeats.inside.mean(axis=0)
-    spread = np.sqrt(share * (1 - share) / len(repeats.inside))
-    bias, half_width = (100 * column.mean(axis=0) for column in (repeats.error, repeats.half_width))
-    converged = float(repeats.converged.mean())
+    columns = {
+        "coverage": share,
+        "standard_error": np.sqrt(share * (1 - share) / len(repeats.inside)),
+        "bias": 100 * repeats.error.mean(axis=0),
+        "half_width": 100 * repeats.half_width.mean(axis=0),
+        "converged": np.full(len(LEARNED), repeats.converged.mean()),
+    }
     return [
-        CoverageRow(
-            case=case,
-            noise_on=noise_on,
-            parameter=name,
-            coverage=float(share[i]),
-            standard_error=float(spread[i]),
-            bias=float(bias[i]),
-            half_width=float(half_width[i]),
-            converged=converged,
-        )
-        for i, name in enumerate(LEARNED)
+        {"case": case, "noise_on": noise_on, "parameter": parameter}
+        | {name: float(column[i]) for name, column in columns.items()}
+        for i, parameter in enumerate(LEARNED)
     ]
 
 
-def table(rows: Sequence[CoverageRow], level: float) -> Table:
-    """The rows for a terminal."""
-    titles = ("truth", "noise on", "θ_p", "coverage [%]", "bias [%]", "half-width [%]", "converged [%]")
-    shown = Table(*titles, title=f"Does the {100 * level:g} % interval contain the truth?")
-    for row in rows:
-        numbers = (f"{row.bias:+.2f}", f"{row.half_width:.2f}", f"{100 * row.converged:.0f}")
-        share = f"{100 * row.coverage:.1f} ± {100 * row.standard_error:.1f}"
-        shown.add_row(row.case, row.noise_on, row.parameter, share, *numbers)
-    return shown
+def table(rows: Results, level: float) -> Table:
+    """The rows as text."""
+    groups = rows.group("case", "noise_on", "parameter")
+    columns = {
+        "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
+        "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",
+        "half-width [%]": lambda r: f"{r[0]['half_width']:.2f}",
+        "converged [%]": lambda r: f"{100 * r[0]['converged']:.0f}",
+    }
+    title = f"Does the {100 * level:g} % interval contain the truth?"
+    return tabulate(title, groups, columns, ("truth", "noise on", "θ_p"))
 
 
-def experiment(config: Config, console: Console) -> list[CoverageRow]:
+def experiment(config: Config) -> None:
     """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
     folder = config.out / NAME
-    check_folder("--out", folder)
+    command.check_folder("--out", folder)
     rows = coverage(config, Console(stderr=True))
-    write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": [asdict(row) for row in rows]}))
-    console.print(table(rows, config.level))
-    return rows
+    write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": rows.rows}))
+    print_tables(Console(), [table(rows, config.level)])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line. Bad input ends in one line on stderr and exit code 2, an interrupt in one and 130."""
-    try:
-        config = tyro.cli(Config, prog=f"python -m experiments.{NAME}", description=Config.__doc__, args=arguments)
-        experiment(config, Console())
-    except (ValueError, OSError) as error:
-        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        print(f"{NAME}: interrupted, nothing was written", file=sys.stderr)
-        sys.exit(INTERRUPTED)
+    """The command line."""
+    command.call(NAME, Config, experiment, arguments)
 
 
 if __name__ == "__main__":

@@ -1,9 +1,8 @@
-"""A trained model for programs that know nothing of this library: StableHLO in files, CasADi functions; docs/export.md.
+"""Export a trained model to StableHLO files and CasADi functions; see docs/export.md.
 
 python -m experiments.export --help
 """
 
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from experiments.runner.command import BAD_INPUT, check_folder
+from experiments.runner import command
 from hybrid_jax import Model, checks, load
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
@@ -32,30 +31,30 @@ class Config:
     out: Path = Path("runs/export")
     """Folder for the files."""
     dt: float | None = None
-    """Length of a step [s]; by default what the model says of the flights that it was trained on."""
+    """Length of a step [s]; by default that of the flights that the model was trained on."""
     batched: bool = False
-    """The programs take x (b, 13) and u (b, 4), for any b, in the place of x (13,) and u (4,)."""
+    """The programs take x (b, 13) and u (b, 4), for any b, instead of x (13,) and u (4,)."""
     platforms: tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...] = ("cpu",)
-    """Where the programs are to run."""
+    """Platforms to compile for."""
     casadi: bool = False
     """Write CasADi functions as well."""
     state_size: int = STATE_SIZE
-    """Numbers in x, of a model of something else than a multirotor."""
+    """Size of x, for a model of another system."""
     input_size: int = INPUT_SIZE
-    """Numbers in u, likewise."""
+    """Size of u, likewise."""
 
 
 def export(config: Config) -> list[Path]:
     """Write the files; their paths.
 
     Raises:
-        ValueError: no model, or one that cannot be exported; says why.
-        ImportError: what the extras `export` and `casadi` bring is not installed.
+        ValueError: no model, or a model that cannot be exported; says why.
+        ImportError: the extra `export` or `casadi` is not installed.
         OSError: the folder cannot be written.
     """
     model = load(config.model)
     dt = step_length(config, model)
-    check_folder("--out", config.out)
+    command.check_folder("--out", config.out)
     sizes: dict[str, Any] = {"state_size": config.state_size, "input_size": config.input_size}
     options = sizes | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
     written = [config.out / "field.npz", config.out / "step.npz"]
@@ -70,10 +69,10 @@ def export(config: Config) -> list[Path]:
 
 
 def step_length(config: Config, model: Model) -> float:
-    """What was asked for, or what the model says.
+    """--dt, or the step length saved with the model.
 
     Raises:
-        ValueError: neither is there, or no positive number.
+        ValueError: neither is given, or it is not a positive number.
     """
     dt = model.about.get("dt") if config.dt is None else config.dt
     if dt is None:
@@ -83,14 +82,8 @@ def step_length(config: Config, model: Model) -> float:
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line. Bad input ends in one line on stderr and exit code 2."""
-    config = tyro.cli(Config, prog=f"python -m experiments.{NAME}", description=Config.__doc__, args=arguments)
-    try:
-        for path in export(config):
-            print(path)
-    except (ValueError, OSError, ImportError) as error:
-        print(f"{NAME}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
+    """The command line."""
+    command.call(NAME, Config, lambda config: print(*export(config), sep="\n"), arguments)
 
 
 if __name__ == "__main__":

@@ -20,18 +20,18 @@ NAME, TITLE = "external_force", "External force"
 
 
 def experiment(config: AdaptationConfig, console: Console) -> None:
-    """Run the protocol in the wind and write what came of it, beside the error that the wind's sine alone makes."""
+    """Run the protocol in the wind and write the report, with the error that the wind's sine alone makes."""
     found = study(EXTERNAL_FORCE, IRIS, config, console)
     times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)
     floor = sine_floor(IRIS.mass, times)
     if hosts.is_main_process():
-        write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, Console(), floor)
+        write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, floor)
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:
-    """L_MSE at the times [s] of a model that is perfect but for the wind's sine, which ẋ = f(x, u) cannot see.
+    """L_MSE at the times [s] of a model that is exact but for the wind's sine, which ẋ = f(x, u) cannot see.
 
-    With a = (A / m) sin(ω t), unseen from a start of random phase on, the mean squares over the phase are
+    For an acceleration (A / m) sin(ω t) with a random phase at the start, the mean squares over the phase are
     (A / m)² (1 − cos ωs) / ω² in velocity and (A / m)² (s² / 2ω² + (1 − cos ωs) / ω⁴ − s sin ωs / ω³) in position.
     """
     w, s = WIND_ANGULAR_FREQUENCY, times
@@ -42,7 +42,7 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
 
 def main() -> None:
     """The command line."""
-    command.run(NAME, "A side wind that the model has never felt: adapt to it.", experiment, presets=PRESETS)
+    command.run(NAME, "A side wind that no source flight had: adapt to it.", experiment, presets=PRESETS)
 
 
 if __name__ == "__main__":

@@ -1,33 +1,28 @@
 """Record random flights of a true system as a dataset: python -m experiments.make_flights --help"""
 
-import sys
-from collections.abc import Callable, Mapping
-from contextlib import AbstractContextManager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-import tyro
 from rich.console import Console
-from rich.markup import escape
-from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
-from rich.table import Table
 
+from experiments.reporting.tables import Table, print_tables
+from experiments.runner import command
+from experiments.runner.progress import Line
 from hybrid_jax.io.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
 from hybrid_jax.sim.render import picture
 
-NOTES = Console(stderr=True)
-
 
 @dataclass(frozen=True)
 class Options:
-    """Fly a simulated quadrotor at random and save windows of the flights as one dataset file.
+    """Fly a simulated quadrotor along random paths and save windows of the flights as one dataset file.
 
-    The pilot wanders between waypoints at up to about 5 m/s, a quarter of the time less than 0.5 m above ground, and
-    shakes the vehicle so that its inertia shows. Every split comes from flights of its own. The same arguments give the
-    same file, byte for byte; a file that exists with other content is never overwritten.
+    The pilot flies between waypoints at up to about 5 m/s, a quarter of the time less than 0.5 m above ground, and
+    excites roll and pitch so that the inertia is identifiable. Every split comes from its own flights. The same
+    arguments give the same file, byte for byte; an existing file with other content is never overwritten.
 
     Example: python -m experiments.make_flights --domain source --out source.npz --train 10000 --validation 1000
     """
@@ -38,7 +33,7 @@ class Options:
     out: Path
     """File to write (.npz)."""
     seed: int = 0
-    """Everything random follows from it."""
+    """Seed of everything random."""
     train: int = 1000
     """Windows of 0.1 s (10 steps) to learn from; 0 leaves a split out."""
     validation: int = 1000
@@ -51,7 +46,7 @@ class Options:
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
 
     def splits(self) -> dict[str, SplitSpec]:
-        """The splits asked for.
+        """The requested splits.
 
         Raises:
             ValueError: none, or a negative size.
@@ -64,32 +59,33 @@ class Options:
 
 
 def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_dir: str | Path) -> Dataset:
-    """The dataset of a domain from the cache folder, flown and put there if it is not.
+    """The dataset of a domain, from the cache folder if it is there, else flown and saved there.
 
     Raises:
-        ValueError: a cached file is damaged; says which, so that it can be deleted.
+        ValueError: a cached file is damaged; the message names it, so that it can be deleted.
     """
     digest = config_hash(configuration(domain, splits, seed))
     return read_or_fly(Path(cache_dir) / f"flights-{domain.name}-{digest[:12]}.npz", domain, splits, seed)
 
 
 def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
-    """The dataset in a file, flown and written there if the file does not exist.
+    """The dataset in a file; it is flown and saved if the file does not exist.
 
     Raises:
         ValueError: the file is damaged or holds a dataset of another configuration.
     """
     if not path.exists():
-        with progress_bar(f"flying {domain.name}") as advance:
-            save_dataset(path, make_dataset(domain, splits, seed, advance))
+        with Line(f"flying {domain.name}", Console(stderr=True)) as line:
+            dataset = make_dataset(domain, splits, seed, lambda share: line.say(f"{share:.0%}"))
+        save_dataset(path, dataset)
     return load_dataset(path, configuration(domain, splits, seed))
 
 
 def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
-    """The windows asked for, the first of each split of a file that was made before.
+    """The first windows of each split of an existing file.
 
     Raises:
-        ValueError: the file is damaged, of another domain, or has fewer windows or others than asked for.
+        ValueError: the file is damaged, of another domain, or has fewer windows than asked for, or of other lengths.
     """
     whole = load_dataset(path)
     expected = domain.describe()
@@ -103,45 +99,32 @@ def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) 
     return Dataset(parts, whole.metadata, origin=str(path))
 
 
-class progress_bar(AbstractContextManager):
-    """A bar on stderr; entering gives the function to call with the share done, 0 … 1."""
-
-    def __init__(self, title: str):
-        columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        self._progress = Progress(*columns, console=NOTES, transient=True)
-        self._task = self._progress.add_task(title, total=1.0)
-
-    def __enter__(self) -> Callable[[float], None]:
-        self._progress.start()
-        return lambda share: self._progress.update(self._task, completed=share)
-
-    def __exit__(self, *exception) -> None:
-        self._progress.stop()
-
-
 def statistics_table(dataset: Dataset) -> Table:
-    """What was flown, left out and recorded, a column for each split."""
+    """Counts and statistics of the flights, a column for each split."""
     tallies, statistics = dataset.metadata["tallies"], dataset.metadata["statistics"]
-    table = Table("", *dataset.splits, title=f"{dataset.config['domain']}, seed {dataset.config['seed']}")
-    table.add_row("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))
-    for name in next(iter(tallies.values())):
-        table.add_row(name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
-    for name in next(iter(statistics.values())):
-        table.add_row(escape(name), *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
-    return table
+    lines = [("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))]
+    lines += [
+        (name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
+        for name in next(iter(tallies.values()))
+    ]
+    lines += [
+        (name, *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
+        for name in next(iter(statistics.values()))
+    ]
+    return Table(f"{dataset.config['domain']}, seed {dataset.config['seed']}", ("", *dataset.splits), lines)
+
+
+def make_flights(options: Options) -> None:
+    """Fly and save the dataset unless it exists; print its table."""
+    dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
+    if options.picture is not None:
+        picture(options.picture)
+    print_tables(Console(), [statistics_table(dataset)])
 
 
 def main() -> None:
-    """Read the command line, record what is not there yet, print the table."""
-    options = tyro.cli(Options, prog="python -m experiments.make_flights", description=Options.__doc__)
-    try:
-        dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
-        if options.picture is not None:
-            picture(options.picture)
-    except (ValueError, OSError) as error:
-        print(f"make_flights: {error}", file=sys.stderr)
-        sys.exit(2)
-    Console().print(statistics_table(dataset))
+    """The command line."""
+    command.call("make_flights", Options, make_flights)
 
 
 if __name__ == "__main__":

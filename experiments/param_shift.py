@@ -17,10 +17,10 @@ NAME, TITLE = "param_shift", "Parameter shift"
 
 
 def experiment(config: AdaptationConfig, console: Console) -> None:
-    """Run the protocol on the shifted vehicle and write what came of it."""
+    """Run the protocol on the shifted vehicle and write the report."""
     found = study(PARAMETER_SHIFT, IRIS, config, console)
     if hosts.is_main_process():
-        write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found, Console())
+        write_outcome(NAME, TITLE, PARAMETER_SHIFT, config, found)
 
 
 def main() -> None:

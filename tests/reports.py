@@ -1,15 +1,14 @@
-"""Rows and reports of the paper's shape, and any others, for the tests of what is told."""
+"""Rows and reports of the paper's shape, and random ones, for the tests of reporting."""
 
-import math
-from dataclasses import replace
+from types import MappingProxyType
 
-import numpy as np
 from hypothesis import strategies as st
 
 from experiments.paper.claims import claims
-from experiments.paper.rows import DOMAINS, MODELS, MODES, STATUSES, THETA, Row, with_rho
-from experiments.reporting.report import Report
-from experiments.runner.environment import environment
+from experiments.paper.config import PRESETS
+from experiments.paper.lanes import DOMAINS, MODELS, MODES, TAGS, THETA, with_rho
+from experiments.paper.outcome import paper_report
+from experiments.reporting.results import Results
 
 TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": 8.5e-6}
 SIZES = (100, 500, 1000)
@@ -24,81 +23,70 @@ ERRORS = {
 }
 
 
+def row(model, mode, n, seed, test_mse, domain="parameter_shift", theta=None, theta_interval=None, **fields):
+    known = {"domain": domain, "model": model, "mode": mode, "n_train": n, "seed": seed, "test_mse": test_mse}
+    known |= {"rho": None, "val_mse": 1e-3, "epochs": 150, "status": "ok"}
+    return known | {"theta": theta, "theta_interval": theta_interval} | fields
+
+
 def make_rows(seeds=3, sizes=SIZES, errors=ERRORS, theta=TRUTH, domain="parameter_shift"):
     """The seeds' errors lie 2 % apart around the mean."""
-    return with_rho(
-        Row(
-            domain,
-            model,
-            mode,
-            n,
-            seed,
-            mean * (1 + 0.02 * (seed - (seeds - 1) / 2)),
-            None,
-            mean / 100,
-            150,
-            "ok",
-            known,
-        )
+    rows = [
+        row(model, mode, n, seed, mean * (1 + 0.02 * (seed - (seeds - 1) / 2)), domain, known)
         for (model, mode), means in errors.items()
         for n, mean in means.items()
         for seed in range(seeds)
         for known in [None if model == "no_physics" else theta]
         if n in (0, *sizes)
-    )
+    ]
+    return with_rho(Results(rows, TAGS))
 
 
-def changed(rows, model, mode, n_train, **fields):
+def changed(rows, model, mode, n_train, factor=1.0, **fields):
     """The rows with a factor on `test_mse`, or other fields, changed in one cell, and ρ to match."""
-    factor = fields.pop("factor", 1.0)
-    cell = (model, mode, n_train)
-    return with_rho(
-        replace(r, **{"test_mse": r.error * factor} | fields) if (r.model, r.mode, r.n_train) == cell else r
-        for r in rows
-    )
+    cell = {"model": model, "mode": mode, "n_train": n_train}
+
+    def change(row):
+        scaled = None if row["test_mse"] is None else row["test_mse"] * factor
+        return {**row, "test_mse": scaled, **fields} if cell.items() <= row.items() else row
+
+    return with_rho(Results([change(row) for row in rows], rows.tags))
 
 
 def verdicts(rows, experiment="param_shift", truth=TRUTH):
-    return {claim.id: claim.holds for claim in claims(rows, experiment, truth)}
+    return {verdict.id: verdict.holds for verdict in claims(rows, experiment, truth)}
 
 
-def make_report(rows, experiment="param_shift", truth=TRUTH, **fields):
-    judged = claims(rows, experiment, truth)
-    surroundings = environment({"training": 12.5})
-    return Report(experiment, {"preset": "quick", "sizes": [100]}, surroundings, rows, judged, truth, **fields)
+def make_report(rows, experiment="param_shift", truth=TRUTH, figures=MappingProxyType({}), **options):
+    return paper_report(experiment, PRESETS["quick"], {"training": 12.5}, rows, truth, figures, **options)
 
 
-NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([math.nan, math.inf, np.float32(0.1)])
+NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([float("nan"), float("inf")])
 THETAS = st.none() | st.fixed_dictionaries({name: st.none() | st.floats() for name in THETA})
-PAIRS = st.lists(st.floats(allow_nan=False), min_size=2, max_size=2).map(sorted) | st.sampled_from(
-    [None, [0.0, math.nan]]
-)
-INTERVALS = st.none() | st.fixed_dictionaries(dict.fromkeys(THETA, PAIRS))
+ENDS = st.none() | st.lists(st.floats(allow_nan=False, allow_infinity=False), min_size=2, max_size=2).map(sorted)
 
 
 @st.composite
 def odd_rows(draw):
-    mode = draw(st.sampled_from(MODES))
-    theta = draw(THETAS)
-    return Row(
-        domain=draw(st.sampled_from(DOMAINS)),
-        model=draw(st.sampled_from(MODELS)),
-        mode=mode,
-        n_train=0 if mode == "source_only" else draw(st.sampled_from([1, 100, 500, 1000])),
-        seed=draw(st.integers(0, 2)),
-        test_mse=draw(NUMBERS),
+    mode, theta = draw(st.sampled_from(MODES)), draw(THETAS)
+    return row(
+        draw(st.sampled_from(MODELS)),
+        mode,
+        0 if mode == "source_only" else draw(st.sampled_from([1, 100, 500, 1000])),
+        draw(st.integers(0, 2)),
+        draw(NUMBERS),
+        draw(st.sampled_from(DOMAINS)),
+        theta,
+        draw(st.none() | st.fixed_dictionaries(dict.fromkeys(THETA, ENDS))) if theta else None,
         rho=draw(st.none() | st.floats()),
         val_mse=draw(NUMBERS),
         epochs=draw(st.integers(0, 10**6)),
-        status=draw(st.sampled_from(STATUSES)),
-        theta=theta,
-        theta_interval=draw(INTERVALS) if theta else None,
+        status=draw(st.sampled_from(["ok", "capped", "diverged"])),
     )
 
 
-def identity(row):
-    """No two rows of a report share it."""
-    return row.domain, row.model, row.mode, row.n_train, row.seed
+def tags(row):
+    return tuple(row[tag] for tag in TAGS)
 
 
-ODD_ROWS = st.lists(odd_rows(), max_size=12, unique_by=identity)
+ODD_ROWS = st.lists(odd_rows(), max_size=12, unique_by=tags).map(lambda rows: Results(rows, TAGS))

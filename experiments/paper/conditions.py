@@ -1,4 +1,4 @@
-"""What each lane of a sweep starts from and is asked to do: models by seed, plans by size (paper, App. A)."""
+"""Initial models and hyper-parameters of every run of a sweep: models by seed, plans by size (paper, App. A)."""
 
 from dataclasses import replace
 from typing import Any
@@ -24,26 +24,22 @@ from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
-FORCES = 6  # v̇ and ω̇ are the last of whatever a network of a multirotor writes
-FORCED = {
-    "wrench": "accelerations",
-    "rotors": "rotors",
-}  # the name for `make_residual` of f_d as a force and a torque
-PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # what the keys of a seed are for
+FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
+FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs that act as a force and a torque → of `make_residual`
+PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # purposes of a seed's keys
 
 
 def settings(config: Config) -> Settings:
-    """What all lanes of the experiment share."""
+    """The settings that all runs of the experiment share."""
     return Settings(config.batch_size, REGULARISERS.get(config.regulariser), SOLVERS[config.solver])
 
 
 def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
-    """The untrained models of all seeds, stacked. A seed gives the hybrid and its rivals the same parts."""
-
+    """The untrained models of all seeds, stacked. A seed gives all models the same physics and network."""
     return jax.device_get(_fresh_fields(model, vehicle, config, np.arange(config.seeds)))
 
 
-# Equinox hands the options on to jax.jit, but does not declare them.
+# Equinox passes the options to jax.jit, but does not declare them.
 @eqx.filter_jit(compiler_options=FASTEST_COMPILE)  # pyright: ignore[reportCallIssue]
 def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
     def build(seed):
@@ -55,12 +51,12 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
 
 
 def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, RunConfig]:
-    """One lane a seed, on all source trajectories."""
+    """One run per seed, on all source trajectories."""
     return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
 
 
 def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, RunConfig]:
-    """Pre-training that goes on from the seeds' fields, with all its rates times a factor."""
+    """Pre-training from the seeds' fields, with all rates times a factor."""
     rate, rule = _pretraining_rule(model, config)
     everything = np.arange(config.source_train)
     plan = _plan(model, config, rate, rule, everything, config.source_train)
@@ -70,8 +66,8 @@ def annealing(model: str, fields: AbstractVectorField, factor: float, config: Co
 
 
 def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, RunConfig]:
-    """One lane for each size and seed, in this order, from the seeds' fields; subsets of one seed are nested."""
-    subsets = [drawn(seed, config) for seed in range(config.seeds)]
+    """One run for each size and seed, in this order, from the seeds' fields; the subsets of a seed are nested."""
+    subsets = [sampled_indices(seed, config) for seed in range(config.seeds)]
     one = lane(fields, 0)
     plans = [
         _with_offset(_plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size), one, config)
@@ -85,11 +81,11 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
 ) -> tuple[FitState, RunConfig]:
-    """One lane a seed: the encoder of Expert Augmentation, on source flights as flown and as the expert flies them.
+    """One run per seed: the encoder of Expert Augmentation, on source flights and on rollouts of the expert.
 
     Args:
         experts: the pre-trained hybrids of all seeds.
-        past: the heads of the source windows, which the encoder will read.
+        past: the first part of each source window, the input of the encoder.
     """
 
     def build(expert, seed):
@@ -103,14 +99,14 @@ def augmentation(
     return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
 
 
-def drawn(seed: int, config: Config) -> np.ndarray:
-    """The order in which a seed takes its target trajectories from the pool."""
+def sampled_indices(seed: int, config: Config) -> np.ndarray:
+    """The order in which a seed takes target trajectories from the pool, as indices."""
     return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
 
 
 def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
-    """How a network sees rotor speeds."""
-    # Around hover, in tenths of it: then they are of the size of the other inputs.
+    """The scaling of rotor speeds at the input of a network."""
+    # In tenths of the hover speed, from hover: of the magnitude of the other inputs.
     hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
     return {"hover": hover, "raw": InputScaling()}[config.inputs]
 
@@ -161,7 +157,7 @@ def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.nd
 
 
 def _with_offset(plan: RunConfig, field: AbstractVectorField, config: Config) -> RunConfig:
-    """The plan with a rate of its own for v̇ and ω̇ in the output bias of the field's network, if one is asked for."""
+    """The plan with --rates.offset for v̇ and ω̇ in the output bias of the network, if it is given."""
     offset = config.rates.offset
     if offset is None:
         return plan

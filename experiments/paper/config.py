@@ -1,14 +1,20 @@
-"""The paper's protocol as data: sizes, rates, patience, and what each preset makes of them (paper, App. A)."""
+"""The paper's protocol as data: sizes, rates, patience, and the presets (paper, App. A)."""
 
-import math
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, is_dataclass, replace
-from functools import partial
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
-from experiments.runner.options import Run
-from hybrid_jax import checks
+from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
+from experiments.runner.options import (
+    Count,
+    CountFromZero,
+    NotNegative,
+    Positive,
+    Run,
+    check_numbers,
+    distinct,
+    factors,
+)
 from hybrid_jax.training.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
@@ -18,43 +24,35 @@ ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
 ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
 RegulariserName = Literal["none", "trajectory_correlation", "inner_product", "cosine", "pearson", "residual_norm"]
 assert {*RegulariserName.__args__} == {"none", *REGULARISERS}
-Rule = Callable[[str, Any], None]  # of an option's name and a number of it: raises where the number makes no sense
-FROM_ZERO: Rule = partial(checks.count, least=0)
-RULES: Mapping[str, Rule] = (
-    dict.fromkeys(("source_train", "validation", "test", "hidden", "batch_size", "max_epochs"), checks.count)
-    | dict.fromkeys(("data_seed", "patience"), FROM_ZERO)
-    | dict.fromkeys(("noise", "regulariser_weight", "rates"), checks.not_negative)
-    | {"perturbed_by": checks.positive}
-)
 
 
 @dataclass(frozen=True)
 class Rates:
     """Adam's learning rates; a tuple has one for each of the sizes 100, 300, 500, 700, 1000."""
 
-    physics: float = 1e-2
+    physics: NotNegative = 1e-2
     """θ_p, in pre-training and fine-tuning."""
-    pretraining: float = 1e-4
+    pretraining: NotNegative = 1e-4
     """θ_d, both models."""
-    decay: tuple[float, ...] = ()
-    """Pre-training goes on from its best model with all its rates times each of these in turn; by default it ends."""
-    hybrid: tuple[float, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
+    decay: tuple[Positive, ...] = ()
+    """Factors: pre-training continues from its best model with all rates times each in turn; none by default."""
+    hybrid: tuple[NotNegative, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
     """θ_d of the hybrid, fine-tuned and target-only."""
-    no_physics: tuple[float, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
+    no_physics: tuple[NotNegative, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
     """The network without physics, fine-tuned (the scan of the paper is damaged in the first four)."""
-    no_physics_target_only: float = 1e-4
+    no_physics_target_only: NotNegative = 1e-4
     """The network without physics, from a fresh start."""
-    offset: float | None = None
-    """v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default as the rest of
-    θ_d. A steady force is there alone, and at 1e-3 takes thousands of steps, in which the rest learns by heart."""
+    offset: Positive | None = None
+    """Rate of v̇ and ω̇ in the output bias of θ_d [m/s², rad/s² a step], fine-tuned and target-only; by default that of
+    θ_d. Only this bias can represent a steady force; at 1e-3 that takes thousands of steps, and the rest overfits."""
 
 
 @dataclass(frozen=True)
 class Stopping:
     """At least `minimum` epochs, then stop after `patience` epochs without a better validation loss."""
 
-    minimum: int
-    patience: int
+    minimum: CountFromZero
+    patience: CountFromZero
 
 
 @dataclass(frozen=True)
@@ -63,26 +61,26 @@ class Patience:
 
     hybrid_pretraining: Stopping = Stopping(100, 20)
     no_physics_pretraining: Stopping = Stopping(300, 50)
-    hybrid_minimum: tuple[int, ...] = (100, 300, 300, 300, 100)
-    hybrid_patience: tuple[int, ...] = (20, 50, 50, 50, 20)
+    hybrid_minimum: tuple[CountFromZero, ...] = (100, 300, 300, 300, 100)
+    hybrid_patience: tuple[CountFromZero, ...] = (20, 50, 50, 50, 20)
     no_physics: Stopping = Stopping(250, 50)
 
 
 @dataclass(frozen=True)
 class Encoding:
-    """How Expert Augmentation learns to read θ_p off the past; the paper says no more than that it does."""
+    """The encoder of Expert Augmentation, which estimates θ_p from the past; the paper gives no details."""
 
     box: tuple[float, float] = (0.5, 2.0)
     """θ_p of augmented flights: the source model's times a factor in this range, even in its logarithm."""
-    hidden: int = 128
+    hidden: Count = 128
     """Units in each of the encoder's two hidden layers."""
-    rate: float = 1e-3
+    rate: NotNegative = 1e-3
     """Adam's learning rate."""
-    weight: float = 1.0
-    """Of the mean squared error of log θ̂_p beside the error of the prediction."""
+    weight: NotNegative = 1.0
+    """Weight of the mean squared error of log θ̂_p, added to the error of the prediction."""
     stopping: Stopping = Stopping(100, 60)
     """Early stopping, by the error of the prediction on source and augmented validation flights."""
-    max_epochs: int = 400
+    max_epochs: Count = 400
     """Cap on the encoder's epochs."""
 
 
@@ -94,51 +92,50 @@ class Config(Run):
     """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
-    source_train: int = 10_000
+    source_train: Count = 10_000
     """Source trajectories for pre-training."""
-    validation: int = 1000
+    validation: Count = 1000
     """Validation trajectories, in the source and in the target."""
-    test: int = 1000
+    test: Count = 1000
     """Target test trajectories."""
-    data_seed: int = 0
+    data_seed: CountFromZero = 0
     """Seed of all flights."""
-    hidden: int = 64
+    hidden: Count = 64
     """Hidden units of f_d."""
     inputs: Literal["hover", "raw"] = "hover"
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Literal["batch", "layer", "none"] = "batch"
     """Normalisation of f_d's hidden layer."""
     residual_inputs: ResidualInputs = "all"
-    """What f_d sees of the state: all; all but p_x, p_y; no yaw either; that and how near the ground each rotor is; or
-    altitude and what the body feels, no yaw."""
+    """Inputs of f_d from the state. no_xy: without p_x, p_y. no_xy_yaw: without yaw too. near_ground: also each rotor's
+    distance to the ground. body: altitude, and velocity, rates and gravity in the body frame."""
     residual_outputs: ResidualOutputs = "all"
-    """What f_d adds to: all 13 derivatives; v̇ and ω̇ alone; to these as a force and a torque, so that Ix and Iy turn
-    what it says of ω̇ as well; or, besides, to the thrust of each rotor, by one network that all rotors share."""
+    """Outputs of f_d. all: 13 derivatives. accelerations: v̇ and ω̇. wrench: these as a force and a torque, so that Ix
+    and Iy act on them. rotors: also the thrust of each rotor, by one network that all rotors share."""
     residual_linear: bool = False
-    """A linear map goes past f_d's hidden layer, and both begin at zero."""
+    """Add a linear skip connection to f_d; both start at zero."""
     guess: tuple[float, float] = (0.8, 1.25)
     """θ_p starts at nominal times a random factor in this range."""
-    perturbed_by: float | None = None
-    """Instead: at nominal times or over 1 + this, each of θ_p at random."""
-    noise: float = 0.0
+    perturbed_by: Positive | None = None
+    """Instead of --guess: each of θ_p starts at nominal times or over 1 + this, at random."""
+    noise: NotNegative = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
     regulariser: RegulariserName = "trajectory_correlation"
-    """What keeps f_d from overwriting f_p."""
-    regulariser_weight: float = 1e-3
+    """Penalty that keeps f_d from replacing f_p."""
+    regulariser_weight: NotNegative = 1e-3
     """λ."""
     solver: Literal["rk4", "heun", "midpoint", "tsit5", "dopri5"] = "rk4"
     """Integrator, one step for each input interval of 0.01 s."""
-    batch_size: int = 100
+    batch_size: Count = 100
     """Trajectories in a minibatch."""
-    max_epochs: int = 2000
-    """Cap; a run that hits it is marked in the report."""
+    max_epochs: Count = 2000
+    """Cap on epochs; the report marks runs that reach it."""
     rates: Rates = Rates()
     patience: Patience = Patience()
 
     def __post_init__(self):
         Run.__post_init__(self)
-        check_numbers("--", self, RULES)
-        check_numbers("--rates.", self.rates, dict.fromkeys(("offset", "decay"), checks.positive))
+        check_numbers("--", self)
         factors("--guess", self.guess)
         if not self.sizes or min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
@@ -156,7 +153,7 @@ class Config(Run):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def has_networks(self) -> bool:
-        """Whether anything that is trained holds f_d."""
+        """Whether any trained model has f_d."""
         return True
 
     def pooled(self) -> int:
@@ -166,7 +163,7 @@ class Config(Run):
 
 @dataclass(frozen=True)
 class AdaptationConfig(Config):
-    """Pre-train on source flight, adapt to the target with N short trajectories, test; all lanes are one sweep."""
+    """Pre-train on source flight, adapt to the target with N short trajectories, and test."""
 
     models: tuple[Model, ...] = get_args(Model)
     """Which models to compare. constant_disturbance: the source's hybrid, of which θ_p and a constant disturbance are
@@ -179,52 +176,17 @@ class AdaptationConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--models", self.models)
-        if "no_physics" in self.models and self.residual_outputs != "all":
+        if NO_PHYSICS in self.models and self.residual_outputs != "all":
             raise ValueError(
                 f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives, leave it out"
             )
 
     def has_networks(self) -> bool:
-        return set(self.models) != {"physics_only"}
-
-
-def distinct(option: str, names: Sequence[str]) -> None:
-    """Check an option that lists names.
-
-    Raises:
-        ValueError: no names, or one twice.
-    """
-    if not names or len(set(names)) < len(names):
-        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
-
-
-def check_numbers(prefix: str, options: Any, rules: Mapping[str, Rule]) -> None:
-    """Check options, each by its rule: a number, a tuple of numbers, a group of either, or None for what is not given.
-
-    Raises:
-        ValueError: the first number that its rule refuses, by the name on the command line, which begins with prefix.
-    """
-    for name, rule in rules.items():
-        option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
-        if is_dataclass(value):
-            check_numbers(f"{option}.", value, dict.fromkeys((each.name for each in fields(value)), rule))
-        elif value is not None:
-            for number in value if isinstance(value, tuple) else (value,):
-                rule(option, number)
-
-
-def factors(option: str, value: tuple[float, float]) -> None:
-    """Check an option that is a range of factors.
-
-    Raises:
-        ValueError: not two finite numbers above 0, the lower one first.
-    """
-    if not 0 < value[0] < value[1] < math.inf:
-        raise ValueError(f"{option} must be two factors, low < high, above 0, got {value}")
+        return set(self.models) != {PHYSICS_ONLY}
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
-    """A configuration of a kind with what it shares with another one, but for its own sizes and the changes."""
+    """A configuration of a kind with the shared options of another one, except sizes and pool, and the changes."""
     shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
     return kind(**shared | changes)
 
@@ -236,7 +198,7 @@ def column(size: int) -> int:
 
 PAPER = AdaptationConfig()
 QUICK = replace(
-    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=("hybrid", "no_physics", "constant_disturbance"),
+    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=(HYBRID, NO_PHYSICS, CONSTANT_DISTURBANCE),
     source_train=3000, validation=300, test=300, max_epochs=400,
 )  # fmt: skip
 SMOKE = replace(

@@ -1,10 +1,9 @@
-"""Figures of scores and of physical parameters against N, the number of target trajectories (Figs. 3 and 5)."""
+"""Figures of the paper's experiments: scores and θ_p against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
 
-import io
 import math
-from collections.abc import Callable, Mapping, Sequence
-from pathlib import Path
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from types import MappingProxyType
+from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -12,31 +11,28 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import THETA_TOLERANCE
-from experiments.paper.rows import NAMES, THETA, Row
-from experiments.paper.summary import grouped
-from hybrid_jax.io.files import write_atomic
+from experiments.paper.lanes import THETA, Cell, by_domain, cells, gain, method_label, ranked
+from experiments.paper.tables import UNITS, value_label
+from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
+from experiments.reporting.plots import (
+    DRAWABLE,
+    FLOOR_LABEL,
+    STYLE,
+    Line,
+    colour,
+    error_legend,
+    error_panel,
+    legend_below,
+)
+from experiments.reporting.results import Column, Results, Row
 
-STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "svg.hashsalt": "hybrid_jax",  # otherwise names inside an SVG are random
-}
-# Okabe and Ito's palette, which the colour-blind can tell apart.
-COLOURS = {"hybrid": "#0072B2", "no_physics": "#D55E00", "physics_only": "#009E73", "constant_disturbance": "#CC79A7"}
-OTHERS = "0.4"  # models that are in no figure of the paper
-DASHES = {"fine_tuned": "-", "target_only": "--", "source_only": ":"}
-MARKERS = {"fine_tuned": "o", "target_only": "s", "source_only": ""}
+DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
+MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 # What lies beyond these is marked at the edge of its panel, so that one failed run does not flatten the rest.
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
-DRAWABLE = 1e30  # a number beyond it overflows inside matplotlib and is drawn like one that is not finite
+MEANING = "mean ± one standard deviation over seeds; hollow: over the finite seeds only"
 
 
 class _Curve(NamedTuple):
@@ -55,7 +51,7 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 
 
 @mpl.rc_context(STYLE)
-def scores(rows: Sequence[Row], title: str, floor: float = 0.0) -> Figure:
+def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error and ρ against N, mean and one standard deviation over seeds.
 
     Args:
@@ -64,21 +60,19 @@ def scores(rows: Sequence[Row], title: str, floor: float = 0.0) -> Figure:
     Raises:
         ValueError: no rows.
     """
-    if not rows:
-        raise ValueError("rows must not be empty: there is nothing to draw")
+    _require(rows)
     figure = Figure(figsize=(9, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
-    _draw_errors(left, _curves(rows, lambda row: row.error), floor)
-    _draw_gains(right, _curves([row for row in rows if row.mode != "source_only"], lambda row: row.gain))
+    _draw_errors(left, _curves(rows, "test_mse"), floor)
+    _draw_gains(right, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
     for axes in (left, right):
         axes.set_xlabel("N, target trajectories trained on")
         _tick_sizes(axes, rows)
-    _finish(figure, left, title, columns=3)
-    return figure
+    return legend_below(figure, title, MEANING, columns=3)
 
 
 @mpl.rc_context(STYLE)
-def theta(rows: Sequence[Row], truth: Mapping[str, float], title: str = "Physical parameters after training") -> Figure:
+def theta(rows: Results, truth: Mapping[str, float], title: str = "Physical parameters after training") -> Figure:
     """Ix, Iy and k relative to the truth against N, mean and one standard deviation over seeds.
 
     Args:
@@ -87,46 +81,91 @@ def theta(rows: Sequence[Row], truth: Mapping[str, float], title: str = "Physica
     Raises:
         ValueError: no trained row has parameters.
     """
-    known = [row for row in rows if row.theta is not None and row.mode != "source_only"]
-    if not known:
+    known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
+    if not len(known):
         raise ValueError("rows must hold some with theta: there is nothing to draw")
     figure = Figure(figsize=(9, 4.1), layout="constrained")
     panels = figure.subplots(1, len(THETA))
     for axes, name in zip(panels, THETA, strict=True):
         _draw_biases(axes, _curves(known, lambda row, name=name: _bias(row, name, truth)))
-        axes.set(title=f"{name}, truly {truth[name]:.4g} {_unit(name)}", xlabel="N, target trajectories")
+        axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
         _tick_sizes(axes, known)
     panels[0].set_ylabel("recovered / true − 1  [%]")
-    _finish(figure, panels[0], title, columns=4)
-    return figure
+    return legend_below(figure, title, MEANING, columns=4)
 
 
-def save_figure(figure: Figure, path: str | Path) -> list[Path]:
-    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths.
+@mpl.rc_context(STYLE)
+def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:
+    """Table 2: the test errors of all seeds of every method, the smallest mean on top, a panel for each domain.
+
+    Args:
+        floors: domain → an error that no model at hand can get below, such as the share of a wind's sine.
 
     Raises:
-        OSError: the folder cannot be written.
+        ValueError: no rows.
     """
-    paths = []
-    for suffix, metadata in (("png", {}), ("svg", {"Date": None})):
-        content = io.BytesIO()
-        with mpl.rc_context(STYLE):
-            figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
-            figure.set_layout_engine("none")  # both as the first was laid out: that is half of the work
-        paths.append(Path(f"{path}.{suffix}"))
-        write_atomic(paths[-1], content.getvalue())
-    return paths
+    _require(rows)
+    panels = {domain: ranked(group) for domain, group in by_domain(rows).items()}
+    counts = [len(methods) for methods in panels.values()]
+    figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
+    column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
+    several_sizes = len({*rows["n_train"]} - {0}) > 1
+    for axes, (domain, methods) in zip(column, panels.items(), strict=True):
+        lines = [_method_line(cell, group, several_sizes) for cell, group in methods.items()]
+        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+    return error_legend(figure, title, None in rows["test_mse"])
 
 
-def colour(model: str) -> str:
-    """The colour that a model has in every figure."""
-    return COLOURS.get(model, OTHERS)
+@mpl.rc_context(STYLE)
+def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
+    """The test errors of the fine-tuned models of one choice: a panel for each domain, a line for each value and N.
+
+    Args:
+        rows: with the tags value and default.
+        floors: domain → an error that no model can get below.
+
+    Raises:
+        ValueError: no rows.
+    """
+    _require(rows)
+    tuned = rows.where(mode=FINE_TUNED)
+    panels = {domain: _ablation_lines(group) for domain, group in by_domain(tuned).items()}
+    count = max(len(lines) for lines in panels.values())
+    figure = Figure(figsize=(11, 1.9 + 0.32 * count), layout="constrained")
+    row = figure.subplots(1, len(panels), squeeze=False)[0]
+    for axes, (domain, lines) in zip(row, panels.items(), strict=True):
+        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+    for axes in row[1:]:
+        axes.tick_params(labelleft=False)  # the lines are those of the first panel
+    return error_legend(figure, title, None in rows["test_mse"])
 
 
-def _curves(rows: Sequence[Row], value: Callable[[Row], float]) -> _Curves:
+def _require(rows: Results) -> None:
+    if not len(rows):
+        raise ValueError("rows must not be empty: there is nothing to draw")
+
+
+def _method_line(cell: Cell, rows: Results, several_sizes: bool) -> Line:
+    name = f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell)
+    marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
+    return Line(name, rows.numbers("test_mse"), colour(cell[0]), marked)
+
+
+def _ablation_lines(rows: Results) -> list[Line]:
+    sizes, lines = sorted({*rows["n_train"]}), []
+    for n in sizes:
+        for group in rows.where(n_train=n).group("value").values():
+            name, default = value_label(group[0]), group[0]["default"]
+            tint, marked = (colour(HYBRID), "mean of the default") if default else ("0.35", "")
+            full = f"{name}, N = {n}" if len(sizes) > 1 else name
+            lines.append(Line(full, group.numbers("test_mse"), tint, marked if n == sizes[0] else ""))
+    return lines
+
+
+def _curves(rows: Results, value: Column) -> _Curves:
     points: dict[tuple[str, str], list[tuple[float, ...]]] = {}
-    for (model, mode, n), group in grouped(rows).items():
-        points.setdefault((model, mode), []).append((n, *_point(np.array([value(row) for row in group], float))))
+    for (model, mode, n), group in cells(rows).items():
+        points.setdefault((model, mode), []).append((n, *_point(group.numbers(value))))
     return {key: _Curve(*np.array(found, float).T) for key, found in points.items()}
 
 
@@ -147,14 +186,14 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     axes.set(yscale="log", ylabel="$L^T_{MSE}$  (state in SI units, squared)", title="Test error (log scale)")
     # One std may reach below 0, which a log axis has not; the whisker then ends at the best seed.
     curves = {key: c._replace(low=np.where(c.low > 0, c.low, c.smallest)) for key, c in curves.items()}
-    trained = {key: curve for key, curve in curves.items() if key[1] != "source_only"}
+    trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
     _draw_curves(axes, trained, min(limits[0], floor / 2) if floor > 1 / DRAWABLE else limits[0], limits[1])
     for (model, mode), curve in curves.items():
-        if mode == "source_only" and np.isfinite(curve.mean[0]):
+        if mode == SOURCE_ONLY and np.isfinite(curve.mean[0]):
             axes.axhspan(curve.low[0], curve.high[0], color=colour(model), alpha=0.12, linewidth=0)
-            axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=f"{NAMES[model]}, source-only")
+            axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if floor > 1 / DRAWABLE:
-        axes.axhline(floor, color="0.4", linestyle="-.", label="floor: what no model here can see")
+        axes.axhline(floor, color="0.4", linestyle="-.", label=FLOOR_LABEL)
 
 
 def _draw_gains(axes: Axes, curves: _Curves) -> None:
@@ -186,7 +225,7 @@ def _draw_curves(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at
         mean, low, high = (np.where(inside, np.clip(part, bottom, top), np.nan) for part in curve[1:4])
         style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markersize": 5}
         whiskers = np.stack([mean - low, high - mean])
-        axes.errorbar(x, mean, whiskers, capsize=3, label=f"{NAMES[model]}, {NAMES[mode]}", **style)
+        axes.errorbar(x, mean, whiskers, capsize=3, label=label(model, mode), **style)
         lost = top if lost_at_top else bottom
         for index, at in enumerate(x):
             _mark_failure(axes, at, [part[index] for part in curve], lost, colour(model))
@@ -210,25 +249,14 @@ def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, co
         axes.annotate(words, (at, y), offset, textcoords="offset points", **style)
 
 
-def _tick_sizes(axes: Axes, rows: Sequence[Row]) -> None:
-    sizes = sorted({row.n_train for row in rows} - {0})
+def _tick_sizes(axes: Axes, rows: Results) -> None:
+    sizes = sorted({*rows["n_train"]} - {0})
     axes.set_xticks(sizes, [str(size) for size in sizes])
     if not sizes:
         axes.set_xticks([])
 
 
-def _finish(figure: Figure, axes: Axes, title: str, columns: int) -> None:
-    figure.suptitle(title, fontsize=12)
-    handles, labels = axes.get_legend_handles_labels()
-    meaning = "mean ± one standard deviation over seeds; hollow: over the finite seeds only"
-    figure.legend(handles, labels, loc="outside lower center", ncols=columns, title=meaning)
-
-
 def _bias(row: Row, name: str, truth: Mapping[str, float]) -> float:
     """recovered / true − 1 [%]."""
-    value = None if row.theta is None else row.theta[name]
+    value = row["theta"][name]
     return math.inf if value is None else 100 * (value / truth[name] - 1)
-
-
-def _unit(name: str) -> str:
-    return "N/(rad/s)²" if name == "k" else "kg m²"

@@ -1,4 +1,4 @@
-"""Figures of flights: predicted paths over the ground (Figs. 2 and 4) and an example of the data (Fig. 7)."""
+"""Figures of flights: predicted paths in the horizontal plane (Figs. 2 and 4) and an example of the data (Fig. 7)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -9,12 +9,12 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.paper.figures import COLOURS, STYLE, colour
-from experiments.paper.rows import NAMES
+from experiments.reporting.names import HYBRID, label
+from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
-NARROWEST = 0.2  # m, half the width of a view: a hovering vehicle is not magnified beyond it
-MARGIN = 1.6  # half the width of a view over the truth's own reach
+MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
+VIEW_RATIO = 1.6  # width of a view over the extent of the truth
 
 States = Float[np.ndarray, "t+1 13"]
 
@@ -23,7 +23,7 @@ States = Float[np.ndarray, "t+1 13"]
 def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], title: str) -> Figure:
     """Figs. 2 and 4: one test flight in the horizontal plane, a panel for each N, every model against the truth.
 
-    The view is set by the truth alone; a prediction that leaves it is cut and said to leave.
+    The truth alone sets the view; a prediction that leaves it is cut, and the panel says so.
 
     Args:
         truth: states from the start on.
@@ -41,11 +41,7 @@ def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], ti
         _draw_paths(axes, truth, {name: _states(f"predicted[{n}][{name!r}]", x) for name, x in models.items()})
         axes.set(title=f"N = {n} trajectories", xlabel="x [m]")
     panels[0].set_ylabel("y [m]")
-    figure.suptitle(title, fontsize=12)
-    pairs = [pair for axes in panels for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    entries = {label: handle for handle, label in pairs}
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=4)
-    return figure
+    return legend_below(figure, title, columns=4)
 
 
 @mpl.rc_context(STYLE)
@@ -72,9 +68,9 @@ def example_flight(
     panels = [first, *(figure.add_subplot(grid[row, 1], sharex=first) for row in range(1, 4))]
     speed = np.linalg.norm(states[:, VELOCITY], axis=1)
     named = (("altitude\n[m]", states[:, POSITION][:, 2]), ("speed\n[m/s]", speed), ("tilt\n[°]", tilt(states)))
-    for axes, (label, values) in zip(panels, named, strict=False):
-        axes.plot(time, values, color=COLOURS["hybrid"])
-        axes.set_ylabel(label)
+    for axes, (name, values) in zip(panels, named, strict=False):
+        axes.plot(time, values, color=colour(HYBRID))
+        axes.set_ylabel(name)
         axes.tick_params(labelbottom=False)
     _draw_rotors(panels[-1], time, inputs)
     figure.align_ylabels(panels)
@@ -98,32 +94,32 @@ def _states(name: str, states: Any) -> States:
 def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
     start, path = truth[0, :2], truth[:, :2]
     centre = (path.min(axis=0) + path.max(axis=0)) / 2
-    half = max(NARROWEST, MARGIN * np.ptp(path, axis=0).max() / 2)
+    half = max(MIN_HALF_WIDTH, VIEW_RATIO * np.ptp(path, axis=0).max() / 2)
     for name, states in models.items():
         # A path ends where it first is not finite, or so far off that drawing it would overflow.
         near = np.all(np.abs(states[:, :2] - centre) < 1e3 * half, axis=1)
         drawn = states[: len(near) if near.all() else int(np.argmin(near)), :2]
-        label, tint = NAMES.get(name, name), colour(name)
-        axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=label)
-        _say_if_it_leaves(axes, states[:, :2], centre, half, label, tint)
+        shown, tint = label(name), colour(name)
+        axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=shown)
+        _mark_if_outside(axes, states[:, :2], centre, half, shown, tint)
     axes.plot(*path.T, color="black", linestyle="--", linewidth=1.5, label="truth", zorder=4)
     axes.plot(*start, marker="o", color="black", markerfacecolor="white", linestyle="", label="start", zorder=5)
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
 
 
-def _say_if_it_leaves(axes: Axes, path: np.ndarray, centre: np.ndarray, half: float, label: str, colour: str) -> None:
+def _mark_if_outside(axes: Axes, path: np.ndarray, centre: np.ndarray, half: float, name: str, tint: str) -> None:
     if np.all(np.abs(path - centre) <= half):
         return
     with np.errstate(over="ignore"):
         off = np.linalg.norm(path - centre, axis=1).max()
-    words = f"{label} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{label} ends: not finite"
+    words = f"{name} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{name} ends: not finite"
     y = 0.02 + 0.12 * len(axes.texts)
-    axes.text(0.03, y, words, transform=axes.transAxes, color=colour, fontsize=8, va="bottom")
+    axes.text(0.03, y, words, transform=axes.transAxes, color=tint, fontsize=8, va="bottom")
 
 
 def _draw_space(axes: Any, states: States) -> None:
     x, y, z = states[:, POSITION].T
-    axes.plot(x, y, z, color=COLOURS["hybrid"])
+    axes.plot(x, y, z, color=colour(HYBRID))
     axes.plot(x, y, np.zeros_like(z), color="0.7", linewidth=1)
     axes.plot(x[:1], y[:1], z[:1], "o", color="black", markerfacecolor="white")
     axes.text(x[0], y[0], z[0], "  start")

@@ -1,4 +1,4 @@
-"""The methods of Table 2 and more, each a function from what it may use to its trained and tested lanes."""
+"""The methods of Table 2 and more baselines: each a function from a case to trained and tested models."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
@@ -11,9 +11,10 @@ import numpy as np
 
 from experiments.paper.conditions import adaptation, settings
 from experiments.paper.config import Config
-from experiments.paper.results import Lanes, physics_in, solution, theta_of, trained
+from experiments.paper.lanes import Lanes, physics_in, solution, theta_of, trained
 from experiments.paper.solved import Solve, by_lane, constant_disturbance, least_squares, solved, subsets
 from experiments.paper.study import domain_name, places
+from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
@@ -36,11 +37,11 @@ Method = Literal[
 
 @dataclass(frozen=True)
 class Case:
-    """What a method may use in one target domain.
+    """The data and models that a method may use in one target domain.
 
     Attributes:
-        pretrained: by model, the final states of its pre-training, one lane a seed.
-        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation takes part.
+        pretrained: by model, the final states of its pre-training, one per seed.
+        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
         target: splits train (the pool), validation and test_with_past.
     """
 
@@ -62,25 +63,25 @@ class Case:
 
 
 def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field: field) -> Callable[[Case, str], Lanes]:
-    """Fine-tuning by Adam of what `mark` does not freeze of a pre-trained model."""
+    """Fine-tune a pre-trained model by Adam, except the parts that `mark` freezes."""
 
     def method(case: Case, name: str) -> Lanes:
         config = case.config
-        starts, plans = adaptation(model, "fine_tuned", mark(case.pretrained[model].best), config)
-        final = case.stages.run(f"fine_tuned {name} {case.name}", starts, plans, settings(config), case.target)
+        starts, plans = adaptation(model, names.FINE_TUNED, mark(case.pretrained[model].best), config)
+        final = case.stages.run(f"{names.FINE_TUNED} {name} {case.name}", starts, plans, settings(config), case.target)
         whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
         errors = case.tested(name, whole.best)
-        return with_intervals(case, trained(name, "fine_tuned", *places(config.sizes, config), whole, errors))
+        return with_intervals(case, trained(name, names.FINE_TUNED, *places(config.sizes, config), whole, errors))
 
     return method
 
 
 def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
-    """Adaptation of the hybrid by what solves it instead of training."""
+    """Adapt the hybrid by a solver instead of training."""
 
     def method(case: Case, name: str) -> Lanes:
-        config, start = case.config, case.pretrained["hybrid"].best
-        found = solved(f"fine_tuned {name} {case.name}", solve, start, config, case.stages, case.target)
+        config, start = case.config, case.pretrained[names.HYBRID].best
+        found = solved(f"{names.FINE_TUNED} {name} {case.name}", solve, start, config, case.stages, case.target)
         errors = case.tested(name, found.fields)
         return with_intervals(case, solution(name, *places(config.sizes, config), found, errors))
 
@@ -88,18 +89,18 @@ def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
 
 
 def source_only(model: str) -> Callable[[Case], Lanes]:
-    """The pre-trained model as it is."""
+    """The pre-trained model, unchanged."""
 
     def method(case: Case) -> Lanes:
         final = case.pretrained[model]
-        errors = case.tested(f"source_only {model}", final.best)
-        return trained(model, "source_only", *places((0,), case.config), final, errors)
+        errors = case.tested(f"{names.SOURCE_ONLY} {model}", final.best)
+        return trained(model, names.SOURCE_ONLY, *places((0,), case.config), final, errors)
 
     return method
 
 
 def augmented(case: Case, name: str) -> Lanes:
-    """Expert Augmentation: θ_p of each test window is read off its past; no target data are learned from."""
+    """Expert Augmentation: the encoder estimates θ_p of each test window from its past; it uses no target data."""
     assert case.experts is not None
     solver = settings(case.config).solver
     windows = case.target.splits["test_with_past"]
@@ -111,16 +112,16 @@ def augmented(case: Case, name: str) -> Lanes:
 
     experts = case.experts
     errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: by_lane(one, experts.best, windows))
-    lanes = trained(name, "source_only", *places((0,), case.config), experts, errors)
+    lanes = trained(name, names.SOURCE_ONLY, *places((0,), case.config), experts, errors)
     return replace(lanes, theta=theta_of(physics))
 
 
 def with_intervals(case: Case, lanes: Lanes) -> Lanes:
-    """The lanes with the 95 % interval of θ_p from the windows that each was adapted to, where θ_p was adapted.
+    """The models with the 95 % interval of θ_p from the windows of their adaptation, if θ_p was adapted.
 
-    It takes a network as given, and a disturbance would be too: there is none where θ_p and one were fitted together.
+    The interval treats the network as fixed. It would do so with a disturbance too, so models that fitted one get none.
     """
-    without = ("theta_d_only", "constant_disturbance", *CLOSED_FORM)
+    without = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, *CLOSED_FORM)
     if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:
         return lanes
     solver = settings(case.config).solver
@@ -150,17 +151,17 @@ def _ridge(method) -> Callable[[Case, str], Lanes]:
 
 
 CLOSED_FORM = {
-    "last_layer": _ridge(ridge.last_layer),
-    "linear_residual": _ridge(ridge.linear_residual),
+    names.LAST_LAYER: _ridge(ridge.last_layer),
+    names.LINEAR_RESIDUAL: _ridge(ridge.linear_residual),
 }
 METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
-    "hybrid": tuned("hybrid"),
-    "no_physics": tuned("no_physics"),
-    "physics_only": tuned("physics_only"),
-    "expert_augmentation": augmented,
-    "theta_p_only": tuned("hybrid", lambda field: Hybrid(field.physics, Frozen(field.residual))),
-    "theta_d_only": tuned("hybrid", lambda field: Hybrid(Frozen(field.physics), field.residual)),
-    "least_squares": found_by(least_squares),
-    "constant_disturbance": found_by(constant_disturbance),
+    names.HYBRID: tuned(names.HYBRID),
+    names.NO_PHYSICS: tuned(names.NO_PHYSICS),
+    names.PHYSICS_ONLY: tuned(names.PHYSICS_ONLY),
+    names.EXPERT_AUGMENTATION: augmented,
+    names.THETA_P_ONLY: tuned(names.HYBRID, lambda field: Hybrid(field.physics, Frozen(field.residual))),
+    names.THETA_D_ONLY: tuned(names.HYBRID, lambda field: Hybrid(Frozen(field.physics), field.residual)),
+    names.LEAST_SQUARES: found_by(least_squares),
+    names.CONSTANT_DISTURBANCE: found_by(constant_disturbance),
     **CLOSED_FORM,
 }

@@ -1,4 +1,4 @@
-"""What motion capture and a gyroscope make of flights: white noise on the states that are learned from."""
+"""Measurement noise of motion capture and a gyroscope: white noise on the states of training flights."""
 
 import zlib
 from dataclasses import asdict, dataclass
@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
+from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -18,18 +19,18 @@ from hybrid_jax.trajectories import Trajectories
 class Noise:
     """Standard deviation of the white measurement noise on each entry of a group of the state."""
 
-    position: float = 0.001
+    position: NotNegative = 0.001
     """[m], motion capture."""
-    quaternion: float = 0.002
+    quaternion: NotNegative = 0.002
     """Of each component, motion capture: about 0.2 degrees."""
-    velocity: float = 0.02
+    velocity: NotNegative = 0.02
     """[m/s], differentiated motion capture."""
-    body_rates: float = 0.02
+    body_rates: NotNegative = 0.02
     """[rad/s], gyroscope."""
 
 
 def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[Array, "*n 13"]:
-    """The states with white noise; measured quaternions are unit quaternions too."""
+    """The states with white noise; quaternions are normalised again."""
     sizes = np.zeros(13)
     for group, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), asdict(noise).values(), strict=True):
         sizes[group] = size
@@ -38,7 +39,7 @@ def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[
 
 
 def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
-    """The dataset with `level` times the typical noise on all but its test splits: tests are made against the truth."""
+    """The dataset with `level` times the typical noise on all but its test splits."""
     if not level:
         return dataset
     noise = Noise(**{name: level * size for name, size in asdict(Noise()).items()})

@@ -1,4 +1,4 @@
-"""Adaptation that is solved instead of trained, by least squares or in closed form, for every size and seed."""
+"""Adaptation by least squares or in closed form, for every size and seed."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -10,10 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.conditions import drawn, settings
+from experiments.paper.conditions import sampled_indices, settings
 from experiments.paper.config import Config
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation.disturbance_selection import select_disturbance
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
@@ -26,18 +25,18 @@ from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
-# From a field, the windows to adapt to and those to validate with: the field found, steps and status.
+# From a field, the windows to adapt to and those to validate with: the adapted field, steps and status.
 Solve = Callable[[Any, Trajectories, Trajectories, Settings], tuple[AbstractVectorField, Any, Any]]
 
 
 class Solved(NamedTuple):
-    """What was found: a lane for each size and seed, in the order of `study.places`.
+    """Adapted models, one for each size and seed, in the order of `study.places`.
 
     Attributes:
         fields: the models, stacked.
-        val_mse: L_MSE of each on the validation windows (lanes,).
-        steps: of each solution (lanes,).
-        status: see `training` (lanes,).
+        val_mse: L_MSE on the validation windows, of each.
+        steps: of the solver, of each.
+        status: see `training`, of each.
     """
 
     fields: Any
@@ -49,7 +48,7 @@ class Solved(NamedTuple):
 def solved(
     name: str, solve: Solve, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> Solved:
-    """Each seed's field, adapted to as many target windows of its own as each of the sizes says.
+    """Adapt each seed's field to its target windows, for each of the sizes.
 
     Args:
         name: of the stage.
@@ -66,7 +65,7 @@ def solved(
 
 @dataclass(frozen=True)
 class _Lane:
-    """What is done to one lane; equal for the targets of an experiment, which so share a program."""
+    """The adaptation of one model. Instances compare equal for all targets, so these share a compiled program."""
 
     solve: Solve
     shared: Settings
@@ -79,40 +78,40 @@ class _Lane:
 
 
 def least_squares(field, train: Trajectories, validation: Trajectories, shared: Settings):
-    """θ_p by least squares, everything else as it is."""
-    return _told(fit_least_squares(field, train, shared.solver))
+    """θ_p by least squares; the network is fixed."""
+    return _solution(fit_least_squares(field, train, shared.solver))
 
 
 def constant_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
-    """θ_p and a constant disturbance by least squares: nine numbers."""
+    """θ_p and a constant disturbance (9 parameters) by least squares; the network is fixed."""
     return least_squares(with_disturbance(field), train, validation, shared)
 
 
 def needed_disturbance(field, train: Trajectories, validation: Trajectories, shared: Settings):
-    """The same, but a disturbance of zero where the windows need none."""
-    return _told(select_disturbance(field, train, shared.solver).fit)
+    """As `constant_disturbance`, with the disturbance at zero unless it improves left-out windows."""
+    return _solution(select_disturbance(field, train, shared.solver).fit)
 
 
-def _told(found: LeastSquaresFit):
+def _solution(found: LeastSquaresFit):
     status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
     return found.field, found.steps, status
 
 
 def by_lane(function: Callable[..., Any], lanes: Any, *shared: Any) -> Any:
-    """`function(lane, *shared)` of each lane, one after the other in one program, as host arrays."""
+    """`function(lane, *shared)` of each lane, in sequence in one program, as host arrays."""
     return jax.device_get(_mapped(function)(lanes, shared))
 
 
-# A LaneMap would use all devices, but lineax does not compile under its shard_map, and this is no long work.
+# A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
 @lru_cache(PROGRAMS)
 def _mapped(function: Callable[..., Any]) -> Callable[..., Any]:
     def mapped(lanes, shared):
         return jax.lax.map(lambda lane: function(lane, *shared), lanes)
 
-    # Equinox hands the options on to jax.jit, but does not declare them.
+    # Equinox passes the options to jax.jit, but does not declare them.
     return eqx.filter_jit(mapped, compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
 
 
 def subsets(size: int, config: Config) -> np.ndarray:
-    """The target trajectories that each seed draws, as indices (seeds, size)."""
-    return stack([drawn(seed, config)[:size] for seed in range(config.seeds)])
+    """The indices of the target trajectories of each seed (seeds, size)."""
+    return stack([sampled_indices(seed, config)[:size] for seed in range(config.seeds)])

@@ -1,4 +1,4 @@
-"""The course of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
+"""The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,10 +12,11 @@ from rich.console import Console
 from experiments.make_flights import chosen_flights, flights
 from experiments.paper.conditions import adaptation, annealing, fresh_fields, pretraining, settings
 from experiments.paper.config import AdaptationConfig, Config
-from experiments.paper.results import Lanes, rows_of, solution, trained
-from experiments.paper.rows import SOURCE_OF, Row, with_rho
+from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
 from experiments.paper.sensors import measured
 from experiments.paper.solved import Solve, constant_disturbance, solved
+from experiments.reporting.names import CONSTANT_DISTURBANCE, FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
+from experiments.reporting.results import Results
 from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -30,17 +31,17 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
-SOLVED: Mapping[str, Solve] = {"constant_disturbance": constant_disturbance}  # models that are not trained
+SOLVED: Mapping[str, Solve] = {CONSTANT_DISTURBANCE: constant_disturbance}  # models that are not trained
 
 
 @dataclass(frozen=True)
 class Study:
-    """What an experiment found: the flights, every trained lane, the rows, seconds by stage, and notes on these."""
+    """The outcome of an experiment: flights, trained models, rows, seconds by stage, and notes on these."""
 
     source: Dataset
     target: Dataset
     lanes: list[Lanes]
-    rows: list[Row]
+    rows: Results
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
@@ -49,7 +50,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     """Run the protocol on a target domain; finished stages come from the cache.
 
     Args:
-        vehicle: what the engineer knows of the vehicle; its nominal θ_p is where the models start from.
+        vehicle: as known before the change; models start around its nominal θ_p.
     """
     stages = stages_of(config, console)
 
@@ -70,14 +71,14 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             if start not in learned:
                 programs.wait_for(start)
                 learned[start] = pretrained(start, vehicle, config, stages, source)
-                lanes.append(_tested(start, "source_only", learned[start], config, stages, target))
+                lanes.append(_tested(start, SOURCE_ONLY, learned[start], config, stages, target))
             lanes += _adapted_lanes(model, learned[start].best, vehicle, config, stages, target)
-    rows = with_rho([row for group in lanes for row in rows_of(group, domain_name(target))])
+    rows = with_rho(rows_of(lanes, domain_name(target)))
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
 
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
-    """A model after pre-training on source flight, one lane a seed."""
+    """A model after pre-training on source flight, one run per seed."""
     shared = settings(config), source, capacity(config)
     found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
     for factor in config.rates.decay:
@@ -89,13 +90,13 @@ def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, sou
 def adapted(
     model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> FitState:
-    """A model after training on target flight, one lane for each size and seed (see `places`), from seeds' fields."""
+    """A model after training on target flight, one run for each size and seed; see `places`."""
     lanes = adaptation(model, mode, fields, config)
     return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, capacity(config))
 
 
 def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
-    """The flights of a domain, from the cache or the simulator, as sensors of the configured noise see them."""
+    """The flights of a domain, from the cache or the simulator, with the configured measurement noise."""
     found = stages.timed(
         f"flights {domain.name}",
         lambda: from_first(lambda: flights(domain, splits, config.data_seed, config.cache)),
@@ -104,7 +105,7 @@ def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: 
 
 
 def from_first(read: Callable[[], Dataset]) -> Dataset:
-    """The dataset that `read` gives on process 0: the others need no file, and all learn from the same bits."""
+    """The dataset that `read` returns on process 0; the others receive the same bits and need no file."""
 
     def parts() -> tuple[Any, Arrays]:
         found = read()
@@ -121,17 +122,17 @@ def from_first(read: Callable[[], Dataset]) -> Dataset:
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the source."""
+    """The splits of the source."""
     return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the target; the train split is the pool from which every seed draws."""
+    """The splits of the target; every seed draws from the train split."""
     return adaptation_splits(config) | {"test": SplitSpec(config.test, 100)}
 
 
 def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
-    """What is flown in the target to adapt to."""
+    """The splits of the target for adaptation."""
     return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
 
 
@@ -140,30 +141,25 @@ def capacity(config: Config) -> tuple[int, int]:
     return config.seeds * len(config.sizes), max(config.source_train, config.pooled())
 
 
-def source_of(model: str) -> str:
-    """The model whose pre-training an adaptation starts from."""
-    return SOURCE_OF.get(model, model)
-
-
 def _adapted_lanes(
     model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
 ) -> list[Lanes]:
-    """The lanes of a model after learning from the target: trained on, and anew, or solved."""
+    """A model after adaptation to the target: fine-tuned and target-only, or solved."""
     if model in SOLVED:
         return [_solved(model, source, config, stages, target)]
-    starts = {"fine_tuned": source, "target_only": fresh_fields(model, vehicle, config)}
+    starts = {FINE_TUNED: source, TARGET_ONLY: fresh_fields(model, vehicle, config)}
     finals = {mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()}
     return [_tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
 
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
-    """Compile all that training and testing a model will run: of windows and models, a program knows shapes alone."""
+    """Compile all programs that training and testing a model will run; they depend on shapes only."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
     before = pretraining(model, vehicle, config)
-    after = adaptation(model, "target_only", fresh, config)
+    after = adaptation(model, TARGET_ONLY, fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
@@ -172,11 +168,11 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
 
 def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
     errors = _errors(f"test {mode} {model}", final.best, config, stages, target)
-    return trained(model, mode, *places((0,) if mode == "source_only" else config.sizes, config), final, errors)
+    return trained(model, mode, *places((0,) if mode == SOURCE_ONLY else config.sizes, config), final, errors)
 
 
 def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    name = f"fine_tuned {model}"
+    name = f"{FINE_TUNED} {model}"
     found = solved(f"{name} {domain_name(target)}", SOLVED[model], source, config, stages, target)
     errors = _errors(f"test {name}", found.fields, config, stages, target)
     return solution(model, *places(config.sizes, config), found, errors)
@@ -190,10 +186,10 @@ def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Sta
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:
-    """The size and the seed of each lane, in the order in which `conditions` makes them."""
+    """The size and the seed of each run, in the order of `conditions`."""
     return [n for n in sizes for _ in range(config.seeds)], [*range(config.seeds)] * len(sizes)
 
 
 def domain_name(dataset: Dataset) -> str:
-    """Where a dataset was flown."""
+    """The domain of a dataset."""
     return str(dataset.config["domain"])

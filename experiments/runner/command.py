@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 from filelock import FileLock, Timeout
@@ -19,6 +19,7 @@ from experiments.runner.run_record import OtherRun, recorded
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
+Options = TypeVar("Options")
 BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
 
 
@@ -66,6 +67,24 @@ def run(
         fresh = " without --fresh" if "--fresh" in arguments else ""
         print(f"{name}: interrupted; the same command{fresh} goes on from here", file=sys.stderr)
         sys.exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED)
+
+
+def call(
+    name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
+) -> None:
+    """Read the command line of a command without presets and run it. Errors as in `run`.
+
+    Args:
+        kind: a dataclass of the options; its docstring is the description.
+    """
+    try:
+        command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
+    except (ValueError, OSError, ImportError) as error:
+        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt:
+        print(f"{name}: interrupted, nothing was written", file=sys.stderr)
+        sys.exit(INTERRUPTED)
 
 
 @contextlib.contextmanager

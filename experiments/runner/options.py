@@ -1,10 +1,21 @@
 """Command-line options shared by all experiments."""
 
-from dataclasses import asdict, dataclass, field
+import math
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field, is_dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal, get_args, get_type_hints
 
 import platformdirs
+
+from hybrid_jax import checks
+
+# Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
+Count = Annotated[int, checks.count]
+CountFromZero = Annotated[int, partial(checks.count, least=0)]
+Positive = Annotated[float, checks.positive]
+NotNegative = Annotated[float, checks.not_negative]
 
 # Options that do not affect the results.
 UNFIXED = ("out", "cache", "fresh", "saving", "distributed", "coordinator", "processes", "process_id")
@@ -47,3 +58,46 @@ class Run:
     def described(self) -> dict[str, Any]:
         """The options that determine the results."""
         return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
+
+
+def check_numbers(prefix: str, options: Any) -> None:
+    """Check every number of a dataclass whose type has a rule, such as `Count`, `tuple[Positive, ...]`, `Count | None`.
+
+    Args:
+        prefix: of the options' names on the command line, such as "--" or "--rates.".
+
+    Raises:
+        ValueError: the first number that its rule refuses, by its name on the command line.
+    """
+    for name, hint in get_type_hints(type(options), include_extras=True).items():
+        option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
+        if is_dataclass(value):
+            check_numbers(f"{option}.", value)
+        for rule in _rules(hint):
+            for number in value if isinstance(value, tuple) else (value,) if value is not None else ():
+                rule(option, number)
+
+
+def _rules(hint: Any) -> list[Any]:
+    own = [rule for rule in getattr(hint, "__metadata__", ()) if callable(rule)]
+    return own + [rule for part in get_args(hint) for rule in _rules(part)]
+
+
+def distinct(option: str, names: Sequence[str]) -> None:
+    """Check an option that lists names.
+
+    Raises:
+        ValueError: no names, or one twice.
+    """
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
+
+
+def factors(option: str, value: tuple[float, float]) -> None:
+    """Check an option that is a range of factors.
+
+    Raises:
+        ValueError: not two finite numbers above 0, the lower one first.
+    """
+    if not 0 < value[0] < value[1] < math.inf:
+        raise ValueError(f"{option} must be two factors, low < high, above 0, got {value}")

@@ -156,7 +156,7 @@ def test_the_command_prints_and_writes_every_case(said_and_written, rows):
     ("changed", "said"),
     [
         ({"n_train": 3}, "--n-train must be more than the 3 parameters, got 3"),
-        ({"repeats": 0}, "--repeats must be at least 1, got 0"),
+        ({"repeats": 0}, "--repeats must be an integer of at least 1, got 0"),
         ({"seed": -1}, "--seed must be an integer of at least 0, got -1"),
         ({"level": 95.0}, "--level must be between 0 and 1, got 95.0"),
         ({"noise_on": ()}, "--noise-on must be targets, all or both, got nothing"),

@@ -1,6 +1,5 @@
-"""Ablations: that each value differs from the default in what its name says, and what a run leaves."""
+"""Ablations: the configuration of each value, tables and figure, and the files of a run."""
 
-import csv
 import json
 import math
 from dataclasses import replace
@@ -8,39 +7,43 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from reports import row
 from rich.console import Console
 from smoke import experiments
 
 from experiments.ablation import PRESETS, Choice, experiment, varied
-from experiments.paper.ablations import Trial, by_choice, figure, tables, to_csv
-from experiments.paper.rows import Row
+from experiments.paper.figures import ablation
+from experiments.paper.lanes import TAGS
 from experiments.paper.sensors import Noise, measured
+from experiments.paper.tables import ablation_tables
+from experiments.reporting.results import Results
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.trajectories import Trajectories
 
 TRUTH = {domain: {"Ix": 0.04, "Iy": 0.02, "k": 1e-5} for domain in ("parameter_shift", "external_force")}
 
 
-def rows(error, ix=0.04):
+def trial(choice, value, default, source_mse, error, ix=0.04):
     """Two seeds in both domains, source-only and fine-tuned at N = 100."""
     theta = {"Ix": ix, "Iy": 0.02, "k": 1e-5}
-    return [
-        Row(domain, "hybrid", mode, n, seed, error * (1 + seed), 0.0, 1e-3, 5, "ok", theta)
+    rows = [
+        row("hybrid", mode, n, seed, error * (1 + seed), domain, theta, val_mse=source_mse[seed])
         for domain in TRUTH
         for mode, n in (("source_only", 0), ("fine_tuned", 100))
         for seed in range(2)
     ]
+    return Results(rows, TAGS).tagged(choice=choice, value=value, default=default)
 
 
-TRIALS = [
-    Trial("norm", "batch", True, [1e-3, 2e-3], rows(0.1)),
-    Trial("norm", "none", False, [1e-3, math.nan], rows(0.4, ix=0.05)),
-    Trial("solver", "heun", False, [1e-3, 2e-3], rows(0.2)),
-]
+ROWS = (
+    trial("norm", "batch", True, [1e-3, 2e-3], 0.1)
+    + trial("norm", "none", False, [1e-3, math.nan], 0.4, ix=0.05)
+    + trial("solver", "heun", False, [1e-3, 2e-3], 0.2)
+)
 
 
 @pytest.mark.parametrize("choice", get_args(Choice))
-def test_every_choice_has_its_default_once_among_valid_values(choice):
+def test_every_choice_has_its_default_once(choice):
     config = PRESETS["paper"]
     changed = list(varied(choice, config).values())
     assert changed.count(config) == 1
@@ -48,27 +51,27 @@ def test_every_choice_has_its_default_once_among_valid_values(choice):
 
 
 @pytest.mark.parametrize(("most", "sizes"), [(40, [40]), (1000, [300, 1000]), (5000, [300, 1000, 3000, 5000])])
-def test_the_source_flights_that_were_asked_for_are_the_most_that_are_tried(most, sizes):
+def test_source_flights_are_at_most_those_asked_for(most, sizes):
     config = replace(PRESETS["smoke"], source_train=most)
     assert [other.source_train for other in varied("source", config).values()] == sizes
 
 
-def test_the_start_in_a_range_of_factors_is_that_whatever_the_others_are_off_by():
+def test_initial_guess_in_a_range_ignores_perturbed_by():
     config = replace(PRESETS["paper"], perturbed_by=0.3)
     assert [other.perturbed_by for other in varied("start", config).values()] == [None, 0.2, 0.5, 1.0]
 
 
-def test_values_that_do_not_go_with_the_other_options_are_refused_before_anything_is_flown(tmp_path):
+def test_contradictory_values_are_refused_before_any_flight(tmp_path):
     config = replace(PRESETS["smoke"], batch_size=1, norm="none", over=("weight", "norm"), out=tmp_path)
     with pytest.raises(ValueError, match="--batch-size must be at least 2 with --norm batch"):
         experiment(config, Console(quiet=True))
     assert not list(tmp_path.iterdir())
 
 
-def test_a_table_has_a_line_for_each_value_in_each_domain_with_means_and_biases():
-    norm, solver = tables(TRIALS, TRUTH)
+def test_tables_have_a_line_per_value_and_domain():
+    norm, solver = ablation_tables(ROWS, TRUTH)
     assert [line[:2] for line in norm.lines] == [
-        [target, value]
+        (target, value)
         for target in ("parameter shift, 100", "external force, 100")
         for value in ("batch (default)", "none")
     ]
@@ -78,22 +81,15 @@ def test_a_table_has_a_line_for_each_value_in_each_domain_with_means_and_biases(
     assert "∞" in norm.lines[1][2]  # a pre-training that was not finite
 
 
-def test_the_csv_has_every_row_and_theta_in_columns():
-    found = list(csv.DictReader(to_csv(TRIALS).splitlines()))
-    assert len(found) == 3 * 8
-    assert {row["choice"] for row in found} == set(by_choice(TRIALS)) == {"norm", "solver"}
-    assert float(found[-1]["Ix"]) == 0.04
-
-
-def test_the_figure_has_a_panel_for_each_domain_and_a_dot_for_each_seed():
-    drawn = figure(TRIALS[:2], "norm", {"external_force": 0.05})
+def test_figure_has_a_panel_per_domain_and_a_line_per_value():
+    drawn = ablation(ROWS.where(choice="norm"), "norm", {"external_force": 0.05})
     assert [axes.get_title() for axes in drawn.axes] == ["Parameter shift", "External force"]
     assert [label.get_text() for label in drawn.axes[0].get_yticklabels()] == ["batch (default)", "none"]
     with pytest.raises(ValueError, match="nothing to draw"):
-        figure([], "norm", {})
+        ablation(Results(), "norm", {})
 
 
-def test_noise_has_its_size_and_spares_the_tests():
+def test_noise_has_its_size_and_spares_the_test_split():
     x = np.zeros((400, 10, 13), np.float32)
     x[..., 3] = 1
     clean = Trajectories(x[:, 0], np.zeros((400, 10, 4), np.float32), x, 0.01)
@@ -106,7 +102,7 @@ def test_noise_has_its_size_and_spares_the_tests():
     np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
 
 
-def test_a_run_leaves_a_report_a_page_and_a_figure_for_each_choice(tmp_path):
+def test_run_writes_report_page_and_figures(tmp_path):
     (run,) = experiments("ablation", "ablation", folder=tmp_path, options=("--over", "noise"))
     assert run.returncode == 0, run.stderr
     out = tmp_path / "out" / "ablation"

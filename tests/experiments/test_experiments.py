@@ -13,8 +13,7 @@ from smoke import ROOT, command, experiments, refused, smallest, unbegun
 
 import hybrid_jax
 from experiments.external_force import sine_floor
-from experiments.paper.results import physics_in
-from experiments.paper.rows import SOURCE_OF
+from experiments.paper.lanes import physics_in, source_of
 from experiments.reporting.report import load_report
 
 EXPERIMENTS = ("param_shift", "external_force")
@@ -69,7 +68,7 @@ def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
     rows = record(folder, name)["rows"]
     source = {row["model"]: row["test_mse"] for row in rows if row["mode"] == "source_only"}
     for row in rows:
-        error = source[SOURCE_OF.get(row["model"], row["model"])]
+        error = source[source_of(row["model"])]
         expected = (error - row["test_mse"]) / error
         np.testing.assert_allclose(row["rho"], expected, rtol=1e-12)
 

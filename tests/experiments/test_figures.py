@@ -1,4 +1,4 @@
-"""Figures say what the rows say, whatever the rows are."""
+"""Figures show the numbers of the rows, also of failed runs, and are reproducible."""
 
 import io
 import math
@@ -9,12 +9,12 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from reports import ODD_ROWS, SIZES, TRUTH, changed, make_rows
-from test_standings import compared_rows, spoilt
+from test_ranking import compared_rows, spoilt
 
-from experiments.paper.comparison_figures import standings
-from experiments.paper.figures import COLOURS, save_figure, scores, theta
+from experiments.paper.figures import ranking, scores, theta
 from experiments.paper.flight_figures import example_flight, predictions, tilt
-from experiments.reporting.error_panels import REACH
+from experiments.reporting.plots import COLOURS, LARGEST_RATIO, save_figure
+from experiments.reporting.results import Results
 
 
 def straight_flight(steps=10):
@@ -33,14 +33,14 @@ def hovering_inputs(steps=10):
 FIGURES = {
     "scores": lambda: scores(make_rows(), "Scores", floor=0.01),
     "theta": lambda: theta(make_rows(), TRUTH),
-    "standings": lambda: standings(compared_rows(), "Standings", {"external_force": 2e-3}),
+    "ranking": lambda: ranking(compared_rows(), "Ranking", {"external_force": 2e-3}),
     "predictions": lambda: predictions(straight_flight(), {100: {"hybrid": straight_flight() * 1.01}}, "Paths"),
     "example_flight": lambda: example_flight(straight_flight(), hovering_inputs(), 0.1),
 }
 
 
 @pytest.mark.parametrize("make", FIGURES.values(), ids=FIGURES)
-def test_the_same_figure_is_the_same_bytes(tmp_path, make):
+def test_figures_are_reproducible(tmp_path, make):
     first, again = (save_figure(make(), tmp_path / name / "figure") for name in ("one", "two"))
     assert [path.name for path in first] == ["figure.png", "figure.svg"]
     for one, two in zip(first, again, strict=True):
@@ -49,7 +49,7 @@ def test_the_same_figure_is_the_same_bytes(tmp_path, make):
     assert b"<dc:date>" not in first[1].read_bytes()
 
 
-def test_drawing_leaves_matplotlibs_settings_alone(tmp_path):
+def test_drawing_keeps_matplotlibs_settings(tmp_path):
     before = dict(mpl.rcParams)
     save_figure(FIGURES["scores"](), tmp_path / "figure")
     assert dict(mpl.rcParams) == before
@@ -59,7 +59,7 @@ def labels(axes):
     return axes.get_legend_handles_labels()[1]
 
 
-def test_scores_show_every_model_and_mode_with_its_mean():
+def test_scores_show_every_mean():
     left, right = scores(make_rows(), "Scores").axes
     assert set(labels(left)) == {
         f"{model}, {mode}"
@@ -72,7 +72,7 @@ def test_scores_show_every_model_and_mode_with_its_mean():
     assert [tick.get_text() for tick in right.get_xticklabels()] == [str(n) for n in SIZES]
 
 
-def test_a_failed_seed_is_marked_and_the_axes_stay_readable():
+def test_failed_seeds_are_marked_and_axes_stay_readable():
     rows = changed(make_rows(), "no_physics", "fine_tuned", 100, factor=1e9)
     rows = changed(rows, "no_physics", "fine_tuned", 500, test_mse=math.nan)
     left, right = scores(rows, "Scores").axes
@@ -88,8 +88,8 @@ def methods_of(axes):
     return [tick.get_text() for tick in axes.get_yticklabels()]
 
 
-def test_standings_have_a_line_for_every_method_of_each_domain_the_smallest_mean_on_top():
-    shift, force = standings(compared_rows(), "Standings").axes
+def test_ranking_has_a_line_per_method_best_first():
+    shift, force = ranking(compared_rows(), "Ranking").axes
     assert methods_of(shift)[:3] == ["hybrid", "Expert Augmentation", "physics-only"]
     assert methods_of(shift)[-1] == "hybrid, source-only"
     assert set(methods_of(force)) == set(methods_of(shift))
@@ -100,17 +100,17 @@ def test_standings_have_a_line_for_every_method_of_each_domain_the_smallest_mean
     assert dots[0].get_xdata() == pytest.approx([3.26e-3 * factor for factor in (0.99, 1, 1.01)])
 
 
-def test_standings_name_n_where_there_are_several():
-    (axes,) = standings(make_rows(), "Standings").axes
+def test_ranking_names_n_if_there_are_several():
+    (axes,) = ranking(make_rows(), "Ranking").axes
     assert {"hybrid, N = 100", "hybrid, N = 1000", "hybrid, source-only"} < set(methods_of(axes))
 
 
-def test_a_method_that_failed_is_told_at_the_edge_of_the_standings_and_flattens_nothing():
+def test_failed_methods_are_marked_at_the_edge_of_the_ranking():
     rows = spoilt(compared_rows(), "last_layer", lambda row: math.nan)
-    rows = spoilt(rows, "theta_d_only", lambda row: math.inf if row.seed else row.error)
-    rows = spoilt(rows, "linear_residual", lambda row: 1e9 * row.error)
-    axes = standings(rows, "Standings").axes[0]
-    assert axes.get_xlim()[1] < 3.26e-3 * REACH * 1.2
+    rows = spoilt(rows, "theta_d_only", lambda row: math.inf if row["seed"] else row["test_mse"])
+    rows = spoilt(rows, "linear_residual", lambda row: 1e9 * row["test_mse"])
+    axes = ranking(rows, "Ranking").axes[0]
+    assert axes.get_xlim()[1] < 3.26e-3 * LARGEST_RATIO * 1.2
     assert methods_of(axes)[-3:] == ["source + linear residual", "θ_d only", "last layer (ridge)"]
     words = [text.get_text() for text in axes.texts]
     assert words == ["3 of 3 beyond, mean 5e+06", "2 of 3 not finite", "3 of 3 not finite"]
@@ -124,7 +124,7 @@ def test_theta_is_relative_to_the_truth_in_percent():
         assert curve.get_color() == COLOURS["hybrid"]
 
 
-def test_the_view_of_predictions_is_the_truths_whatever_the_models_do():
+def test_the_truth_sets_the_view_of_predictions():
     truth, off, lost = straight_flight(), straight_flight(), straight_flight()
     off[5:, 1] = 1e30
     lost[3:] = math.nan
@@ -143,15 +143,15 @@ def test_tilt_is_the_angle_of_roll_and_pitch_alone():
     assert tilt(states) == pytest.approx([math.degrees(0.4), 0.0], abs=1e-12)
 
 
-def test_what_cannot_be_drawn_is_refused():
+def test_empty_or_misshapen_data_are_refused():
     with pytest.raises(ValueError, match="rows must not be empty"):
-        scores([], "Scores")
+        scores(Results(), "Scores")
     with pytest.raises(ValueError, match="rows must not be empty"):
-        standings([], "Standings")
+        ranking(Results(), "Ranking")
     with pytest.raises(ValueError, match="one domain"):
         scores(compared_rows(), "Scores")
     with pytest.raises(ValueError, match="theta"):
-        theta([row for row in make_rows() if row.model == "no_physics"], TRUTH)
+        theta(make_rows().where(model="no_physics"), TRUTH)
     with pytest.raises(ValueError, match="predicted must not be empty"):
         predictions(straight_flight(), {}, "Paths")
     with pytest.raises(ValueError, match=r"predicted\[100\]\['hybrid'\].*13"):
@@ -162,15 +162,15 @@ def test_what_cannot_be_drawn_is_refused():
 
 @settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(rows=ODD_ROWS, floor=st.floats(0, 1e6))
-def test_any_rows_with_something_to_draw_are_drawn(rows, floor):
+def test_any_rows_are_drawn(rows, floor):
     compared = rows
-    rows = [row for row in rows if row.domain == "parameter_shift"]
-    known = [row for row in rows if row.theta and row.mode != "source_only"]
+    rows = rows.where(domain="parameter_shift")
+    known = rows.where(lambda row: row["theta"] and row["mode"] != "source_only")
     drawn = (
         (rows, lambda: scores(rows, "Scores", floor)),
         (known, lambda: theta(rows, TRUTH)),
-        (compared, lambda: standings(compared, "Standings", {"external_force": floor})),
+        (compared, lambda: ranking(compared, "Ranking", {"external_force": floor})),
     )
     for enough, draw in drawn:
-        if enough:
+        if len(enough):
             draw().savefig(io.BytesIO(), format="png", dpi=30)

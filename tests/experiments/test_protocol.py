@@ -149,7 +149,7 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"guess": (1.2, 0.8)}, "--guess"),
         ({"guess": (-1.0, 0.8)}, "--guess"),
         ({"guess": (0.8, math.inf)}, "--guess must be two factors"),
-        ({"perturbed_by": math.nan}, "--guess-off must be a positive finite number, got nan"),
+        ({"perturbed_by": math.nan}, "--perturbed-by must be a positive finite number, got nan"),
         ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
         ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
         ({"data_seed": -1}, "--data-seed must be an integer of at least 0, got -1"),

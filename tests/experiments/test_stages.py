@@ -9,8 +9,8 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
 
-from experiments.paper.results import rows_of, trained
-from experiments.reporting.report_tables import lane_notes
+from experiments.paper.lanes import rows_of, trained
+from experiments.paper.tables import run_notes
 from experiments.runner.progress import SweepLine
 from experiments.runner.stages import Stages
 from hybrid_jax.io.archive import named_leaves
@@ -97,10 +97,10 @@ def test_a_diverged_lane_stops_no_other_and_is_reported_with_its_epoch(tmp_path,
     """A learning rate of 1e3 in one lane: the other keeps every bit."""
     final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
     assert same(lane(final, 0), lane(whole, 0))
-    rows = rows_of(trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2)), "parameter_shift")
-    assert [row.status == "diverged" for row in rows] == [False, True]
-    assert rows[1].epochs == final.epoch[1] < 30
-    assert any("1 of 2 runs met a non-finite loss" in note for note in lane_notes(rows))
+    rows = rows_of([trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2))], "parameter_shift")
+    assert [row["status"] == "diverged" for row in rows] == [False, True]
+    assert rows[1]["epochs"] == final.epoch[1] < 30
+    assert any("1 of 2 runs met a non-finite loss" in note for note in run_notes(rows))
 
 
 def test_a_damaged_file_is_named(tmp_path, whole):

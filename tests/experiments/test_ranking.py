@@ -1,24 +1,24 @@
-"""The comparison: its claim, its tables beside the paper's, its page."""
+"""The comparison: claim C9, the ranking beside the paper's Table 2, the page."""
 
 import io
 import math
-from dataclasses import replace
 
 import pytest
-from reports import TRUTH, make_report
+from reports import TRUTH, make_report, row
 from rich.console import Console
 
 from experiments.paper.claims import claims
-from experiments.paper.rows import DOMAINS, RIVALS, Row, from_csv, with_rho
-from experiments.paper.standings import standings
-from experiments.reporting.report import load_report, print_report, write_report
+from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, with_rho
+from experiments.paper.tables import ranking
+from experiments.reporting.report import load_report, write_report
+from experiments.reporting.results import Results
 
-# As in Table 2, and other rivals behind: means for the hybrid, the best of the seeds for the rest.
+# As in Table 2, and other baselines behind: means for the hybrid, the best of the seeds for the rest.
 ERRORS = {
     ("hybrid", "fine_tuned"): (3.26e-3, 2.64e-3),
     ("expert_augmentation", "source_only"): (3.68e-3, 4.02e-3),
     ("physics_only", "fine_tuned"): (3.76e-3, 4.53e-3),
-    **{(rival, "fine_tuned"): (5e-3, 5e-3) for rival in RIVALS if rival != "expert_augmentation"},
+    **{(model, "fine_tuned"): (5e-3, 5e-3) for model in BASELINES if model != "expert_augmentation"},
     ("hybrid", "source_only"): (0.02, 0.03),
     ("physics_only", "source_only"): (0.01, 0.01),
 }
@@ -27,24 +27,25 @@ TRUTHS = {"parameter_shift": TRUTH, "external_force": TRUTH | {"Ix": 0.029, "Iy"
 
 def compared_rows(seeds=3):
     """Three seeds 1 % apart: around the mean for the fine-tuned hybrid, from the best on for every other method."""
-    return with_rho(
-        Row(domain, model, mode, 100 * (mode == "fine_tuned"), seed, error * (1 + 0.01 * (seed - centre)), None, 1e-3,
-            9, "ok", TRUTHS[domain], dict.fromkeys(TRUTH, (0, 1)))
+    rows = [
+        row(model, mode, 100 * (mode == "fine_tuned"), seed, error * (1 + 0.01 * (seed - centre)), domain,
+            TRUTHS[domain], dict.fromkeys(TRUTH, (0, 1)))
         for (model, mode), errors in ERRORS.items()
         for domain, error in zip(DOMAINS, errors, strict=True)
         for centre in [(seeds - 1) / 2 if (model, mode) == ("hybrid", "fine_tuned") else 0]
         for seed in range(seeds)
-    )  # fmt: skip
+    ]  # fmt: skip
+    return with_rho(Results(rows, TAGS))
 
 
 def spoilt(rows, model, error, domain=None):
     """The rows with the test error of one model's adapted rows computed anew."""
-    return [
-        replace(row, test_mse=error(row), rho=None)
-        if row.model == model and domain in (None, row.domain) and (model in RIVALS or row.n_train)
-        else row
-        for row in rows
-    ]
+
+    def change(row):
+        own = row["model"] == model and domain in (None, row["domain"]) and (model in BASELINES or row["n_train"])
+        return {**row, "test_mse": error(row), "rho": None} if own else row
+
+    return Results([change(row) for row in rows], rows.tags)
 
 
 def verdict(rows):
@@ -53,7 +54,7 @@ def verdict(rows):
     return claim
 
 
-def test_c9_holds_for_the_papers_own_numbers():
+def test_c9_holds_for_the_papers_numbers():
     claim = verdict(compared_rows())
     assert claim.holds is True
     for number in ("0.00326", "0.00368", "0.00376", "0.00264", "0.00402", "0.00453"):
@@ -68,33 +69,33 @@ def test_c9_holds_for_the_papers_own_numbers():
     [("hybrid", 2), ("expert_augmentation", 1.5), ("expert_augmentation", 0.3), ("physics_only", 0.8)],
 )
 def test_c9_needs_the_whole_order_in_both_domains(domain, model, factor):
-    assert verdict(spoilt(compared_rows(), model, lambda row: row.error * factor, domain)).holds is False
+    assert verdict(spoilt(compared_rows(), model, lambda row: row["test_mse"] * factor, domain)).holds is False
 
 
-def test_c9_takes_the_hybrids_mean_and_the_others_best():
+def test_c9_compares_the_hybrids_mean_with_the_others_best():
     """One bad seed ruins the hybrid, but not a rival."""
     for model, holds in (("hybrid", False), ("expert_augmentation", True), ("physics_only", True)):
-        rows = spoilt(compared_rows(), model, lambda row: math.nan if row.seed == 2 else row.error)
+        rows = spoilt(compared_rows(), model, lambda row: math.nan if row["seed"] == 2 else row["test_mse"])
         assert verdict(rows).holds is holds
 
 
 @pytest.mark.parametrize(
     "lacks",
     [
-        lambda row: row.domain == "external_force",
-        lambda row: row.model == "expert_augmentation",
-        lambda row: (row.domain, row.model, row.n_train) == ("external_force", "physics_only", 100),
+        lambda row: row["domain"] == "external_force",
+        lambda row: row["model"] == "expert_augmentation",
+        lambda row: (row["domain"], row["model"], row["n_train"]) == ("external_force", "physics_only", 100),
         lambda row: True,
     ],
 )
-def test_c9_is_not_judged_where_a_domain_or_a_method_is_missing(lacks):
-    claim = verdict([row for row in compared_rows() if not lacks(row)])
+def test_c9_is_inconclusive_without_a_domain_or_a_method(lacks):
+    claim = verdict(compared_rows().where(lambda row: not lacks(row)))
     assert claim.holds is None
     assert "there are no rows of" in claim.measured
 
 
-def test_the_standings_repeat_the_papers_ratios_when_the_rows_are_its_own():
-    for table, physics in zip(standings(compared_rows()), (3.76e-3, 4.53e-3), strict=True):
+def test_ranking_of_the_papers_rows_has_the_papers_ratios():
+    for table, physics in zip(ranking(compared_rows()), (3.76e-3, 4.53e-3), strict=True):
         column = {line[0]: dict(zip(table.header, line, strict=True)) for line in table.lines}
         assert len(column) == len(table.lines) == len(ERRORS)
         for name in ("hybrid", "Expert Augmentation", "physics-only"):
@@ -104,18 +105,18 @@ def test_the_standings_repeat_the_papers_ratios_when_the_rows_are_its_own():
         assert column["hybrid, source-only"]["N"] == column["Expert Augmentation"]["N"] == "–"
 
 
-def test_the_standings_quote_table_2():
-    first, second = standings(compared_rows())
+def test_ranking_quotes_table_2():
+    first, second = ranking(compared_rows())
     quoted = [[line[5] for line in table.lines if line[5] != "–"] for table in (first, second)]
     assert quoted[0] == ["3.26e-03 ± 2.66e-05", "3.68e-03 (smallest)", "3.76e-03 (smallest)"]
     assert quoted[1] == ["2.64e-03 ± 1.56e-04", "4.02e-03 (smallest)", "4.53e-03 (smallest)"]
     assert [line[6] for line in first.lines[:3]] == ["0.867 (mean)", "0.979 (smallest)", "1 (smallest)"]
 
 
-def test_a_method_with_an_infinite_error_stands_last_with_what_it_has():
-    rows = spoilt(compared_rows(), "theta_p_only", lambda row: math.inf if row.seed == 1 else row.error)
+def test_methods_with_infinite_errors_are_last():
+    rows = spoilt(compared_rows(), "theta_p_only", lambda row: math.inf if row["seed"] == 1 else row["test_mse"])
     rows = spoilt(rows, "physics_only", lambda row: math.nan, "external_force")
-    shift, force = standings(rows)
+    shift, force = ranking(rows)
     assert shift.lines[-1][:5] == (
         "θ_p only",
         "100",
@@ -127,11 +128,11 @@ def test_a_method_with_an_infinite_error_stands_last_with_what_it_has():
     assert {line[4] for line in force.lines} == {"–"}
 
 
-def test_the_page_of_a_comparison_has_its_own_tables_and_reads_back(tmp_path):
+def test_page_of_a_comparison(tmp_path):
     report = make_report(compared_rows(), "comparison", TRUTHS, figures={"standings.png": "Every seed"}, notes=["A."])
-    write_report(tmp_path, report)
+    text = io.StringIO()
+    write_report(tmp_path, report, Console(file=text, width=200))
     assert load_report(tmp_path) == report
-    assert from_csv((tmp_path / "rows.csv").read_text()) == report.rows
     page = (tmp_path / "report.md").read_text()
     headings = [line for line in page.splitlines() if line.startswith("## ")]
     assert headings[0].startswith("## Test error L^T_MSE, parameter shift (experiment 1 of the paper; 3 seeds")
@@ -142,6 +143,4 @@ def test_the_page_of_a_comparison_has_its_own_tables_and_reads_back(tmp_path):
     assert "N, target trajectories" not in page
     assert all(page.count(f"- **{name}**") == 1 for name in ("Expert Augmentation", "θ_p only", "last layer (ridge)"))
     assert "95 % ± 0.5" in page
-    text = io.StringIO()
-    print_report(Console(file=text, width=200), report)
     assert "✓ holds" in text.getvalue()

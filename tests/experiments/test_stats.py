@@ -1,17 +1,17 @@
-"""Laws of paired comparisons: their intervals hold the truth as often as they say, and their ends are known."""
+"""Paired comparisons: intervals have their nominal coverage, and limits are exact."""
 
 import math
 
 import numpy as np
 import pytest
 
-from experiments.reporting.paired import mean_difference, share_of_gap
+from experiments.reporting.stats import mean_difference, share_of_gap
 
 REPEATS, SEEDS = 2000, 10
 
 
 @pytest.mark.parametrize("share", [0.0, 0.9, 1.3])
-def test_the_interval_of_a_share_holds_it_in_95_of_100_cases(share):
+def test_coverage_of_share_of_gap(share):
     """Before varies between seeds, after follows it with noise of its own; Fieller's interval is exact for normals."""
     rng = np.random.default_rng(0)
     before = rng.normal(3.0, 0.5, (REPEATS, SEEDS))
@@ -23,7 +23,7 @@ def test_the_interval_of_a_share_holds_it_in_95_of_100_cases(share):
     assert np.mean([interval.value for interval in found]) == pytest.approx(share, abs=0.01)
 
 
-def test_the_interval_of_a_difference_holds_it_in_95_of_100_cases():
+def test_coverage_of_mean_difference():
     rng = np.random.default_rng(1)
     shared = rng.normal(0.0, 5.0, (REPEATS, SEEDS))
     found = [mean_difference(base + rng.normal(1.0, 0.3, SEEDS), base + rng.normal(0.6, 0.3, SEEDS)) for base in shared]
@@ -32,13 +32,13 @@ def test_the_interval_of_a_difference_holds_it_in_95_of_100_cases():
     assert np.mean([interval.high - interval.low for interval in found]) < 1.0
 
 
-def test_what_is_reachable_closes_the_gap_and_what_was_before_closes_none():
+def test_share_of_gap_is_one_at_the_reachable_and_zero_before():
     before, reachable = np.array([4.0, 5.0, 6.0]), np.ones(3)
     assert share_of_gap(before, reachable, reachable) == pytest.approx((1.0, 1.0, 1.0))
     assert share_of_gap(before, before, reachable) == pytest.approx((0.0, 0.0, 0.0))
 
 
-def test_without_a_sure_gap_a_share_has_no_ends_and_without_a_gap_no_value():
+def test_share_without_significant_gap_has_no_ends():
     unsure = share_of_gap([1.2, 0.9, 1.1], [1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
     assert unsure.value == pytest.approx(1.0)
     assert math.isnan(unsure.low)
@@ -46,7 +46,7 @@ def test_without_a_sure_gap_a_share_has_no_ends_and_without_a_gap_no_value():
     assert math.isnan(share_of_gap([0.9, 0.8], [0.9, 0.8], [1.0, 1.0]).value)
 
 
-def test_a_seed_that_failed_is_left_out_of_both():
+def test_failed_seeds_are_left_out():
     whole = share_of_gap([4.0, 5.0, 6.0], [1.5, 1.4, 1.6], [1.0] * 3)
     assert share_of_gap([4.0, 5.0, 6.0, 7.0], [1.5, 1.4, 1.6, math.inf], [1.0] * 4) == pytest.approx(whole)
     assert mean_difference([1.0, math.inf, 3.0], [0.5, 1.0, 2.0]).value == pytest.approx(0.75)

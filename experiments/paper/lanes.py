@@ -1,0 +1,204 @@
+"""Trained and tested models, and their rows in the table of results."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+import hybrid_jax
+from experiments.paper.solved import Solved
+from experiments.reporting import names
+from experiments.reporting.names import label
+from experiments.reporting.results import Results, Row
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.sim.flight import DT
+from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED, FitState
+
+THETA = ("Ix", "Iy", "k")
+DOMAINS = (names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)
+BASELINES = (
+    names.EXPERT_AUGMENTATION,
+    names.THETA_P_ONLY,
+    names.THETA_D_ONLY,
+    names.LAST_LAYER,
+    names.LEAST_SQUARES,
+    names.CONSTANT_DISTURBANCE,
+    names.LINEAR_RESIDUAL,
+)
+MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
+MODES = (names.FINE_TUNED, names.TARGET_ONLY, names.SOURCE_ONLY)
+CELL = ("model", "mode", "n_train")
+TAGS = ("domain", *CELL, "seed")
+Cell = tuple[str, str, int]  # model, mode, n_train
+
+
+@dataclass(frozen=True)
+class Lanes:
+    """The trained models of one kind in one mode, one for each size and seed.
+
+    Attributes:
+        sizes, seeds: of each.
+        fields: the trained models, stacked.
+        errors: L^T_MSE of each on the test flights.
+        val_mse: L_MSE of each on the validation windows.
+        epochs, status: of its training; see `training`.
+        theta: Ix, Iy, k of each; None for models without physics.
+        intervals: name → (lanes, 2), low and high end of the 95 % interval; None where there are none.
+    """
+
+    model: str
+    mode: str
+    sizes: Sequence[int]
+    seeds: Sequence[int]
+    fields: Any
+    errors: np.ndarray
+    val_mse: np.ndarray
+    epochs: np.ndarray
+    status: np.ndarray
+    theta: Mapping[str, np.ndarray] | None
+    intervals: Mapping[str, np.ndarray] | None = None
+
+    def field(self, index: int) -> AbstractVectorField:
+        """One of the models."""
+        return lane(self.fields, index)
+
+
+def trained(
+    model: str, mode: str, sizes: Sequence[int], seeds: Sequence[int], final: FitState, errors: np.ndarray
+) -> Lanes:
+    """The best models of a sweep, tested."""
+    fit = (np.asarray(leaf) for leaf in (final.best_mse, final.epoch, final.status))
+    return Lanes(model, mode, sizes, seeds, final.best, errors, *fit, theta=theta_of(final.best))
+
+
+def solution(model: str, sizes: Sequence[int], seeds: Sequence[int], found: Solved, errors: np.ndarray) -> Lanes:
+    """The models of a method that is solved instead of trained, tested."""
+    return Lanes(model, names.FINE_TUNED, sizes, seeds, found.fields, errors, *found[1:], theta=theta_of(found.fields))
+
+
+def physics_in(field: Any) -> Any:
+    """The physics inside a field, also of nested hybrids."""
+    return physics_in(field.physics) if isinstance(field, Hybrid) else field
+
+
+def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray] | None:
+    """θ_p of a model that has physics, or of stacked ones."""
+    theta = getattr(physics_in(field), "theta", None)
+    return None if theta is None else {name: np.asarray(value) for name, value in theta().items()}
+
+
+def rows_of(groups: Sequence[Lanes], domain: str) -> Results:
+    """A row for each model, without ρ; see `with_rho`.
+
+    Args:
+        domain: in which the models were tested.
+    """
+    return Results([_row(lanes, i, domain) for lanes in groups for i in range(len(lanes.sizes))], TAGS)
+
+
+def with_rho(rows: Results) -> Results:
+    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9).
+
+    L^S is the source-only error of the same domain, seed and model; for one of BASELINES, that of the hybrid.
+
+    Raises:
+        ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.
+    """
+    source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=names.SOURCE_ONLY)}
+
+    def rho(row: Row) -> float | None:
+        key = row["domain"], source_of(row["model"]), row["seed"]
+        if source.get(key, 0) == 0:
+            lack = "a source_only row has test_mse 0:" if key in source else "no source_only row of"
+            raise ValueError(f"{lack} {key[1]}, seed {key[2]}, in {key[0]}: ρ is not defined")
+        before, after = source[key], row["test_mse"]
+        return None if before is None or after is None else (before - after) / before
+
+    return Results([{**row, "rho": rho(row)} for row in rows], rows.tags)
+
+
+def source_of(model: str) -> str:
+    """The model whose pre-training an adaptation starts from."""
+    return names.HYBRID if model in BASELINES else model
+
+
+def gain(row: Row) -> float:
+    """ρ as it counts in a mean: −∞ if the test error is not finite; 1 if only the source-only error is not finite."""
+    if row["rho"] is not None:
+        return row["rho"]
+    return -math.inf if row["test_mse"] is None else 1.0
+
+
+def cells(rows: Results) -> dict[Cell, Results]:
+    """The rows of each model, mode and N, in the order of MODELS, MODES and N.
+
+    Raises:
+        ValueError: rows of several domains, which have no mean together.
+    """
+    if len(domains := sorted(rows.unique("domain"))) > 1:
+        raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
+    return rows.sort(model=MODELS, mode=MODES, n_train=None).group(*CELL)
+
+
+def by_domain(rows: Results) -> dict[str, Results]:
+    """The rows of each domain, in the order of DOMAINS."""
+    return rows.sort(domain=DOMAINS).group("domain")
+
+
+def ranked(rows: Results) -> dict[Cell, Results]:
+    """`cells`, the smallest mean error first; among infinite means the smallest error first."""
+
+    def error(item: tuple[Cell, Results]) -> tuple[float, float]:
+        values = item[1].spread("test_mse")
+        return values.mean, values.smallest
+
+    return dict(sorted(cells(rows).items(), key=error))
+
+
+def method_label(cell: Cell) -> str:
+    """A cell as a method for readers, without its N: an adapted model needs no mode, nor does a baseline."""
+    model, mode, _ = cell
+    return (
+        label(model)
+        if mode == names.FINE_TUNED or (mode == names.SOURCE_ONLY and model in BASELINES)
+        else label(model, mode)
+    )
+
+
+def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:
+    """Save every trained model, with what is known about it."""
+    known = rows.group(*CELL, "seed")
+    for lanes in groups:
+        for i, (size, seed) in enumerate(zip(lanes.sizes, lanes.seeds, strict=True)):
+            row = known[lanes.model, lanes.mode, size, seed][0]
+            about = {name: row[name] for name in ("model", "mode", "n_train", "seed", "test_mse", "val_mse")}
+            name = f"{lanes.model}-{lanes.mode}-{size}-seed{seed}.npz"
+            hybrid_jax.save(folder / name, lanes.field(i), about | {"dt": DT})
+
+
+def _row(lanes: Lanes, i: int, domain: str) -> dict[str, Any]:
+    theta, ends = lanes.theta, lanes.intervals
+    bounds = None if ends is None else {name: _interval(pair[i]) for name, pair in ends.items()}
+    return {
+        "domain": domain,
+        "model": lanes.model,
+        "mode": lanes.mode,
+        "n_train": int(lanes.sizes[i]),
+        "seed": int(lanes.seeds[i]),
+        "test_mse": float(lanes.errors[i]),
+        "rho": None,
+        "val_mse": float(lanes.val_mse[i]),
+        "epochs": int(lanes.epochs[i]),
+        "status": STATUS_NAMES.get(int(lanes.status[i]), STATUS_NAMES[STOPPED]),
+        "theta": None if theta is None else {name: float(value[i]) for name, value in theta.items()},
+        "theta_interval": bounds,
+    }
+
+
+def _interval(ends: np.ndarray) -> list[float] | None:
+    """Both ends, or None if one is not finite: the interval then bounds nothing."""
+    return [float(end) for end in ends] if np.isfinite(ends).all() else None
