@@ -5,13 +5,10 @@ from scipy import signal
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import estimate_time_constant, lagged, respond
-from hybrid_jax.flights.segments import GAP, at_rest, repeats, segments
+from hybrid_jax.flights.motor_response import lagged, respond
+from hybrid_jax.flights.segments import GAP, at_rest, even_segments, repeats, segments
 from hybrid_jax.state import QUATERNION
-from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
-
-JITTER = 0.1  # intervals may differ from their median by this share and still count as equal
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
@@ -153,45 +150,3 @@ def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
     if found is None or sum(found.correlations[:2]) < 0.2:
         raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be told")
     return delay_motors(log, found.lag)
-
-
-def follow_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
-    """`lag_motors` by the time constant that explains roll and pitch best.
-
-    Raises:
-        ValueError: too little flight to tell the time constant.
-    """
-    return lag_motors(log, estimate_time_constant(log, vehicle))
-
-
-def windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectories:
-    """Windows of `steps` intervals within segments, every `stride` intervals (by default they touch).
-
-    Raises:
-        ValueError: samples are not evenly spaced, or no segment is as long as a window.
-    """
-    parts = [
-        windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps, stride=stride)
-        for part in even_segments(log)
-        if part.stop - part.start > steps
-    ]
-    if not parts:
-        longest = max((part.stop - part.start - 1 for part in segments(log)), default=0)
-        raise ValueError(
-            f"{log.name}: no window of steps={steps}: the longest segment without gaps has {longest} intervals"
-        )
-    return concatenate(parts)
-
-
-def even_segments(log: FlightLog) -> list[slice]:
-    """Its segments, if the samples of each are evenly spaced.
-
-    Raises:
-        ValueError: where they are not.
-    """
-    for part in (found := segments(log)):
-        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
-        if uneven.any():
-            at = log.t[part][int(uneven.argmax())]
-            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
-    return found

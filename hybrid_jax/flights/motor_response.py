@@ -77,21 +77,6 @@ def correlations(
     return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
 
 
-def estimate_time_constant(log: FlightLog, vehicle: Vehicle) -> float:
-    """The first-order lag [s] of the rotors behind the log's motor values that explains roll and pitch best.
-
-    Raises:
-        ValueError: too little flight to tell.
-    """
-    scores = []
-    for time_constant in TIME_CONSTANTS:
-        torque, squares = _quick(FlightLog(log.t, log.x, lagged(log, time_constant), log.name), vehicle)
-        scores.append(correlations(torque, squares, mixer(vehicle), 0)[0, :2].sum())
-    if not max(scores) > 0.2:
-        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be told")
-    return float(TIME_CONSTANTS[int(np.argmax(scores))])
-
-
 def lagged(log: FlightLog, time_constant: float) -> Float[np.ndarray, "n 4"]:
     """Mean rotor speed over each interval if rotors follow u as τ ẇ = u − w; each segment starts in equilibrium.
 

@@ -5,7 +5,6 @@
   (windows with a stride of 1 and a horizon of 50).
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -86,30 +85,6 @@ def _errors(field, windows: Trajectories, solver) -> FlightErrors:
     return errors_between(predicted, jnp.asarray(windows.x))
 
 
-def rmse_at(errors: FlightErrors, horizons: Sequence[int]) -> dict[int, FlightErrors]:
-    """The root mean square over windows of the errors (n, t) after each of some numbers of intervals.
-
-    Raises:
-        ValueError: a horizon beyond that of the windows.
-    """
-    longest = np.shape(errors.position)[1]
-    for steps in horizons:
-        checks.count("horizons", steps)
-        if steps > longest:
-            raise ValueError(f"horizons must be at most the {longest} intervals of the windows, got {steps}")
-
-    def rms(part) -> list[float]:
-        return [float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float)))) for steps in horizons]
-
-    columns = zip(*map(rms, errors), strict=True)
-    return {steps: FlightErrors(*column) for steps, column in zip(horizons, columns, strict=True)}
-
-
 def mean_by_step(errors: FlightErrors) -> FlightErrors:
     """The mean error (t,) over windows at each step, as the nanodrone protocol plots it."""
     return FlightErrors(*(np.mean(part, axis=0, dtype=float) for part in errors))
-
-
-def summed_mean(errors: FlightErrors) -> FlightErrors:
-    """The mean error over windows at each step, summed over steps: the nanodrone protocol's score."""
-    return FlightErrors(*(float(np.sum(part)) for part in mean_by_step(errors)))

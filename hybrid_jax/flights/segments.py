@@ -7,6 +7,7 @@ from hybrid_jax.flights.log import FlightLog
 
 GAP = 1.5  # intervals longer than this many times the median are gaps
 IDLE = 0.3  # of the thrust in flight: below it a vehicle stands, falls or rolls
+JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
 RESTING = 0.5  # s that it does so at least before it is said to stand
 
 
@@ -30,6 +31,20 @@ def segments(log: FlightLog) -> list[slice]:
     """The longest runs of samples joined by sound intervals, two samples or more each."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], sound_intervals(log), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def even_segments(log: FlightLog) -> list[slice]:
+    """Return the segments after checking that the samples of each are evenly spaced.
+
+    Raises:
+        ValueError: the time of the first uneven interval.
+    """
+    for part in (found := segments(log)):
+        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
+        if uneven.any():
+            at = log.t[part][int(uneven.argmax())]
+            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return found
 
 
 def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
