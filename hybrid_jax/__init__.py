@@ -19,6 +19,7 @@ Imports point down; simulator and learning meet in `experiments` only. From the 
 from hybrid_jax import runtime
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
+from hybrid_jax.flights.windows import load_windows
 from hybrid_jax.integrate import RK4, rollout, rollout_batch
 from hybrid_jax.io.models import Model, load, save
 from hybrid_jax.networks.mlp import residual_network
@@ -40,6 +41,7 @@ __all__ = [
     "fit",
     "load",
     "load_vehicle",
+    "load_windows",
     "residual_network",
     "rigid_body",
     "rollout",

@@ -123,8 +123,7 @@ def apply_motor_lag(
 
     def error(candidate: list[FlightLog]) -> float:
         fitted_to, predicted = (
-            cut_windows(part, INTERVAL_STEPS).windows
-            for part in (candidate[: len(train)], candidate[len(train) :])
+            cut_windows(part, INTERVAL_STEPS).windows for part in (candidate[: len(train)], candidate[len(train) :])
         )
         field = fit_least_squares(model.physics(), evenly_spaced(fitted_to, LAG_WINDOWS)).field
         return relative_error(flight_errors(field, predicted), flight_errors(baseline, predicted), (INTERVAL_STEPS,))

@@ -27,9 +27,7 @@ class Fold:
     test: list[FlightLog]
 
 
-def make_folds(
-    train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, config: RealFlightConfig
-) -> list[Fold]:
+def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, config: RealFlightConfig) -> list[Fold]:
     """Make the folds; without separate test flights, each training flight is held out once.
 
     Raises:
@@ -109,7 +107,7 @@ def evenly_spaced(windows: Trajectories, count: int) -> Trajectories:
 
 
 def padded(windows: Trajectories, count: int) -> Trajectories:
-    """Pad windows to `count` by repeating the first ones, so that folds share one program; no run samples the padding."""
+    """Pad windows to `count` by repetition, so that folds share one program; no run samples the padding."""
     return windows[np.arange(count) % len(windows)]
 
 

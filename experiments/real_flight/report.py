@@ -1,8 +1,7 @@
-"""What `python -m experiments.real_flight` leaves in its folder: report, rows, figures and models."""
+"""Write the report, rows, figures and models of an experiment on recorded flights."""
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +10,8 @@ import numpy as np
 from rich.console import Console
 
 import hybrid_jax
-from experiments.paper.claims import Claim
-from experiments.paper.figures import save_figure
-from experiments.real_flight.claims import flight_claims
-from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
+from experiments.real_flight.claims import verdicts
+from experiments.real_flight.config import NANODRONE_STEPS
 from experiments.real_flight.figures import (
     Curve,
     Restarted,
@@ -24,244 +21,194 @@ from experiments.real_flight.figures import (
     predicted_flight,
     residual_by_speed,
 )
-from experiments.real_flight.logs import Flown, cut, stretch
-from experiments.real_flight.models import Craft
+from experiments.real_flight.folds import Fold
+from experiments.real_flight.models import physics_of, thrust_baseline
 from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import Cell, FlightRow, by_name, cell_name, cells, to_csv
-from experiments.real_flight.study import Study
+from experiments.real_flight.rows import Cell, cell_name, cells
+from experiments.real_flight.study import Outputs
 from experiments.real_flight.tables import choice_tables, fold_tables, log_tables, parameter_tables, score_tables
-from experiments.real_flight.train import Taught
+from experiments.real_flight.train import Experiment, TrainedModel
+from experiments.reporting import report
+from experiments.reporting.claims import verdict_table
 from experiments.reporting.environment import environment
-from experiments.reporting.report import print_tables
-from experiments.reporting.report_page import sections
-from experiments.reporting.report_tables import Table, verdicts
+from experiments.reporting.plots import save_figures
+from experiments.reporting.tables import print_tables
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.terms import nominal_values
+from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.splits import flight_of
-from hybrid_jax.io.files import json_text, json_value, write_whole
-from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.flights.windows import cut_windows, longest_segment
+from hybrid_jax.io.files import json_value
+from hybrid_jax.state import VELOCITY
 
 PIECES = 6  # predictions in the figure of a flight
-GIVEN = (
-    "An interval of θ_p takes the network as given, and comes from windows of 10 steps that share no sample; it knows "
-    "nothing of what the model lacks."
+NOTES = (
+    "Validation flights stop every training and are not among the N windows.",
+    "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
+    "not account for errors of the model.",
 )
-VALIDATION = "Validation flights stop every training and are not among the N windows."
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """All that the report is made from."""
-
-    name: str
-    config: RealFlightConfig
-    before: Craft
-    after: Craft
-    flown: Mapping[str, Flown]
-    dt: float
-    found: Study
-
-    @property
-    def rows(self) -> list[FlightRow]:
-        """One for each test."""
-        return [scored.row for scored in self.found.scored]
-
-
-def write_outcome(outcome: Outcome, console: Console) -> None:
-    """Write models, figures and, last, the report; print its tables."""
-    out = outcome.config.out / outcome.name
-    save_models(out / "models", outcome)
-    captions = draw(out, outcome)
-    claims = flight_claims(outcome.rows)
-    tables = outcome_tables(outcome, claims)
-    record = to_record(outcome, claims, captions)
-    shown = json.dumps(record["config"], indent=1, ensure_ascii=False)
-    page = sections(head(outcome), tables, captions, record["notes"], record["environment"], shown)
-    files = {"rows.csv": to_csv(outcome.rows), "report.md": page, "report.json": json_text(record)}
-    for name, content in files.items():
-        write_whole(out / name, content)
-    print_tables(console, [*score_tables(outcome.rows, outcome.dt), *judged(claims)])
-    console.print(
-        f"Fold by fold, parameters, checks of every log: {out / 'report.md'}", highlight=False, soft_wrap=True
-    )
-
-
-def outcome_tables(outcome: Outcome, claims: Sequence[Claim]) -> list[Table]:
-    """Scores first, the logs last."""
-    rows = outcome.rows
-    records = [record for flown in outcome.flown.values() for record in flown.records]
-    return [
-        *score_tables(rows, outcome.dt),
-        *judged(claims),
-        *fold_tables(rows),
-        *choice_tables(outcome.found.choices),
-        *parameter_tables(rows, nominal(outcome.before)),
-        *log_tables(records),
-    ]
-
-
-def judged(claims: Sequence[Claim]) -> list[Table]:
-    """The claims, if there are any."""
-    return [verdicts(claims)._replace(title="What should come of it")] if claims else []
-
-
-def to_record(outcome: Outcome, claims: Sequence[Claim], captions: Mapping[str, str]) -> dict[str, Any]:
-    """report.json."""
-    stages = outcome.found.stages
-    record = {
-        "experiment": outcome.name,
-        "config": outcome.config.described(),
-        "environment": environment(stages.seconds),
-        "rows": [asdict(row) for row in outcome.rows],
-        "claims": [asdict(claim) for claim in claims if claim.holds is not None],
-        "not_judged": [{"id": c.id, "text": c.text, "why": c.measured} for c in claims if c.holds is None],
-        "figures": dict(captions),
-        "notes": [*stages.notes(), VALIDATION, GIVEN],
-        "vehicle": {"before": asdict(outcome.before), "after": asdict(outcome.after)},
-        "folds": [_fold_record(fold) for fold in outcome.found.folds],
-        "choices": outcome.found.choices,
-        "logs": {name: flown.records for name, flown in outcome.flown.items()},
+def write_report(name: str, experiment: Experiment, outputs: Outputs, console: Console) -> None:
+    """Write models, figures and, last, the report; print its main tables."""
+    out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
+    save_models(out / "models", experiment, outputs)
+    claims = verdicts(rows)
+    main = [*score_tables(rows, experiment.dt), *([verdict_table(claims, "Hypotheses")] if claims else [])]
+    records = [record for logs in experiment.logs.values() for record in logs.records]
+    nominal = nominal_parameters(experiment.before)
+    more = [*fold_tables(rows), *choice_tables(outputs.choices), *parameter_tables(rows, nominal), *log_tables(records)]
+    extra = {
+        "vehicle": {"before": asdict(experiment.before), "after": asdict(experiment.after)},
+        "folds": [_fold_record(fold) for fold in outputs.folds],
+        "choices": outputs.choices,
+        "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
-    return json_value(record)
-
-
-def head(outcome: Outcome) -> str:
-    """What was done, for a reader who has seen nothing else."""
-    config, rows = outcome.config, outcome.rows
-    flights = ", ".join(f"{len(flown.logs)} {name}" for name, flown in outcome.flown.items())
-    seconds = {name: sum(record["seconds"] for record in flown.records) for name, flown in outcome.flown.items()}
-    of = ", ".join(f"{name} {value:.0f} s" for name, value in seconds.items())
-    recipes = "\n".join(f"- recipe **{name}**: {RECIPES[name].about}" for name in config.tried)
-    adapted = (
-        f"Models learn from the source's flights, then from N windows of the target's ({config.draw}), and predict "
-        if "target" in outcome.flown
-        else "Models learn from flights and predict "
+    written = report.Report(
+        name,
+        json_value(experiment.config.described()),
+        json_value(environment(stages.seconds)),
+        rows,
+        claims,
+        save_figures(out, make_figures(experiment, outputs)),
+        [*stages.notes(), *NOTES],
+        extra,
+        head(name, experiment, outputs),
+        [*main, *more],
     )
-    learned = ", ".join(outcome.before.learn)
-    return f"""# {outcome.name}
+    report.write_report(out, written)
+    print_tables(console, main)
+    console.print(f"Folds, parameters and log checks: {out / 'report.md'}", highlight=False, soft_wrap=True)
 
-{adapted}flights that they have not seen, open loop from every sample with the recorded rotor speeds.
-{flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outcome.found.folds)} folds by \
-{config.folds_by}; {len(rows)} tests, {config.seeds} seeds.
 
-- **hybrid**: a multirotor that learns {learned} (or what its recipe says), plus a small network seen from the body
+def head(name: str, experiment: Experiment, outputs: Outputs) -> str:
+    """Introduce the report to a reader who knows nothing of the experiment."""
+    config, logs = experiment.config, experiment.logs
+    flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
+    seconds = {label: sum(record["seconds"] for record in each.records) for label, each in logs.items()}
+    of = ", ".join(f"{label} {value:.0f} s" for label, value in seconds.items())
+    recipes = "\n".join(f"- recipe **{recipe}**: {RECIPES[recipe].about}" for recipe in config.tried)
+    trained = (
+        f"Models are trained on the source's flights, then on N windows of the target's ({config.draw}), and predict "
+        if "target" in logs
+        else "Models are trained on flights and predict "
+    )
+    return f"""# {name}
+
+{trained}held-out flights, open loop from every sample with the recorded rotor speeds.
+{flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outputs.folds)} folds by \
+{config.folds_by}; {len(outputs.rows)} tests, {config.seeds} seeds.
+
+- **hybrid**: a multirotor that learns {", ".join(experiment.before.learn)} (or what its recipe says), plus a small \
+network of body-frame inputs
 - **no-physics**: the same network with ṗ = v and the attitude's kinematics
 - **physics-only**: the multirotor alone
-- **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its defects
+- **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its residuals
 - **fine-tuned**: from the source's model; **scratch**: from nominal values; **zero-shot**: the source's model as it is
 {recipes}
 
 Errors are lengths of vectors, of rotation the angle. An RMSE is over all test windows."""
 
 
-def curves(outcome: Outcome) -> dict[Cell, Curve]:
-    """Errors at every step of the cells that a figure has room for, all folds' windows together."""
-    power = 1 if outcome.config.protocol == "nanodrone" else 2
-    most = max(row.n_train for row in outcome.rows)
+def curves(experiment: Experiment, outputs: Outputs) -> dict[Cell, Curve]:
+    """Compute errors at every step of the main cells, over the test windows of all folds."""
+    nanodrone = experiment.config.protocol == "nanodrone"
+    power, kind = (1, 1) if nanodrone else (2, 0)
+    most = max(row["n_train"] for row in outputs.rows)
     found: dict[Cell, Curve] = {}
-    for cell in cells(outcome.rows):
+    for cell, group in cells(outputs.table).items():
         model, mode, n = cell
         if n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
             continue
-        own = [scored for scored in outcome.found.scored if scored.row.cell == cell]
         by_seed = []
-        for seed in sorted({scored.row.seed for scored in own}):
-            tests = [scored for scored in own if scored.row.seed == seed]
-            weights = np.array([scored.row.windows for scored in tests], float)
-            errors = np.array([scored.mean if power == 1 else scored.rms for scored in tests])
+        for own in group.group("seed").values():
+            weights, errors = own.numbers("windows"), np.array([outputs.by_step(row)[kind] for row in own])
             by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
         found[cell] = Curve(np.mean(by_seed, axis=0), np.std(by_seed, axis=0))
     return found
 
 
-def draw(out: Path, outcome: Outcome) -> dict[str, str]:
-    """All figures as PNG and SVG; file → caption."""
-    nanodrone = outcome.config.protocol == "nanodrone"
-    measure = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
-    steps = errors_by_step(curves(outcome), outcome.dt, "Error against horizon", "mean error" if nanodrone else "RMSE")
-    figures = {"errors_by_step": (steps, f"Error against horizon, {measure}, test flights of all folds")}
-    if any(row.n_train for row in outcome.rows):
-        by_size = errors_by_size(outcome.rows, outcome.dt, "Error against the amount of target flight")
-        figures["errors_by_size"] = (by_size, "Error against N, the windows of the target learned from")
-    hybrids = _hybrids(outcome.found)
+def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Any, str]]:
+    """Draw all figures: name → figure and caption."""
+    nanodrone, dt = experiment.config.protocol == "nanodrone", experiment.dt
+    measure = "mean error" if nanodrone else "RMSE"
+    caption = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
+    steps = errors_by_step(curves(experiment, outputs), dt, "Error against horizon", measure)
+    figures = {"errors_by_step": (steps, f"Error against horizon, {caption}, test flights of all folds")}
+    if any(row["n_train"] for row in outputs.rows):
+        by_size = errors_by_size(outputs.table, dt, "Error against the amount of target flight")
+        figures["errors_by_size"] = (by_size, "Error against N, the number of target windows trained on")
+    modes = ("fine_tuned", "source_only", "zero_shot")
+    hybrids = {mode: outputs.trained[0, "hybrid", mode] for mode in modes if (0, "hybrid", mode) in outputs.trained}
     if hybrids:
-        figures["predicted_flight"] = (_flight(outcome), "A stretch of a test flight and its predictions")
-        figures["residual_by_speed"] = (
-            _residual(outcome, hybrids),
-            "What the network adds to the physics on test flights, against speed",
-        )
-    for name, (figure, _) in figures.items():
-        save_figure(figure, out / name)
-    return {f"{name}.png": caption for name, (_, caption) in figures.items()}
+        flight = _flight(experiment, outputs, next(iter(hybrids)))
+        figures["predicted_flight"] = (flight, "A part of a test flight and its predictions")
+        network = _residual(outputs.folds[0], hybrids)
+        figures["residual_by_speed"] = (network, "Output of the network on test flights against speed")
+    return figures
 
 
-def save_models(folder: Path, outcome: Outcome) -> None:
-    """Every trained model by name, with what is known about it."""
-    scores = {(row.fold, *row.cell, row.seed): row.scores for row in outcome.rows}
-    for (number, model, mode), taught in outcome.found.taught.items():
-        fold = outcome.found.folds[number].name
-        for index, each in enumerate(taught.lanes):
-            n = len(each.subset) if mode in ("fine_tuned", "scratch") else 0
-            about = {"tested_on": fold, "model": model, "mode": mode, "n_train": n, "seed": each.seed}
-            about |= {"dt": outcome.dt, "scores": json_value(scores[fold, model, mode, n, each.seed])}
-            name = f"fold{number}-{model}-{mode}-{n}-seed{each.seed}.npz"
-            hybrid_jax.save(folder / name, lane(taught.trained.fields, index), about)
+def save_models(folder: Path, experiment: Experiment, outputs: Outputs) -> None:
+    """Save every trained model, with what is known about it."""
+    scores = {tuple(row[tag] for tag in outputs.table.tags): row["scores"] for row in outputs.table}
+    for (number, model, mode), trained in outputs.trained.items():
+        fold = outputs.folds[number].name
+        for run, seed in enumerate(trained.seeds):
+            n = trained.size(run)
+            about = {"tested_on": fold, "model": model, "mode": mode, "n_train": n, "seed": seed}
+            about |= {"dt": experiment.dt, "scores": scores[fold, model, mode, n, seed]}
+            name = f"fold{number}-{model}-{mode}-{n}-seed{seed}.npz"
+            hybrid_jax.save(folder / name, trained.run(run), about)
 
 
-def nominal(craft: Craft) -> dict[str, float]:
-    """Nominal values of what is learned, entry by entry, named as in the rows."""
-    values = nominal_values(craft.vehicle, craft.terms)
-    shapes = {name: np.shape(value) for name, value in craft.physics(RECIPES["staged"]).theta().items()}  # type: ignore
-    return by_name({name: np.reshape(values[name], shape) for name, shape in shapes.items()}, float)
+def nominal_parameters(model: VehicleModel) -> dict[str, float]:
+    """Nominal values of the learned parameters, entry by entry: "Ix", "k_rotors[2]", "aerodynamic_moment[0,1]"."""
+    values = nominal_values(model.vehicle, model.terms)
+    found = {}
+    for name, value in physics_of(model, RECIPES["staged"]).theta().items():  # type: ignore
+        array = np.reshape(values[name], np.shape(value))
+        for place in np.ndindex(array.shape):
+            found[f"{name}[{','.join(map(str, place))}]" if place else name] = float(array[place])
+    return found
 
 
-def _fold_record(fold) -> dict[str, Any]:
+def _fold_record(fold: Fold) -> dict[str, Any]:
     parts = {part: [flight_of(log) for log in getattr(fold, part)] for part in ("train", "validation", "test")}
     return {"tested_on": fold.name} | parts
 
 
-def _hybrids(found: Study) -> dict[str, Taught]:
-    """The hybrids of the first fold, by mode."""
-    modes = ("fine_tuned", "source_only", "zero_shot")
-    return {mode: found.taught[0, "hybrid", mode] for mode in modes if (0, "hybrid", mode) in found.taught}
+def _largest(trained: TrainedModel) -> AbstractVectorField:
+    """The field of the first seed with the most windows."""
+    return trained.run(int(np.argmax([len(subset) for subset in trained.subsets])))
 
 
-def _last(taught: Taught) -> tuple[Cell, AbstractVectorField]:
-    """Seed 0 of the largest size: its number of windows, and the model."""
-    most = max(len(each.subset) for each in taught.lanes)
-    index = next(i for i, each in enumerate(taught.lanes) if len(each.subset) == most)
-    return ("hybrid", "", most), lane(taught.trained.fields, index)
+def _flight(experiment: Experiment, outputs: Outputs, mode: str):
+    config, dt = experiment.config, experiment.dt
+    log, begin, windows = longest_segment(outputs.folds[0].test, config.longest)
+    windows = windows[:PIECES]
+    starts = begin + dt * config.longest * np.arange(len(windows))
+    inside = dt * np.arange(config.longest + 1)
+    fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
+    fields["thrust", "nominal"] = thrust_baseline(experiment.after)
 
-
-def _flight(outcome: Outcome):
-    config, fold = outcome.config, outcome.found.folds[0]
-    shown = stretch(fold.test, config.longest)
-    windows = shown.windows[:PIECES]
-    starts = shown.begin + outcome.dt * config.longest * np.arange(len(windows))
-    inside = outcome.dt * np.arange(config.longest + 1)
-    truth = np.concatenate([windows.x0[:1], *windows.x])
-    mode = next(iter(_hybrids(outcome.found)))
-    fields = {model: _last(outcome.found.taught[0, model, mode])[1] for model in config.models}
-    fields["thrust"] = outcome.after.thrust()
-
-    def restarted(model: str, field: AbstractVectorField) -> Restarted:
+    def restarted(cell: tuple[str, str], field: AbstractVectorField) -> Restarted:
         states = np.asarray(hybrid_jax.rollout_batch(field, windows.x0, windows.u, windows.dt))
         pieces = [(at + inside, np.vstack([x0, x])) for at, x0, x in zip(starts, windows.x0, states, strict=True)]
-        return Restarted(cell_name((model, mode if model != "thrust" else "nominal", 0)), colour_of(model), pieces)
+        return Restarted(cell_name(*cell), colour_of(cell[0]), pieces)
 
-    time = shown.begin + outcome.dt * np.arange(len(truth))
-    title = f"Test flight {flight_of(shown.flight)}, predicted {outcome.dt * config.longest:.3g} s at a time"
-    return predicted_flight(time, truth, [restarted(*each) for each in fields.items()], title)
+    truth = np.concatenate([windows.x0[:1], *windows.x])
+    title = f"Test flight {flight_of(log)}, predicted {dt * config.longest:.3g} s at a time"
+    shown = [restarted(*each) for each in fields.items()]
+    return predicted_flight(begin + dt * np.arange(len(truth)), truth, shown, title)
 
 
-def _residual(outcome: Outcome, hybrids: Mapping[str, Taught]):
-    windows = cut(outcome.found.folds[0].test, 1).windows
+def _residual(fold: Fold, hybrids: Mapping[str, TrainedModel]):
+    windows = cut_windows(fold.test, 1).windows
     x, u = windows.x0, windows.u[:, 0]
-    speed = np.linalg.norm(x[:, 7:10], axis=1)
 
-    def added(taught: Taught) -> np.ndarray:
-        field: Any = _last(taught)[1]
+    def output(trained: TrainedModel) -> np.ndarray:
+        field: Any = _largest(trained)
         return np.asarray(jax.jit(jax.vmap(field.residual))(x, u))
 
-    named = {cell_name(("hybrid", mode, 0)): added(taught) for mode, taught in hybrids.items()}
-    return residual_by_speed(speed, named, "What the network adds, against speed")
+    named = {cell_name("hybrid", mode): output(trained) for mode, trained in hybrids.items()}
+    return residual_by_speed(np.linalg.norm(x[:, VELOCITY], axis=1), named, "Output of the network against speed")

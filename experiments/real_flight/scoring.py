@@ -13,7 +13,7 @@ from jaxtyping import Int
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
 from experiments.real_flight.folds import non_overlapping
 from experiments.real_flight.models import is_body
-from experiments.real_flight.rows import QUANTITIES, SUM, FlightRow, finite
+from experiments.real_flight.rows import QUANTITIES, SUM, finite
 from experiments.real_flight.train import TrainedModel, TrainingData
 from hybrid_jax.adaptation import least_squares, ridge
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
@@ -30,19 +30,24 @@ INTERVAL_STEPS = 10  # length of the windows that intervals of θ_p come from: s
 ROUND = 25  # their number is a multiple of it
 
 
+Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step: RMS and mean over windows, (2, 4, t)
+UNTRAINED = {"n_train": 0, "seed": 0, "recipe": "", "val_loss": None, "epochs": 0, "status": "ok"}
+
+
 def score(
-    field: AbstractVectorField, *, windows: Trajectories, config: RealFlightConfig, fold: str, **labels: Any
-) -> FlightRow:
+    field: AbstractVectorField, *, windows: Trajectories, config: RealFlightConfig, fold: str, **columns: Any
+) -> Test:
     """Test a field.
 
     Args:
-        labels: further attributes of the row.
+        columns: further columns of the row.
     """
     errors = flight_errors(field, windows)
     rms = np.array([np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors])
     mean = np.array(mean_by_step(errors))
-    own = {"scores": scores(rms, mean, config), "by_step": np.stack([rms, mean])}
-    return FlightRow(fold=fold, windows=len(windows), **own, **labels)
+    row = {"fold": fold, "model": "", "mode": "", **UNTRAINED, "windows": len(windows)}
+    row |= {"scores": scores(rms, mean, config), "theta": None, "theta_interval": None}
+    return row | columns, np.stack([rms, mean])
 
 
 def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mapping[str, Mapping[str, float | None]]:
@@ -53,17 +58,15 @@ def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mappi
     return {label: dict(zip(QUANTITIES, map(finite, values), strict=True)) for label, values in found.items()}
 
 
-def score_model(
-    scoring: Callable[..., FlightRow], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]
-) -> list[FlightRow]:
+def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]) -> list[Test]:
     """Test all runs of a model.
 
     Args:
-        scoring: `score` with all but the field and the labels given.
+        scoring: `score` with all but the field and the columns given.
         theta: of each run, from `parameters`.
     """
 
-    def labels(run: int) -> dict[str, Any]:
+    def columns(run: int) -> dict[str, Any]:
         return {
             "model": trained.model,
             "mode": trained.mode,
@@ -76,7 +79,7 @@ def score_model(
             **theta[run],
         }
 
-    return [scoring(trained.run(run), **labels(run)) for run in range(len(trained))]
+    return [scoring(trained.run(run), **columns(run)) for run in range(len(trained))]
 
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:

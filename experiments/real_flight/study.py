@@ -1,19 +1,21 @@
 """Train and test in every fold."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from experiments.real_flight.folds import Fold, hold_out_validation, make_folds, require_windows
 from experiments.real_flight.models import rigid_body_of, thrust_baseline
 from experiments.real_flight.recipes import RECIPES, equivalent_recipe
-from experiments.real_flight.rows import FlightRow, least
+from experiments.real_flight.rows import TAGS, least
 from experiments.real_flight.scoring import (
     INTERVAL_STEPS,
+    Test,
     linear_residuals,
     parameters,
     relative_error,
@@ -32,6 +34,7 @@ from experiments.real_flight.train import (
     train_on_source,
     transfer,
 )
+from experiments.reporting.results import Results
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
@@ -44,22 +47,39 @@ FROM_SCRATCH = ("hybrid",)  # models that are trained from scratch too, to show 
 
 
 @dataclass(frozen=True)
-class Results:
+class Outputs:
     """What an experiment found.
 
     Attributes:
-        rows: one per test.
+        rows: one per test; see `rows`.
+        errors: of each row, by its tags: RMS and mean over windows of the error at every step, (2, 4, t).
         choices: of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
         trained: by number of the fold, model and mode.
     """
 
     folds: list[Fold]
-    rows: list[FlightRow] = field(default_factory=list)
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    errors: dict[tuple[Any, ...], Float[np.ndarray, "2 4 t"]] = field(default_factory=dict)
     choices: dict[str, dict[str, float]] = field(default_factory=dict)
     trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)
 
+    @property
+    def table(self) -> Results:
+        """The table of outputs."""
+        return Results(self.rows, TAGS)
 
-def run_folds(experiment: Experiment) -> Results:
+    def add(self, tests: Iterable[Test]) -> None:
+        """Add the rows and errors of some tests."""
+        for row, errors in tests:
+            self.rows.append(row)
+            self.errors[tuple(row[tag] for tag in TAGS)] = errors
+
+    def by_step(self, row: Mapping[str, Any]) -> Float[np.ndarray, "2 4 t"]:
+        """The errors of a row at every step."""
+        return self.errors[tuple(row[tag] for tag in TAGS)]
+
+
+def run_folds(experiment: Experiment) -> Outputs:
     """Train and test all models in all folds; finished stages come from the cache.
 
     Raises:
@@ -67,14 +87,14 @@ def run_folds(experiment: Experiment) -> Results:
     """
     config, logs = experiment.config, experiment.logs
     tested = logs["test"].logs if "test" in logs else None
-    results = Results(make_folds(logs.get("target", logs["source"]).logs, tested, config))
+    outputs = Outputs(make_folds(logs.get("target", logs["source"]).logs, tested, config))
     source = Fold("source", *hold_out_validation(logs["source"].logs, config), []) if "target" in logs else None
-    require_windows(results.folds, source, config)
+    require_windows(outputs.folds, source, config)
     if source:
-        _run_with_target(experiment, source, results)
+        _run_with_target(experiment, source, outputs)
     else:
-        _run_without_target(experiment, results)
-    return results
+        _run_without_target(experiment, outputs)
+    return outputs
 
 
 def each_fold(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
@@ -87,36 +107,36 @@ def each_fold(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
         yield number, fold
 
 
-def _run_without_target(experiment: Experiment, results: Results) -> None:
+def _run_without_target(experiment: Experiment, outputs: Outputs) -> None:
     """Train on the flights of each fold and test."""
     config, before = experiment.config, experiment.before
-    for number, fold in each_fold(results.folds):
+    for number, fold in each_fold(outputs.folds):
         name = f"fold {number}"
 
         def candidate(recipe: str, fold=fold, name=name) -> TrainedModel:
             data, seeds = source_data(experiment, fold, recipe), min(CHOICE_SEEDS, config.seeds)
             return train_on_source(experiment, f"choice {name}", "hybrid", recipe, data, seeds)
 
-        chosen = _choose_recipe(experiment, results, fold, candidate)
+        chosen = _choose_recipe(experiment, outputs, fold, candidate)
         data, scoring = source_data(experiment, fold, chosen), _scoring(experiment, fold)
-        results.rows.extend(_baselines(scoring, before))
+        outputs.add(_baselines(scoring, before))
         for model in config.models:
             recipe = equivalent_recipe(model, chosen, config.tried)
             trained = train_on_source(experiment, name, model, recipe, data, config.seeds)
             if config.refit:
                 trained = refit(experiment, name, fold, data, trained)
-            _add(results, number, scoring, trained, parameters(trained, data))
-        results.rows.append(_linear_of_source(scoring, before, before, data, "source_only"))
+            _add(outputs, number, scoring, trained, parameters(trained, data))
+        outputs.add(_linear_of_source(scoring, before, before, data, "source_only"))
 
 
-def _run_with_target(experiment: Experiment, source: Fold, results: Results) -> None:
+def _run_with_target(experiment: Experiment, source: Fold, outputs: Outputs) -> None:
     """Train on the source once per recipe, adapt in each fold and test."""
     config = experiment.config
     windows = {RECIPES[name].window for name in config.tried}
-    capacity = max(count_windows(fold.train, steps) for fold in results.folds for steps in windows)
+    capacity = max(count_windows(fold.train, steps) for fold in outputs.folds for steps in windows)
     sources = {name: source_data(experiment, source, name) for name in config.tried}
     trained: dict[tuple[str, str], TrainedModel] = {}
-    for number, fold in each_fold(results.folds):
+    for number, fold in each_fold(outputs.folds):
         name = f"fold {number}"
 
         def candidate(recipe: str, fold=fold, name=name) -> TrainedModel:
@@ -125,36 +145,36 @@ def _run_with_target(experiment: Experiment, source: Fold, results: Results) -> 
             here = target_data(experiment, fold, recipe, data.objective, capacity)
             return adapt(experiment, f"choice {name}", "fine_tuned", start, here, [max(config.n)])
 
-        chosen = _choose_recipe(experiment, results, fold, candidate)
+        chosen = _choose_recipe(experiment, outputs, fold, candidate)
         data, scoring = sources[chosen], _scoring(experiment, fold)
         here = target_data(experiment, fold, chosen, data.objective, capacity)
-        results.rows.extend(_baselines(scoring, experiment.after))
+        outputs.add(_baselines(scoring, experiment.after))
         for model in config.models:
             recipe = equivalent_recipe(model, chosen, config.tried)
             if (model, recipe) not in trained:
                 trained[model, recipe] = train_on_source(experiment, "source", model, recipe, data, config.seeds)
             start = transfer(experiment, trained[model, recipe])
-            _add(results, number, scoring, start, parameters(trained[model, recipe], data))
+            _add(outputs, number, scoring, start, parameters(trained[model, recipe], data))
             for mode in ("fine_tuned", "scratch") if model in FROM_SCRATCH else ("fine_tuned",):
                 adapted = adapt(experiment, name, mode, start, here, config.n)
-                _add(results, number, scoring, adapted, parameters(adapted, here))
-        results.rows.append(_linear_of_source(scoring, experiment.before, experiment.after, data, "zero_shot"))
-        results.rows.extend(_linear_of_target(scoring, experiment.after, here, adapted))
+                _add(outputs, number, scoring, adapted, parameters(adapted, here))
+        outputs.add(_linear_of_source(scoring, experiment.before, experiment.after, data, "zero_shot"))
+        outputs.add(_linear_of_target(scoring, experiment.after, here, adapted))
 
 
-def _scoring(experiment: Experiment, fold: Fold) -> Callable[..., FlightRow]:
+def _scoring(experiment: Experiment, fold: Fold) -> Callable[..., Test]:
     """Bind `score` to the test windows of a fold, one from every sample."""
     windows = cut_windows(fold.test, experiment.config.longest).windows
     return partial(score, windows=windows, config=experiment.config, fold=fold.name)
 
 
-def _add(results: Results, number: int, scoring: Callable[..., FlightRow], trained: TrainedModel, theta) -> None:
-    results.rows.extend(score_model(scoring, trained, theta))
-    results.trained[number, trained.model, trained.mode] = trained
+def _add(outputs: Outputs, number: int, scoring: Callable[..., Test], trained: TrainedModel, theta) -> None:
+    outputs.add(score_model(scoring, trained, theta))
+    outputs.trained[number, trained.model, trained.mode] = trained
 
 
 def _choose_recipe(
-    experiment: Experiment, results: Results, fold: Fold, candidate: Callable[[str], TrainedModel]
+    experiment: Experiment, outputs: Outputs, fold: Fold, candidate: Callable[[str], TrainedModel]
 ) -> str:
     """Choose the recipe whose hybrids do best on the fold's validation flights; of one recipe, take that."""
     config = experiment.config
@@ -167,11 +187,11 @@ def _choose_recipe(
         found = [flight_errors(trained.run(index), windows) for index in range(len(trained))]
         return float(np.mean([relative_error(errors, baseline, config.horizon) for errors in found]))
 
-    results.choices[fold.name] = {name: error(candidate(name)) for name in config.tried}
-    return least(results.choices[fold.name])
+    outputs.choices[fold.name] = {name: error(candidate(name)) for name in config.tried}
+    return least(outputs.choices[fold.name])
 
 
-def _baselines(scoring: Callable[..., FlightRow], model: VehicleModel) -> list[FlightRow]:
+def _baselines(scoring: Callable[..., Test], model: VehicleModel) -> list[Test]:
     fields: Mapping[str, AbstractVectorField] = {"hold": HoldState(), "thrust": thrust_baseline(model)}
     return [scoring(field, model=name, mode="nominal") for name, field in fields.items()]
 
@@ -183,16 +203,16 @@ def _linear(model: VehicleModel, data: TrainingData, subsets: Sequence[np.ndarra
 
 
 def _linear_of_source(
-    scoring: Callable[..., FlightRow], before: VehicleModel, after: VehicleModel, data: TrainingData, mode: str
-) -> FlightRow:
+    scoring: Callable[..., Test], before: VehicleModel, after: VehicleModel, data: TrainingData, mode: str
+) -> list[Test]:
     """Fit a linear residual of the rigid body to all source windows, and test it on the present vehicle."""
     linear = _linear(before, data, [np.arange(len(data.train))])
-    return scoring(with_base(rigid_body_of(after), linear)[0], model="linear_residual", mode=mode)
+    return [scoring(with_base(rigid_body_of(after), linear)[0], model="linear_residual", mode=mode)]
 
 
 def _linear_of_target(
-    scoring: Callable[..., FlightRow], model: VehicleModel, data: TrainingData, adapted: TrainedModel
-) -> list[FlightRow]:
+    scoring: Callable[..., Test], model: VehicleModel, data: TrainingData, adapted: TrainedModel
+) -> list[Test]:
     """Fit a linear residual of the rigid body to the windows of each adapted run, and test it."""
     rows = []
     for size in dict.fromkeys(map(len, adapted.subsets)):

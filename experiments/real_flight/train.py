@@ -111,9 +111,7 @@ def source_data(experiment: Experiment, fold: Fold, recipe: str) -> TrainingData
     return TrainingData(train, validation, objective_of(experiment.before, train.windows, RECIPES[recipe]), len(train))
 
 
-def target_data(
-    experiment: Experiment, fold: Fold, recipe: str, objective: ChannelLoss, capacity: int
-) -> TrainingData:
+def target_data(experiment: Experiment, fold: Fold, recipe: str, objective: ChannelLoss, capacity: int) -> TrainingData:
     """Windows of a fold after the change, one at every sample, with the loss of the source."""
     steps = RECIPES[recipe].window
     validation = evenly_spaced(cut_windows(fold.validation, steps).windows, experiment.config.validation)
