@@ -13,7 +13,7 @@ from rich.console import Console
 
 from benchmarks.timing import Ratio, ratio_table
 from experiments.runner.command import BAD_INPUT, check_folder
-from hybrid_jax.io.files import json_text, read_json, write_whole
+from hybrid_jax.io.files import json_text, read_json, write_atomic
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
 PEERS = "training_peers", "environment_peers"
@@ -49,7 +49,7 @@ def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
             raise RuntimeError(f"benchmark {name} failed; what it says stands above")
         for figure in report.parent.glob(f"{name}.[!j]*"):
             if out is not None:
-                write_whole(out.with_name(f"{out.stem}-{figure.name}"), figure.read_bytes())
+                write_atomic(out.with_name(f"{out.stem}-{figure.name}"), figure.read_bytes())
         return read_json(report)
 
 
@@ -84,7 +84,7 @@ def main() -> None:
     for line in absences(reports):
         console.print(line, markup=False)
     if options.out is not None:
-        write_whole(options.out, json_text({"benchmarks": reports}))
+        write_atomic(options.out, json_text({"benchmarks": reports}))
 
 
 if __name__ == "__main__":

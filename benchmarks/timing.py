@@ -25,7 +25,7 @@ from rich.table import Table
 from experiments.paper.figures import save_figure
 from experiments.reporting.environment import environment
 from experiments.runner.command import BAD_INPUT, check_folder
-from hybrid_jax.io.files import json_text, write_whole
+from hybrid_jax.io.files import json_text, write_atomic
 from hybrid_jax.runtime import PROGRAMS, configure, cores
 
 Call = Callable[[], Any]
@@ -165,7 +165,7 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     _print(findings, Console())
     if options.out is not None:
         report = _report(name, options.preset, findings, time.perf_counter() - began)
-        write_whole(options.out, json_text(report))
+        write_atomic(options.out, json_text(report))
         if findings.figure is not None:
             save_figure(findings.figure, options.out.with_suffix(""))
 

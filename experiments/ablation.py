@@ -24,7 +24,7 @@ from experiments.reporting.report_page import sections
 from experiments.runner import command
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
-from hybrid_jax.io.files import json_text, json_value, write_whole
+from hybrid_jax.io.files import json_text, json_value, write_atomic
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sweep import hosts
@@ -170,7 +170,7 @@ def write(config: AblationConfig, trials: list[Trial], seconds: dict[str, float]
         title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
         save_figure(figure(group, title, floors), out / choice)
     for name, content in contents(config, trials, environment(seconds)).items():
-        write_whole(out / name, content)
+        write_atomic(out / name, content)
 
 
 def contents(config: AblationConfig, trials: list[Trial], where: dict[str, Any]) -> dict[str, str]:

@@ -29,7 +29,7 @@ from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.io.files import json_text, write_whole
+from hybrid_jax.io.files import json_text, write_atomic
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -278,7 +278,7 @@ def experiment(config: Config, console: Console) -> list[CoverageRow]:
     folder = config.out / NAME
     check_folder("--out", folder)
     rows = coverage(config, Console(stderr=True))
-    write_whole(folder / "coverage.json", json_text({"config": asdict(config), "rows": [asdict(row) for row in rows]}))
+    write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": [asdict(row) for row in rows]}))
     console.print(table(rows, config.level))
     return rows
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.io.models import portable
+from hybrid_jax.io.structure import portable
 from hybrid_jax.trajectories import Trajectories
 
 GRAVITY = 9.81

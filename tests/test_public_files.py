@@ -27,7 +27,7 @@ from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.datasets import FORMAT as DATASET
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.io.models import FORMAT as MODEL
-from hybrid_jax.io.models import portable
+from hybrid_jax.io.structure import portable
 
 KEY = jax.random.key(0)
 MIXED = hj.Hybrid(pendulum(), hj.residual_network(2, 1, KEY, hidden=4))

@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.base import (
 )
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance
 from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
-from hybrid_jax.io.models import portable
+from hybrid_jax.io.structure import portable
 from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork
 from hybrid_jax.networks.normalisation import Bias
 from hybrid_jax.sim.domain import Domain

@@ -24,7 +24,7 @@ from experiments.reporting.report import print_tables
 from experiments.reporting.report_page import sections
 from experiments.reporting.report_tables import Table, verdicts
 from hybrid_jax.control import Controller, sample
-from hybrid_jax.io.files import json_text, json_value, write_whole
+from hybrid_jax.io.files import json_text, json_value, write_atomic
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
 from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from hybrid_jax.state import POSITION
@@ -113,7 +113,7 @@ def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
         "notes": [*missing, *outcome.notes],
     }
     for file, text in texts(json_value(record), told, to_csv([*rows, *ablated])).items():
-        write_whole(out / file, text)
+        write_atomic(out / file, text)
     print_tables(console, told)
 
 

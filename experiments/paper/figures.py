@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from experiments.paper.claims import THETA_TOLERANCE
 from experiments.paper.rows import NAMES, THETA, Row
 from experiments.paper.summary import grouped
-from hybrid_jax.io.files import write_whole
+from hybrid_jax.io.files import write_atomic
 
 STYLE: dict[Any, Any] = {
     "font.size": 10,
@@ -114,7 +114,7 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
             figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
             figure.set_layout_engine("none")  # both as the first was laid out: that is half of the work
         paths.append(Path(f"{path}.{suffix}"))
-        write_whole(paths[-1], content.getvalue())
+        write_atomic(paths[-1], content.getvalue())
     return paths
 
 

@@ -16,8 +16,8 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
   show the format of the logs.
 
   Your own logs: one file per flight, CSV with the columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 (SI
-  units, z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; or PX4's .ulg. Ten flights
-  of ten seconds before the change and five after it are a good start. docs/real_flight.md explains the formats.
+  units, z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; or PX4's .ulg. Ten
+  flights of ten seconds before the change and five after it are a good start. docs/real_flight.md explains the formats.
 
   Public flights: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
   idsia-robotics/nanodrone-sysid-benchmark on GitHub. Both need a column map and have licences of their own."""

@@ -5,41 +5,22 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, PRNGKeyArray
+from jaxtyping import PRNGKeyArray
 
 from experiments.real_flight.recipes import Recipe
-from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates
+from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
-from hybrid_jax.io.models import portable
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.networks.views import restricted
-from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 NETWORK, ORDER = range(2)  # uses of a seed: weights of the network, order of the minibatches
-
-
-@portable
-class Kinematics(AbstractVectorField):
-    """ṗ = v and q̇ = ½ q ⊗ [0, ω], with v̇ = ω̇ = 0: what holds without any physics."""
-
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        still = jnp.zeros((6, *x.shape[1:]), x.dtype)
-        return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), still])
-
-
-@train_batch.register(Kinematics)
-@infer_batch.register(Kinematics)
-def kinematics_batch(field, x, u):
-    """Evaluate a batch: the field is written for it."""
-    return field(x, u)
 
 
 def rigid_body_of(model: VehicleModel) -> Multirotor:

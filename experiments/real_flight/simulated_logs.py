@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from hybrid_jax.flights.log import COLUMNS
-from hybrid_jax.io.files import write_whole
+from hybrid_jax.io.files import write_atomic
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import DT, fly, gone_wrong
 from hybrid_jax.vehicle import IRIS, Vehicle
@@ -25,10 +25,10 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
         The vehicle file, and the folders by name: source and target.
     """
     vehicle = folder / "vehicle.toml"
-    write_whole(vehicle, vehicle_toml(IRIS))
+    write_atomic(vehicle, vehicle_toml(IRIS))
     for name, (domain, count) in FLIGHTS.items():
         for index, content in enumerate(_flights(domain, count, seed)):
-            write_whole(folder / name / f"flight_{index:02d}.csv.gz", content)
+            write_atomic(folder / name / f"flight_{index:02d}.csv.gz", content)
     return vehicle, {name: folder / name for name in FLIGHTS}
 
 

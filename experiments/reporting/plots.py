@@ -16,7 +16,7 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
 from experiments.reporting import names
-from hybrid_jax.io.files import write_whole
+from hybrid_jax.io.files import write_atomic
 
 STYLE: dict[Any, Any] = {
     "font.size": 10,
@@ -81,7 +81,7 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
             figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
             figure.set_layout_engine("none")  # the second file keeps the layout of the first, which saves half the time
         paths.append(Path(f"{path}.{suffix}"))
-        write_whole(paths[-1], content.getvalue())
+        write_atomic(paths[-1], content.getvalue())
     return paths
 
 

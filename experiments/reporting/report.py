@@ -13,7 +13,7 @@ from experiments.reporting import claims
 from experiments.reporting.claims import Verdict
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table, markdown, plain, print_tables
-from hybrid_jax.io.files import json_text, json_value, read_json, write_whole
+from hybrid_jax.io.files import json_text, json_value, read_json, write_atomic
 
 FORMAT = 2  # of report.json; 1 had no key "format", and rows of some experiments without all their tags
 JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
@@ -65,7 +65,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     record = json_text(to_json(report))
     contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
-        write_whole(Path(out) / name, content)
+        write_atomic(Path(out) / name, content)
     if console is not None:
         print_tables(console, report.tables)
         for note in report.notes:

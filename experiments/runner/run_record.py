@@ -10,7 +10,7 @@ from typing import Any
 from experiments.paper.config import Run
 from experiments.reporting.environment import PACKAGES
 from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_whole
+from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
 
 FILE = "run.json"
 FIXED = ("config", "versions", "flights")  # what must be the same for a run to go on
@@ -45,7 +45,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
         yield
     except ValueError:
         if found:
-            write_whole(folder / FILE, json_text(found))
+            write_atomic(folder / FILE, json_text(found))
         else:
             (folder / FILE).unlink()
         raise
@@ -81,7 +81,7 @@ def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> N
 
 
 def _write(folder: Path, record: Mapping[str, Any], state: str) -> None:
-    write_whole(folder / FILE, json_text({**record, "state": state}))
+    write_atomic(folder / FILE, json_text({**record, "state": state}))
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:

@@ -19,7 +19,7 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import parametrise
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
 from hybrid_jax.integrate import rollout
-from hybrid_jax.io.models import portable
+from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories, check, split

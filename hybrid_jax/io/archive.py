@@ -1,4 +1,4 @@
-"""Named arrays and a JSON header in one file: no pickle, a checksum of its own, the same bytes for the same content."""
+"""Archives: named arrays and JSON metadata in one file, without pickle, with a checksum, byte for byte reproducible."""
 
 import hashlib
 import io
@@ -11,30 +11,33 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
 from hybrid_jax.checks import first_line
-from hybrid_jax.io.files import write_whole
+from hybrid_jax.io.files import write_atomic
 
 HEADER = "header.json"
-NUMERIC = "biufc"  # kinds of NumPy types that are kept
+NUMERIC = {np.dtype(kind) for kind in "?bhilqBHILQefdFD"}
+# JAX's own number types, which a .npy cannot describe: stored as integers of the same size.
+EXTENDED = {np.dtype(kind).name: np.dtype(kind) for kind in (jnp.bfloat16, jnp.float8_e4m3fn, jnp.float8_e5m2)}
 Arrays = Mapping[str, np.ndarray]
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:
-    """Write an archive whole or not at all.
+    """Write an archive atomically.
 
     Args:
-        form: what kind of archive it is, and the version of that kind; the reader asks for the same.
+        form: the kind of archive and its version, such as "hybrid_jax model 2".
 
     Raises:
-        ValueError: the metadata are not JSON, or an array is not of numbers.
-        OSError: the folder cannot be written.
+        ValueError: the metadata are not JSON, or an array is not numeric.
+        OSError: the file cannot be written.
     """
     for name, array in arrays.items():
-        if array.dtype.kind not in NUMERIC:
-            raise ValueError(f"array {name!r} is of {array.dtype}, which cannot be saved")
+        if array.dtype not in NUMERIC:
+            raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
     header = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}
     buffer = io.BytesIO()
     # An .npz is a zip of .npy; entries made by hand carry no clock, so equal content gives equal bytes.
@@ -43,36 +46,38 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
         for name, array in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
                 np.lib.format.write_array(entry, _contiguous(array), allow_pickle=False)
-    write_whole(path, buffer.getvalue())
+    write_atomic(path, buffer.getvalue())
 
 
-def load_archive(path: str | Path, form: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """The metadata and arrays of an archive, verified.
+def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarray]]:
+    """Read and verify an archive of one of these forms.
+
+    Returns:
+        Its metadata, and its arrays by name.
 
     Raises:
-        ValueError: the file is missing, truncated, of another kind or damaged; one line that names the file.
+        ValueError: the file is missing, truncated, damaged or of another form; one line that names the file.
     """
     path = Path(path)
     try:
         entries = _read_entries(path)
         header = json.loads(entries.pop(HEADER, b"{}"))
-        if not isinstance(header, dict) or header.get("format") != form:
-            raise ValueError(f"has no header of {form!r}")
+        if not isinstance(header, dict) or header.get("format") not in forms:
+            raise ValueError(f"no header of {forms[0]!r}")
         arrays = {name.removesuffix(".npy"): _read_array(name, entry) for name, entry in entries.items()}
         found = digest(header.get("metadata"), arrays)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError) as error:
-        raise ValueError(
-            f"{path}: truncated, damaged or not a {form.rsplit(' ', 1)[0]}: {first_line(error)}"
-        ) from error
+        kind = forms[0].rpartition(" ")[0]
+        raise ValueError(f"{path}: truncated, damaged or not a {kind}: {first_line(error)}") from error
     if header.get("sha256") != found:
         raise ValueError(f"{path}: checksum differs from the one recorded: the file is damaged or was altered")
     return header.get("metadata"), arrays
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
-    """SHA-256 (hex) over metadata, whatever the order of their keys, and names, types, shapes and bytes of arrays.
+    """SHA-256 (hex) of metadata and arrays. The order of keys and names does not matter.
 
     Raises:
         ValueError: the metadata are not JSON.
@@ -86,7 +91,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
 
 
 def encode(value: Any, **layout: Any) -> bytes:
-    """Strict JSON as bytes.
+    """Encode a value as strict JSON.
 
     Raises:
         ValueError: the value has no JSON form.
@@ -98,16 +103,23 @@ def encode(value: Any, **layout: Any) -> bytes:
 
 
 def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
-    """The arrays of a tree by their path in it."""
-    leaves, _ = jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))
-    return {jax.tree_util.keystr(path, simple=True, separator="/"): np.asarray(leaf) for path, leaf in leaves}
+    """The arrays of a tree as NumPy arrays, by path.
+
+    Raises:
+        ValueError: two arrays have the same path.
+    """
+    paths, leaves, _ = _flatten(eqx.filter(tree, eqx.is_array))
+    if len(set(paths)) < len(paths):
+        twice = next(path for path in paths if paths.count(path) > 1)
+        raise ValueError(f"two arrays have the path {twice!r}: no key of a dictionary may contain '/'")
+    return dict(zip(paths, map(to_numpy, leaves), strict=True))
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
-    """The tree `like` with its arrays replaced by those of the same path.
+    """The tree `like` with each array replaced by that of the same path.
 
     Raises:
-        ValueError: other paths, shapes or types; names `origin` and the first that differs.
+        ValueError: paths, shapes or types differ; names `origin` and the first difference.
     """
     expected = named_leaves(like)
     for name in sorted(expected.keys() | arrays.keys()):
@@ -116,17 +128,44 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path) -> PyTree:
             found = "absent" if have is None else f"{have.dtype}{list(have.shape)}"
             wanted = "none" if want is None else f"{want.dtype}{list(want.shape)}"
             raise ValueError(f"{origin}: array {name!r} is {found}, expected {wanted}")
-    whole, rest = eqx.partition(like, eqx.is_array)
-    paths, structure = jax.tree_util.tree_flatten_with_path(whole)
-    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in paths]
-    return eqx.combine(jax.tree.unflatten(structure, [arrays[name] for name in names]), rest)
+    dynamic, rest = eqx.partition(like, eqx.is_array)
+    paths, leaves, structure = _flatten(dynamic)
+    filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(paths, leaves, strict=True)]
+    return eqx.combine(jax.tree.unflatten(structure, filled), rest)
+
+
+def _flatten(tree: PyTree) -> tuple[list[str], list[Any], Any]:
+    leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
+    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
+    return names, [leaf for _, leaf in leaves], structure
+
+
+def array_type(array: Any) -> dict[str, str]:
+    """What a NumPy array of `to_numpy` does not say: the algorithm of a random key, or a type in `EXTENDED`."""
+    if jnp.issubdtype(array.dtype, jax.dtypes.prng_key):
+        return {"key": str(jax.random.key_impl(array))}
+    return {"dtype": array.dtype.name} if array.dtype.name in EXTENDED else {}
+
+
+def to_numpy(array: Any) -> np.ndarray:
+    """An array in a type that a .npy can describe."""
+    kind = array_type(array)
+    stored = np.asarray(jax.random.key_data(array) if "key" in kind else array)
+    return stored.view(f"u{stored.itemsize}") if "dtype" in kind else stored
+
+
+def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
+    """The inverse of `to_numpy`, with `kind` from `array_type`."""
+    if "key" in kind:
+        return jax.random.wrap_key_data(jnp.asarray(array), impl=kind["key"])
+    return array.view(EXTENDED[kind["dtype"]]) if "dtype" in kind else array
 
 
 def _read_entries(path: Path) -> dict[str, bytes]:
-    """The bytes of each entry by its name.
+    """The bytes of each entry by name.
 
-    Nothing is written, so no name leads anywhere; one that would was not written here. Nor is a compressed entry, with
-    which a small file could fill the memory.
+    Names that leave the folder, and compressed entries, which could fill the memory, are refused: neither is written
+    here.
     """
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
@@ -142,14 +181,14 @@ def _read_entries(path: Path) -> dict[str, bytes]:
 
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:
-    """The array of numbers in a .npy, whose header is believed only if it declares what is there."""
+    """The array in a .npy whose header agrees with its size."""
     file = io.BytesIO(entry)
     if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"entry {name!r} is a .npy of a version that is not written here")
+        raise ValueError(f"entry {name!r} is a .npy of an unknown version")
     shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
     declared = math.prod(shape) * dtype.itemsize if min(shape, default=0) >= 0 else None
-    if dtype.kind not in NUMERIC or declared != len(entry) - file.tell():
-        raise ValueError(f"entry {name!r} holds no numbers, or other than {dtype}{list(shape)}, as it declares")
+    if dtype not in NUMERIC or declared != len(entry) - file.tell():
+        raise ValueError(f"entry {name!r} is not numeric, or its size is not that of {dtype}{list(shape)}")
     order = "F" if in_fortran_order else "C"
     return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)
 

@@ -1,4 +1,4 @@
-"""Files that are written whole or not at all, and JSON that any reader accepts."""
+"""Atomic writes, and strict JSON."""
 
 import itertools
 import json
@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 
-def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write a neighbour of the file, then put it in the file's place in one step; text is UTF-8.
+def write_atomic(path: str | Path, content: str | bytes) -> None:
+    """Write a temporary file beside `path`, then rename it to `path`. Text is written as UTF-8.
 
     Raises:
-        OSError: the folder cannot be made or written, or is full; what stood at `path` is untouched.
+        OSError: the file cannot be written; an earlier file at `path` is unchanged.
     """
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -25,32 +25,32 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         with temporary.open("wb") as file:
             file.write(content.encode() if isinstance(content, str) else content)
             file.flush()
-            os.fsync(file.fileno())  # or a power cut could leave the new name on no content
+            os.fsync(file.fileno())  # otherwise a power cut could leave an empty file
         os.replace(temporary, path)
     except OSError as error:
-        # A full disk names no file.
+        # The error of a full disk names no file.
         raise OSError(f"{path}: cannot be saved: {error.strerror}; what was saved before is intact") from error
     finally:
         temporary.unlink(missing_ok=True)
 
 
 def backup_path(path: Path, reason: str) -> Path:
-    """A free name beside `path` with the reason and the time (UTC), for what must give way and not be deleted."""
+    """An unused name beside `path` with the reason and the time (UTC), to rename a file instead of deleting it."""
     stem = f"{path.name}.{reason}-{datetime.now(UTC):%Y%m%dT%H%M%SZ}"
     names = itertools.chain([stem], (f"{stem}-{i}" for i in itertools.count(2)))
     return next(free for free in map(path.with_name, names) if not free.exists())
 
 
 def json_text(value: Any) -> str:
-    """Indented JSON of `json_value(value)`, ending in a newline."""
+    """`json_value(value)` as indented JSON that ends in a newline."""
     return json.dumps(json_value(value), indent=1, allow_nan=False, ensure_ascii=False) + "\n"
 
 
 def json_value(value: Any) -> Any:
-    """The JSON form of nested mappings, sequences, arrays, paths and numbers; a number that is not finite is null.
+    """The JSON form of nested mappings, sequences, arrays, paths and numbers. Non-finite numbers become null.
 
     Raises:
-        ValueError: a value of another type, named with its type.
+        ValueError: a value of another type.
     """
     match value:
         case None | bool() | int() | str():
@@ -69,10 +69,10 @@ def json_value(value: Any) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """The content of a JSON file; NaN and Infinity, which are not JSON, are refused.
+    """Read a JSON file.
 
     Raises:
-        ValueError: the file cannot be read, or is truncated or otherwise not JSON; one line.
+        ValueError: the file cannot be read or is not JSON (NaN and Infinity are not); one line.
     """
     try:
         return json.loads(Path(path).read_bytes(), parse_constant=_refuse)

@@ -1,10 +1,11 @@
-"""Trained models as files: saved, loaded with one call, used for prediction. Loading runs no code from the file."""
+"""Trained models as files: saved and loaded with one call. A file holds data; loading it runs no code of the file."""
 
 import dataclasses
+import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -13,68 +14,44 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
-from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance
-from hybrid_jax.dynamics.multirotor import Multirotor
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, check_start
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics.rigid_body import check_start
 from hybrid_jax.integrate import checked, rollout, rollout_batch
-from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.networks.mlp import FusedNetwork, InputScaling, LinearResidual, LinearSkip, ResidualNetwork
-from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
-from hybrid_jax.networks.rotor_thrust import RotorThrust
-from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.io.archive import load_archive, named_leaves, save_archive, to_numpy, with_leaves
+from hybrid_jax.io.structure import Structure, decode
 
-FORMAT = "hybrid_jax model 1"
-_KINDS: dict[str, type] = {}
-Kind = TypeVar("Kind", bound=type)
-
-
-def portable(kind: Kind) -> Kind:
-    """Let a module class be saved and loaded under its name; use it as a decorator on a field of one's own.
-
-    The class must be made from its fields: numbers, text, arrays, tuples, dictionaries and other portable classes.
-    """
-    _KINDS[kind.__name__] = kind
-    return kind
-
-
-_FIELDS = (
-    *(ConstantDisturbance, FusedNetwork, ForcedBody, Frozen, FrozenRates, HoldState, Hybrid),
-    *(LinearSkip, LinearResidual, Multirotor, ResidualNetwork, RigidBody, RotorThrust),
-)
-_VIEWS = (Accelerations, BodyFrame, BodyMotion, Motion, GroundDistance, DropXY, DropXYYaw)
-_PARTS = (BatchNorm, Bias, InputScaling, LayerNorm, RunningStats, Terms, Vehicle)
-for _kind in _FIELDS + _VIEWS + _PARTS:
-    portable(_kind)
+FORMAT = "hybrid_jax model 2"
+FORMAT_1 = "hybrid_jax model 1"
 
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field that has left the lab, with what is known about it.
+    """A vector field and what is known about it.
 
     Attributes:
         field: the vector field ẋ = f(x, u).
-        about: JSON values: where it comes from, how well it did.
+        about: JSON values, such as where the model comes from and its test error.
     """
 
-    field: AbstractVectorField
+    field: Any
     about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The states after each of t intervals of dt [s] with the inputs held over them; one window or n.
+        """The states of one window, or of n, under inputs that are held for dt each.
 
-        What is returned is finite: a prediction that diverges is of no use to a caller, who might not look. Where the
-        other windows are wanted all the same, `rollout_batch` carries on.
+        Args:
+            x0: initial states.
+            u: inputs of t intervals.
+            dt: length of an interval [s].
+
+        Returns:
+            The state at the end of each interval; finite. To keep the other windows where some diverge, use
+            `rollout_batch`.
 
         Raises:
-            ValueError: shapes that do not agree, a number that is not finite, dt that is not positive, a start of a
-                rigid body without a unit quaternion, a model that is no vector field or not of such states and inputs,
-                or a prediction that diverges; says in which window and from which interval on.
+            ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
+                body starts without a unit quaternion, or a prediction diverges.
         """
         if not callable(self.field):
             name = type(self.field).__name__
@@ -83,10 +60,10 @@ class Model:
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
         check_start(self.field, x0)
         predicted = _predict(self.field, x0, u, dt)
-        lost = ~np.isfinite(predicted).all(axis=-1)
-        if lost.any():
-            *window, interval = np.argwhere(lost)[0].tolist()
-            where = f" of window {window[0]}, the first of {lost.any(axis=-1).sum()}," if window else ""
+        diverged = ~np.isfinite(predicted).all(axis=-1)
+        if diverged.any():
+            *window, interval = np.argwhere(diverged)[0].tolist()
+            where = f" of window {window[0]}, the first of {diverged.any(axis=-1).sum()}," if window else ""
             raise ValueError(f"the prediction{where} diverges: it is not finite from interval {interval} on")
         return predicted
 
@@ -96,75 +73,75 @@ def _predict(field, x0, u, dt):
     return rollout(field, x0, u, dt) if x0.ndim == 1 else rollout_batch(field, x0, u, dt)
 
 
-def save(path: str | Path, field: AbstractVectorField, about: Mapping[str, Any] | None = None) -> None:
-    """Write a field and what is known about it to one file.
+def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
+    """Write a model to one file: any Equinox module, and JSON values `about` it.
+
+    If the file alone will not be enough to load the model (see `check_savable`), it is saved with a warning that `load`
+    needs `like`.
 
     Raises:
-        ValueError: the field holds something that is not portable; says what and how to mend it.
-        OSError: the folder cannot be written.
+        ValueError: `about` is not JSON, or the field contains an object that is no array, number, text, function,
+            container or module; names its path.
+        OSError: the file cannot be written.
     """
-    arrays: dict[str, np.ndarray] = {}
-    save_archive(path, FORMAT, {"field": _encode(field, "field", arrays), "about": dict(about or {})}, arrays)
+    structure = _structure(field)
+    arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
+    save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about or {})}, arrays)
+    if structure.problem is not None:
+        warnings.warn(f"{path}: to load this model pass like=: {structure.problem}", stacklevel=2)
 
 
-def load(path: str | Path) -> Model:
+def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     """Read a model that `save` wrote.
 
+    Args:
+        like: a field of the same structure, whose arrays are replaced by those of the file; everything else is taken
+            from `like`. Needed for classes and functions that the file cannot name, such as local classes and lambdas.
+            Without it, the modules that define the model's classes must have been imported.
+
     Raises:
-        ValueError: the file is missing, damaged, no model, or of a class that this program has not made portable.
+        ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
+            its arrays do not fit `like`.
     """
-    metadata, arrays = load_archive(path, FORMAT)
+    metadata, arrays = load_archive(path, FORMAT, FORMAT_1)
     try:
-        field: Any = _decode(metadata["field"], arrays)
-        about = dict(metadata["about"])
-    except (KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{path}: not a whole model: {checks.first_line(error)}") from error
+        about, tree = dict(metadata["about"]), metadata["field"]
+        field = decode(tree, arrays) if like is None else None
+    except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
+        raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
-    if type(field).__name__ not in _KINDS:
-        raise ValueError(f"{path}: not a whole model: its field is a {type(field).__name__}")
+    if like is not None:
+        dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
+        filled = with_leaves({"field": like}, dynamic, path)["field"]
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, filled)
+    if not isinstance(field, eqx.Module):
+        raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
     return Model(field, about)
 
 
-def describe(field: AbstractVectorField) -> Any:
-    """What a field is apart from its arrays, as JSON values: classes, the vehicle, scalings, names of parameters.
+def check_savable(field: eqx.Module) -> str | None:
+    """Why a file alone could not rebuild this field, or None if it can.
 
     Raises:
-        ValueError: as `save`.
+        ValueError: the field cannot be saved at all.
     """
-    return _encode(field, "field", {})
+    return _structure(field).problem
 
 
-def _encode(value: Any, path: str, arrays: dict[str, np.ndarray]) -> Any:
-    name = type(value).__name__
-    if _KINDS.get(name) is type(value):
-        parts = {f.name: _encode(getattr(value, f.name), f"{path}/{f.name}", arrays) for f in fields(value)}
-        return {"kind": name, "fields": parts}
-    match value:
-        case jax.Array() | np.ndarray() if not jnp.issubdtype(value.dtype, jax.dtypes.extended):
-            if path in arrays:
-                raise ValueError(f"two arrays would be {path}; let no key of a dictionary hold a '/'")
-            arrays[path] = np.asarray(value)
-            return {"array": path}
-        case dict() if all(isinstance(key, str) for key in value):
-            return {"items": {key: _encode(item, f"{path}/{key}", arrays) for key, item in value.items()}}
-        case tuple():
-            return {"tuple": [_encode(item, f"{path}/{i}", arrays) for i, item in enumerate(value)]}
-        case None | bool() | int() | float() | str():
-            return value
-    raise ValueError(f"{path} is a {name}, which cannot be saved; decorate its class with hybrid_jax.portable")
+def describe(field: eqx.Module) -> Any:
+    """The structure of a field as JSON values: classes, static values and the paths of its arrays, not their values.
+
+    Raises:
+        ValueError: a part of the field has no name that a file could refer to.
+    """
+    structure = _structure(field)
+    if structure.problem is not None:
+        raise ValueError(structure.problem)
+    return structure.tree
 
 
-def _decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
-    match value:
-        case {"kind": str() as name, "fields": dict() as parts}:
-            if name not in _KINDS:
-                raise ValueError(f"a model of class {name!r}, which no class here made portable")
-            return _KINDS[name](**{key: _decode(part, arrays) for key, part in parts.items()})
-        case {"array": str() as path}:
-            return jnp.asarray(arrays[path])
-        case {"items": dict() as items}:
-            return {key: _decode(item, arrays) for key, item in items.items()}
-        case {"tuple": list() as items}:
-            return tuple(_decode(item, arrays) for item in items)
-    return value
+def _structure(field: eqx.Module) -> Structure:
+    if not isinstance(field, eqx.Module):
+        raise ValueError(f"field must be an Equinox module, got {checks.short_repr(field)}")
+    return Structure(field)

@@ -10,10 +10,11 @@ from recorded import CONFIG, LOGS, OTHERS
 
 from experiments.real_flight import train
 from experiments.real_flight.folds import folds_of, lessons
-from experiments.real_flight.models import Craft, Kinematics, fresh, moved, rates_of, settings_of
+from experiments.real_flight.models import Craft, fresh, moved, rates_of, settings_of
 from experiments.real_flight.recipes import RECIPES, alike, stage_of
 from experiments.real_flight.scoring import body_of
 from experiments.real_flight.train import Course
+from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.state import POSITION
 from hybrid_jax.sweep.lanes import count, lane

@@ -18,12 +18,13 @@ from experiments.real_flight.claims import flight_claims
 from experiments.real_flight.figures import errors_by_size
 from experiments.real_flight.folds import apart, drawn, folds_of, lessons
 from experiments.real_flight.logs import Flown, Windows, count_windows, cut, fly_in, require_one_rate, stretch
-from experiments.real_flight.models import Craft, Kinematics, Lane, fresh
+from experiments.real_flight.models import Craft, Lane, fresh
 from experiments.real_flight.recipes import RECIPES
 from experiments.real_flight.rows import QUANTITIES, FlightRow, pooled
 from experiments.real_flight.scoring import parameters, scores
 from experiments.real_flight.study import in_turn, study
 from experiments.real_flight.train import Course
+from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout
 from hybrid_jax.rotation import angle_between

@@ -1,0 +1,232 @@
+"""The structure of a field as JSON: classes and functions by name, static values, and the path of each array.
+
+Reading a structure runs no code that the file chooses. A class is looked up among the modules that the program has
+already imported and must be an Equinox module of exactly that name. Its `__init__` is not called.
+"""
+
+import dataclasses
+import inspect
+import math
+import sys
+from collections.abc import Callable, Mapping
+from functools import partial
+from types import ModuleType
+from typing import Any, TypeVar, overload
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from hybrid_jax.io.archive import array_type, from_numpy
+from hybrid_jax.io.renamed import RENAMED
+
+_ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid
+    log_softmax mish relu relu6 selu sigmoid silu soft_sign softmax softplus sparse_plus sparse_sigmoid squareplus
+    standardize swish tanh"""
+_ELEMENTWISE = """abs add arccos arccosh arcsin arcsinh arctan arctan2 arctanh cbrt ceil clip conj cos cosh deg2rad
+    divide exp exp2 expm1 floor hypot imag log log10 log1p log2 logaddexp maximum minimum mod multiply negative positive
+    power rad2deg real reciprocal round sign sin sinc sinh sqrt square subtract tan tanh where"""
+_TYPES = """bool_ int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 bfloat16 float32 float64 complex64
+    complex128"""
+# The functions and types that a file may name.
+_ALLOWED: dict[str, Any] = {
+    f"{module.__name__}.{name}": vars(module)[name]
+    for module, names in ((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE + " " + _TYPES), (np, _TYPES))
+    for name in names.split()
+    if name in vars(module)
+}
+_ALLOWED["equinox.identity"] = inspect.signature(eqx.nn.MLP).parameters["final_activation"].default
+_PORTABLE: dict[str, Any] = {}  # "@name" → class or function
+Item = TypeVar("Item", bound=Callable)
+
+
+@overload
+def portable(item: Item) -> Item: ...
+@overload
+def portable(*, name: str) -> Callable[[Item], Item]: ...
+def portable(item: Any = None, *, name: str | None = None) -> Any:
+    """Decorator: saved models refer to this class or function by a name that does not depend on its module.
+
+    An Equinox module needs no decorator unless it may move to another module. A function that a field holds, or a
+    dataclass that is no Equinox module, needs it to be loaded without `like`.
+
+    Args:
+        name: stored in files; the item's own name by default.
+
+    Raises:
+        ValueError: another class or function already has the name.
+    """
+    if item is None:
+        return partial(portable, name=name)
+    name = f"@{item.__name__ if name is None else name}"
+    taken = _PORTABLE.get(name)
+    if taken is not None and _address(taken) != _address(item):
+        raise ValueError(f"name {name[1:]!r} is taken by {_address(taken)}; use portable(name=...)")
+    _PORTABLE[name] = item
+    return item
+
+
+def _address(item: Any) -> str:
+    return f"{item.__module__}:{item.__qualname__}"
+
+
+class Structure:
+    """The structure of a field.
+
+    Attributes:
+        tree: JSON values.
+        static_arrays: arrays in static fields, by path; the others are leaves of the field.
+        problem: why `decode` cannot rebuild the field, or None.
+
+    Raises:
+        ValueError: the field contains an object that cannot be saved; names its path.
+    """
+
+    def __init__(self, field: eqx.Module):
+        self.static_arrays: dict[str, Any] = {}
+        self.problem: str | None = None
+        try:
+            self.tree = self._encode(field, "field", static=False)
+        except RecursionError as error:
+            raise ValueError("field is nested too deeply to be saved, or contains itself") from error
+
+    def _encode(self, value: Any, path: str, static: bool) -> Any:
+        kind = type(value)
+        if value is None or kind in (bool, int, str) or (kind is float and math.isfinite(value)):
+            return value
+        if kind in (float, complex):
+            return {kind.__name__: repr(value)}
+        if kind in (list, tuple):
+            return {kind.__name__: [self._encode(item, f"{path}/{i}", static) for i, item in enumerate(value)]}
+        if kind is dict and all(type(key) in (str, int) for key in value):
+            return {"items": [[key, self._encode(item, f"{path}/{key}", static)] for key, item in value.items()]}
+        if eqx.is_array(value):
+            if not static:
+                return {"array": path, **array_type(value)}
+            self.static_arrays[f"static/{path}"] = value
+            return {"static": f"static/{path}", **array_type(value)}
+        if isinstance(value, np.dtype):
+            return {"dtype": value.name}
+        if (name := _name_of(value)) is not None:
+            return {"named": name}
+        if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            return self._encode_fields(value, path, static)
+        return self._unknown(value, path, static)
+
+    def _encode_fields(self, value: Any, path: str, static: bool) -> Any:
+        name = _name_of(type(value)) or _address(type(value))
+        try:
+            if find_class(name) is not type(value):
+                self._note(f"{path} is of a class that {name} no longer refers to")
+        except ValueError as error:
+            self._note(f"{path}: {error}")
+        static |= not isinstance(value, eqx.Module)
+        parts = {
+            f.name: self._encode(getattr(value, f.name), f"{path}/{f.name}", static or f.metadata.get("static", False))
+            for f in dataclasses.fields(value)
+        }
+        return {"class": name, "fields": parts}
+
+    def _unknown(self, value: Any, path: str, static: bool) -> Any:
+        name = _address(type(value))
+        if callable(value):
+            name = f"the function {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
+        elif not static and jax.tree_util.all_leaves([value]):
+            expected = "an array, number, text, function, container or module"
+            raise ValueError(f"{path} is of type {name}, which cannot be saved; expected {expected}")
+        self._note(reason := f"{path} is {name}")
+        return {"unknown": reason}
+
+    def _note(self, problem: str) -> None:
+        self.problem = self.problem or problem
+
+
+def decode(value: Any, arrays: Mapping[str, np.ndarray]) -> Any:
+    """The object that a structure describes.
+
+    Raises:
+        ValueError: a class or function that this program does not know, or fields that do not fit the class.
+        KeyError, TypeError, AttributeError, RecursionError, OverflowError: the structure is malformed.
+    """
+    match value:
+        case None | bool() | int() | float() | str():
+            return value
+        case {"class": str() as name, "fields": dict() as parts} | {"kind": str() as name, "fields": dict() as parts}:
+            return _rebuild(name, {key: decode(part, arrays) for key, part in parts.items()})
+        case {"array": str() as path, **kind}:
+            return jnp.asarray(from_numpy(arrays[path], kind))
+        case {"static": str() as path, **kind}:
+            return from_numpy(arrays[path], kind)[()]
+        case {"items": dict() | list() as items}:  # a dictionary in format 1
+            pairs = items.items() if isinstance(items, dict) else items
+            return {key: decode(item, arrays) for key, item in pairs}
+        case {"tuple": list() as items}:
+            return tuple(decode(item, arrays) for item in items)
+        case {"list": list() as items}:
+            return [decode(item, arrays) for item in items]
+        case {"float": str() as text}:
+            return float(text)
+        case {"complex": str() as text}:
+            return complex(text)
+        case {"dtype": str() as name}:
+            return np.dtype(name)
+        case {"named": str() as name} if name in _ALLOWED or name in _PORTABLE:
+            return _ALLOWED[name] if name in _ALLOWED else _PORTABLE[name]
+        case {"named": str() as name}:
+            raise ValueError(f"function {name} is unknown: import the module that makes it portable, or pass like=")
+        case {"unknown": str() as reason}:
+            raise ValueError(f"{reason}; pass like=")
+    raise ValueError("an entry of its structure is malformed")
+
+
+def find_class(name: str) -> type:
+    """The class "module:qualname" of a module that is already imported, or the portable class "@name".
+
+    Raises:
+        ValueError: there is none, or it is no Equinox module.
+    """
+    module, _, qualname = name.partition(":")
+    found: Any = _PORTABLE.get(name, sys.modules.get(module))
+    if found is None:
+        what = f"the module that makes {name[1:]} portable" if name.startswith("@") else module
+        raise ValueError(f"class {name} is not known here: import {what} first, or pass like=")
+    for part in qualname.split(".") if qualname else ():
+        # Not getattr: a module's or class's own __getattr__ could run code.
+        found = vars(found).get(part) if isinstance(found, type | ModuleType) else None
+    is_own = name in _PORTABLE or module.startswith("hybrid_jax.")
+    if not (
+        isinstance(found, type) and (issubclass(found, eqx.Module) or (is_own and dataclasses.is_dataclass(found)))
+    ):
+        raise ValueError(f"{name} is not an Equinox module at the top level of a Python module; pass like=")
+    if qualname and _address(found) != name:
+        raise ValueError(f"{name} is another name of {_address(found)}; pass like=")
+    return found
+
+
+def _rebuild(name: str, parts: dict[str, Any]) -> Any:
+    """An object with these fields, made without its `__init__`.
+
+    The checks of this library's own classes (`__check_init__`, `__post_init__`) run, so that a damaged or forged file
+    gives no vehicle of negative mass. Those of other classes do not.
+    """
+    in_format_1 = ":" not in name and not name.startswith("@")
+    cls: Any = RENAMED.get(name) or find_class(f"@{name}" if in_format_1 else name)
+    if not isinstance(cls, type):
+        return cls(parts)
+    made, known = object.__new__(cls), dataclasses.fields(cls)
+    values = {f.name: f.default for f in known if f.default is not dataclasses.MISSING} | parts
+    if values.keys() != {f.name for f in known}:
+        wanted = ", ".join(f.name for f in known)
+        raise ValueError(f"class {name} has fields {wanted}, but the file has {', '.join(parts) or 'none'}")
+    for key, value in values.items():
+        object.__setattr__(made, key, value)
+    for base in reversed(cls.__mro__):
+        for check in ("__post_init__", "__check_init__"):
+            if base.__module__.startswith("hybrid_jax.") and check in vars(base):
+                vars(base)[check](made)
+    return made
+
+
+def _name_of(value: Any) -> str | None:
+    return next((name for name, item in (_PORTABLE | _ALLOWED).items() if item is value), None)
