@@ -21,7 +21,7 @@ def verdicts(rows: Results) -> list[Verdict]:
     if best not in found:
         return []
     baselines = [cell for cell in found if cell[0] in BASELINES]
-    rivals = [(model, *best[1:]) for model in ("no_physics", "physics_only")]
+    rivals: list[Cell] = [(model, best[1], best[2]) for model in ("no_physics", "physics_only")]
     claims = [
         _better("F1", best, baselines, "every simple baseline"),
         _better("F2", best, rivals, "no-physics and physics-only"),

@@ -20,7 +20,7 @@ from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.flights.scores import FlightErrors, flight_errors, mean_by_step
-from hybrid_jax.sweep.lanes import count, lane, stack
+from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training import stages
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
@@ -139,10 +139,16 @@ def body_of(field: AbstractVectorField) -> Multirotor:
 
 
 def linear_residuals(
-    base: AbstractVectorField, windows: Trajectories, subsets: Sequence[np.ndarray], validation: Trajectories
-) -> Any:
-    """Fit a linear residual of the base to each subset of the windows (all of one size); return the fields stacked."""
-    return jax.device_get(_linear_residuals(base, windows, stack(list(subsets)), validation))
+    base: AbstractVectorField, data: TrainingData, subsets: Sequence[np.ndarray], test_base: AbstractVectorField
+) -> list[AbstractVectorField]:
+    """Fit a linear residual of `base` to each subset of the training windows, all of one size.
+
+    Args:
+        test_base: field that the fitted residuals are added to, such as `base` with another payload.
+    """
+    windows = stages.cut(data.train.windows, min(INTERVAL_STEPS, data.train.windows.horizon))
+    fitted = jax.device_get(_linear_residuals(base, windows, stack(list(subsets)), data.validation))
+    return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 
 
 @eqx.filter_jit
@@ -151,11 +157,6 @@ def _linear_residuals(base, windows: Trajectories, subsets: Int[np.ndarray, "run
         return ridge.adapted(ridge.linear_residual, base, windows[subset], validation).field
 
     return jax.lax.map(one, subsets)
-
-
-def with_base(base: AbstractVectorField, linear: Any) -> list[AbstractVectorField]:
-    """Put the linear residuals of stacked fields on another base."""
-    return [Hybrid(base, lane(linear, run).residual) for run in range(count(linear.residual))]
 
 
 def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:

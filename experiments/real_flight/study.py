@@ -14,14 +14,12 @@ from experiments.real_flight.models import rigid_body_of, thrust_baseline
 from experiments.real_flight.recipes import RECIPES, equivalent_recipe
 from experiments.real_flight.rows import TAGS, least
 from experiments.real_flight.scoring import (
-    INTERVAL_STEPS,
     Test,
     linear_residuals,
     parameters,
     relative_error,
     score,
     score_model,
-    with_base,
 )
 from experiments.real_flight.train import (
     Experiment,
@@ -40,7 +38,6 @@ from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows
-from hybrid_jax.training import stages
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
 FROM_SCRATCH = ("hybrid",)  # models that are trained from scratch too, to show what the source is worth
@@ -196,29 +193,23 @@ def _baselines(scoring: Callable[..., Test], model: VehicleModel) -> list[Test]:
     return [scoring(field, model=name, mode="nominal") for name, field in fields.items()]
 
 
-def _linear(model: VehicleModel, data: TrainingData, subsets: Sequence[np.ndarray]) -> Any:
-    windows = data.train.windows
-    short = stages.cut(windows, min(INTERVAL_STEPS, windows.horizon))
-    return linear_residuals(rigid_body_of(model), short, subsets, data.validation)
-
-
 def _linear_of_source(
     scoring: Callable[..., Test], before: VehicleModel, after: VehicleModel, data: TrainingData, mode: str
 ) -> list[Test]:
     """Fit a linear residual of the rigid body to all source windows, and test it on the present vehicle."""
-    linear = _linear(before, data, [np.arange(len(data.train))])
-    return [scoring(with_base(rigid_body_of(after), linear)[0], model="linear_residual", mode=mode)]
+    windows = [np.arange(len(data.train))]
+    (field,) = linear_residuals(rigid_body_of(before), data, windows, rigid_body_of(after))
+    return [scoring(field, model="linear_residual", mode=mode)]
 
 
 def _linear_of_target(
     scoring: Callable[..., Test], model: VehicleModel, data: TrainingData, adapted: TrainedModel
 ) -> list[Test]:
     """Fit a linear residual of the rigid body to the windows of each adapted run, and test it."""
-    rows = []
+    tests, body = [], rigid_body_of(model)
     for size in dict.fromkeys(map(len, adapted.subsets)):
-        runs = [index for index, subset in enumerate(adapted.subsets) if len(subset) == size]
-        linear = _linear(model, data, [adapted.subsets[index] for index in runs])
-        fields = with_base(rigid_body_of(model), linear)
-        labels = {"model": "linear_residual", "mode": "scratch", "n_train": size}
-        rows += [scoring(each, **labels, seed=adapted.seeds[i]) for i, each in zip(runs, fields, strict=True)]
-    return rows
+        runs = [run for run, subset in enumerate(adapted.subsets) if len(subset) == size]
+        fields = linear_residuals(body, data, [adapted.subsets[run] for run in runs], body)
+        columns = {"model": "linear_residual", "mode": "scratch", "n_train": size}
+        tests += [scoring(each, **columns, seed=adapted.seeds[i]) for i, each in zip(runs, fields, strict=True)]
+    return tests

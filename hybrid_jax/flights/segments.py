@@ -40,11 +40,20 @@ def even_segments(log: FlightLog) -> list[slice]:
         ValueError: the time of the first uneven interval.
     """
     for part in (found := segments(log)):
-        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
+        uneven = _uneven(log, part)
         if uneven.any():
             at = log.t[part][int(uneven.argmax())]
             raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
     return found
+
+
+def is_even(log: FlightLog) -> bool:
+    """Whether the samples of each segment are evenly spaced."""
+    return not any(_uneven(log, part).any() for part in segments(log))
+
+
+def _uneven(log: FlightLog, part: slice) -> Bool[np.ndarray, " n-1"]:
+    return np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
 
 
 def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:

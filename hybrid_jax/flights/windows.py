@@ -14,7 +14,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mappe
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, segments
+from hybrid_jax.flights.segments import even_segments, is_even, segments
 from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
@@ -80,7 +80,7 @@ def load_windows(
     for log in logs:
         _report_failures(log, vehicle, strict)
     if dt is not None:
-        logs = [log if log.dt == dt else resample(log, dt)[0] for log in logs]
+        logs = [log if log.dt == dt and is_even(log) else resample(log, dt)[0] for log in logs]
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
