@@ -31,7 +31,6 @@ ROUND = 25  # their number is a multiple of it
 
 
 Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step: RMS and mean over windows, (2, 4, t)
-UNTRAINED = {"n_train": 0, "seed": 0, "recipe": "", "val_loss": None, "epochs": 0, "status": "ok"}
 
 
 def score(
@@ -45,8 +44,9 @@ def score(
     errors = flight_errors(field, windows)
     rms = np.array([np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors])
     mean = np.array(mean_by_step(errors))
-    row = {"fold": fold, "model": "", "mode": "", **UNTRAINED, "windows": len(windows)}
-    row |= {"scores": scores(rms, mean, config), "theta": None, "theta_interval": None}
+    row = {"fold": fold, "model": "", "mode": "", "n_train": 0, "seed": 0, "recipe": "", "windows": len(windows)}
+    row |= {"val_loss": None, "epochs": 0, "status": "ok", "scores": scores(rms, mean, config)}
+    row |= {"theta": None, "theta_interval": None}
     return row | columns, np.stack([rms, mean])
 
 

@@ -1,8 +1,7 @@
-"""How well a field predicts recorded flight, in four quantities that have units, and in the two ways others report it.
+"""Prediction errors on recorded flight in position, velocity, rotation and body rates.
 
-- At horizons: the root mean square, over windows, of the length of the error after 10, 50, … intervals.
-- The nanodrone protocol: from every sample, 50 intervals open loop; the mean error of each step, summed over steps
-  (windows with a stride of 1 and a horizon of 50).
+Two protocols use them: the RMSE over windows after 10, 50, … intervals, and that of the nanodrone benchmark, the mean
+error of each of 50 steps from every sample, summed over steps.
 """
 
 from typing import NamedTuple
@@ -24,7 +23,7 @@ Errors = Float[np.ndarray, "n t"]
 
 
 class FlightErrors(NamedTuple):
-    """One number, or an array of them, for each quantity.
+    """An error for each quantity.
 
     Attributes:
         position: length of the error vector [m].
@@ -40,7 +39,7 @@ class FlightErrors(NamedTuple):
 
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
-    """The error of each predicted state."""
+    """Compute the error of each predicted state."""
 
     def length(part: slice):
         return jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1)
