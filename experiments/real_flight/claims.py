@@ -1,7 +1,7 @@
 """Hypotheses about adaptation to recorded flight, and the verdicts of the results."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -37,10 +37,7 @@ def verdicts(rows: Results) -> list[Verdict]:
 
 def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cells]:
     """Claim that a cell has a smaller error than each of the others, in every quantity and at every horizon."""
-    return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", _predicate(cell, others))
 
-
-def _predicate(cell: Cell, others: Sequence[Cell]) -> Callable[[Cells], tuple[bool, str]]:
     def predicate(found: Cells) -> tuple[bool, str]:
         known = [found[other] for other in others if other in found]
         if not known:
@@ -55,7 +52,7 @@ def _predicate(cell: Cell, others: Sequence[Cell]) -> Callable[[Cells], tuple[bo
         words = ", ".join(f"{where} {ratio:.3f}" for where, ratio in ratios.items())
         return all(ratio < 1 for ratio in ratios.values()), f"error over that of the best of them: {words}"
 
-    return predicate
+    return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", predicate)
 
 
 def _ratio(rows: Results, others: Results, label: str, quantity: str) -> float:

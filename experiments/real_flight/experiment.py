@@ -32,11 +32,7 @@ LAG_WINDOWS = 300  # windows that physics is fitted to for each candidate of the
 
 
 def run(config: RealFlightConfig, console: Console) -> None:
-    """Run the experiment from the logs to the report.
-
-    Raises:
-        ValueError: the option, or file, row and field, and what to do, in one line.
-    """
+    """Run the experiment from the logs to the report."""
     experiment = prepare(config, console)
     results = run_folds(experiment)
     if hosts.is_main_process():
@@ -44,11 +40,7 @@ def run(config: RealFlightConfig, console: Console) -> None:
 
 
 def prepare(config: RealFlightConfig, console: Console) -> Experiment:
-    """Load the vehicle and all logs, and check them.
-
-    Raises:
-        ValueError: as `run`.
-    """
+    """Load the vehicle and all logs, and check them."""
     config.require_flights()
     if config.simulated:
         path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
@@ -77,9 +69,6 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
     Returns:
         The vehicle of the source, that of target and test, and whether the rotors' time constant is to be chosen.
-
-    Raises:
-        ValueError: the file, the key and what was expected, in one line.
     """
     tables = read_tables(path)
     before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
@@ -89,11 +78,7 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 
 def require_untested_source(folders: Mapping[str, Path], config: RealFlightConfig) -> None:
-    """Refuse to choose the rotors' time constant on flights, or manoeuvres, that models are tested on.
-
-    Raises:
-        ValueError: what to do instead.
-    """
+    """Refuse to choose the rotors' time constant on flights, or manoeuvres, that models are tested on."""
     if "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
         raise ValueError(
             f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "

@@ -45,9 +45,6 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
 
     Args:
         measure: what an error is, such as "RMSE".
-
-    Raises:
-        ValueError: no curves.
     """
     if not curves:
         raise ValueError("curves must not be empty: there is nothing to draw")
@@ -65,11 +62,7 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
 
 @mpl.rc_context(STYLE)
 def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
-    """A row of panels for each horizon: the error against N; models without target windows are horizontal lines.
-
-    Raises:
-        ValueError: no model is adapted.
-    """
+    """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
     if not sizes:

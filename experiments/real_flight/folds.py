@@ -28,11 +28,7 @@ class Fold:
 
 
 def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, config: RealFlightConfig) -> list[Fold]:
-    """Make the folds; without separate test flights, each training flight is held out once.
-
-    Raises:
-        ValueError: too few flights or names.
-    """
+    """Make the folds; without separate test flights, each training flight is held out once."""
     if tested is not None and (config.target is not None or config.folds_by == "flight"):
         return [Fold("test", *hold_out_validation(train, config), list(tested))]
     of = GROUP_BY[config.folds_by]
@@ -58,11 +54,7 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
 
 
 def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> tuple[list[FlightLog], list[FlightLog]]:
-    """Split flights into training and validation: a fifth of the names, but at least one, is for validation.
-
-    Raises:
-        ValueError: all flights are of one name.
-    """
+    """Split flights into training and validation: a fifth of the names, but at least one, is for validation."""
     of = GROUP_BY[config.validated_by]
     names = sorted({of(log) for log in logs})
     if len(names) < 2:
@@ -80,9 +72,6 @@ def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlig
 
     Args:
         source: the source flights, where the folds hold flights to adapt to.
-
-    Raises:
-        ValueError: the flights without a window, or that a fold has fewer windows than --n.
     """
     longest = max(RECIPES[name].window for name in config.tried)
     for fold in (*([source] if source else []), *folds):
@@ -118,9 +107,6 @@ def sampled_indices(sizes: Sequence[int], size: int, draw: str, seed: int) -> In
         sizes: number of windows of each flight.
         draw: "random": any windows; smaller sizes are prefixes of larger ones. "contiguous": consecutive windows of one
             flight, or where no flight is that long, whole flights and a part of another.
-
-    Raises:
-        ValueError: there are fewer than `size` windows.
     """
     _require_size(size, sum(sizes))
     if draw == "random":

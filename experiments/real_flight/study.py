@@ -62,7 +62,7 @@ class Outputs:
 
     @property
     def table(self) -> Results:
-        """The table of outputs."""
+        """The table of results."""
         return Results(self.rows, TAGS)
 
     def add(self, tests: Iterable[Test]) -> None:
@@ -77,11 +77,7 @@ class Outputs:
 
 
 def run_folds(experiment: Experiment) -> Outputs:
-    """Train and test all models in all folds; finished stages come from the cache.
-
-    Raises:
-        ValueError: too few flights, or flights that are too short.
-    """
+    """Train and test all models in all folds; finished stages come from the cache."""
     config, logs = experiment.config, experiment.logs
     tested = logs["test"].logs if "test" in logs else None
     outputs = Outputs(make_folds(logs.get("target", logs["source"]).logs, tested, config))

@@ -104,18 +104,20 @@ class TrainedModel:
 
 
 def source_data(experiment: Experiment, fold: Fold, recipe: str) -> TrainingData:
-    """Windows of a fold before the change; the loss is scaled by them."""
-    config, steps = experiment.config, RECIPES[recipe].window
-    train = cut_windows(fold.train, steps, config.stride)
-    validation = evenly_spaced(cut_windows(fold.validation, steps).windows, config.validation)
+    """Cut windows of a fold before the change; the loss is scaled by them."""
+    train, validation = _windows(experiment, fold, recipe, experiment.config.stride)
     return TrainingData(train, validation, objective_of(experiment.before, train.windows, RECIPES[recipe]), len(train))
 
 
 def target_data(experiment: Experiment, fold: Fold, recipe: str, objective: ChannelLoss, capacity: int) -> TrainingData:
-    """Windows of a fold after the change, one at every sample, with the loss of the source."""
+    """Cut windows of a fold after the change, one at every sample, with the loss of the source."""
+    return TrainingData(*_windows(experiment, fold, recipe, 1), objective, capacity)
+
+
+def _windows(experiment: Experiment, fold: Fold, recipe: str, stride: int) -> tuple[LogWindows, Trajectories]:
     steps = RECIPES[recipe].window
-    validation = evenly_spaced(cut_windows(fold.validation, steps).windows, experiment.config.validation)
-    return TrainingData(cut_windows(fold.train, steps), validation, objective, capacity)
+    validation = cut_windows(fold.validation, steps).windows
+    return cut_windows(fold.train, steps, stride), evenly_spaced(validation, experiment.config.validation)
 
 
 def train_on_source(
@@ -126,7 +128,7 @@ def train_on_source(
     fields = untrained(model, experiment.before, how, experiment.config.hidden, seeds)
     start = TrainedModel(model, "source_only", recipe, fields, range(seeds), [np.arange(len(data.train))] * seeds)
     steps = before_a_change(how) if "target" in experiment.logs else how.source
-    return in_stages(experiment, f"{name} {model} {recipe}", start, steps, data, [1.0] * seeds)
+    return in_stages(experiment, name, start, steps, data)
 
 
 def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, first: TrainedModel) -> TrainedModel:
@@ -142,8 +144,7 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
     fields = untrained(first.model, experiment.before, RECIPES[first.recipe], experiment.config.hidden, len(first))
     start = replace(first, fields=fields, subsets=[np.arange(len(train))] * len(first))
     steps = RECIPES[first.recipe].source
-    name = f"{name} {first.model} {first.recipe} again"
-    again = in_stages(experiment, name, start, steps, everything, [1.0] * len(first), first.best_epochs)
+    again = in_stages(experiment, f"{name} again", start, steps, everything, first.best_epochs)
     return replace(first, fields=again.fields, epochs=first.epochs + again.epochs)
 
 
@@ -168,8 +169,7 @@ def adapt(
     subsets = [sampled_indices(data.train.sizes, size, config.draw, s) for size in sizes for s in start.seeds]
     begin = TrainedModel(start.model, mode, start.recipe, lane(fields, np.array(seeds)), seeds, subsets)
     steps = how.scratch if mode == "scratch" else how.adaptation
-    name = f"{name} {mode} {start.model} {start.recipe}"
-    return in_stages(experiment, name, begin, steps, data, [epoch_factor(len(each)) for each in subsets])
+    return in_stages(experiment, f"{name} {mode}", begin, steps, data)
 
 
 def in_stages(
@@ -178,25 +178,25 @@ def in_stages(
     start: TrainedModel,
     steps: Sequence[Step],
     data: TrainingData,
-    factors: Sequence[float],
     best_epochs: Sequence[np.ndarray] | None = None,
 ) -> TrainedModel:
     """Train all runs through the stages; each stage starts from the previous stage's best validation checkpoint.
 
     Args:
-        factors: on the epochs of each run.
         best_epochs: of each stage and run; stages then end after these, with their last fields.
     """
     config, fields, finals = experiment.config, start.fields, []
     settings = Settings(config.batch_size, objective=data.objective)
     train = padded(data.train.windows, data.capacity)
+    sizes = map(start.size, range(len(start)))
+    factors = [config.epochs * (epoch_factor(size) if size else 1.0) for size in sizes]
     for number, step in enumerate(steps, 1):
-        runs = _run_configs(start, fields, step, [config.epochs * factor for factor in factors])
+        runs = _run_configs(start, fields, step, factors)
         splits = Dataset({"train": cut(train, step.steps), "validation": data.validation}, {})
         states = _start_states(fields, start.seeds, number, data.validation, settings)
         if best_epochs is not None:
             runs = _exactly(runs, best_epochs[number - 1])
-        final = experiment.stages.run(f"{name} {number}", states, runs, settings, splits)
+        final = experiment.stages.run(f"{name} {start.model} {start.recipe} {number}", states, runs, settings, splits)
         trained = final.best if best_epochs is None else _where(best_epochs[number - 1] > 0, final.field, fields)
         finals, fields = [*finals, final], trained
     return replace(

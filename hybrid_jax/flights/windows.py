@@ -149,23 +149,12 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
     Raises:
         ValueError: no log is as long as a window, or samples are not evenly spaced.
     """
-    parts = [log_windows(log, steps, stride) for log in require_length(logs, steps)]
+    parts = []
+    for log in require_length(logs, steps):
+        long = [part for part in even_segments(log) if part.stop - part.start > steps]
+        cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
+        parts.append(concatenate(cut))
     return LogWindows(_float32(concatenate(parts)), [len(part) for part in parts], stride)
-
-
-def log_windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectories:
-    """Cut one log into windows of `steps` intervals, every `stride` samples (by default `steps`).
-
-    Raises:
-        ValueError: no segment is as long as a window, or samples are not evenly spaced.
-    """
-    parts = [part for part in even_segments(log) if part.stop - part.start > steps]
-    if not parts:
-        raise ValueError(
-            f"{log.name}: no window of steps={steps}: the longest segment without gaps has "
-            f"{max(_intervals(log), default=0)} intervals"
-        )
-    return concatenate([windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in parts])
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
@@ -177,7 +166,11 @@ def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
         names = ", ".join(flight_of(log) for log in logs)
-        raise ValueError(f"no window of {steps} intervals without gaps in {names}; bridge gaps or use shorter windows")
+        longest = max((length for log in logs for length in _intervals(log)), default=0)
+        raise ValueError(
+            f"no window of {steps} intervals without gaps in {names}; the longest segment has {longest}: "
+            "bridge gaps or use shorter windows"
+        )
     return long
 
 

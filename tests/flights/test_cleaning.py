@@ -14,7 +14,7 @@ from hybrid_jax.flights.cleaning import (
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.motor_response import lagged
 from hybrid_jax.flights.segments import gaps, repeats, segments
-from hybrid_jax.flights.windows import log_windows
+from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
 from hybrid_jax.vehicle import IRIS
 
@@ -38,24 +38,24 @@ def test_segments_end_at_gaps_and_repeats(flight):
     assert segments(log) == [slice(0, 400), slice(400, 680), slice(681, len(log))]
 
 
-@pytest.mark.parametrize("stride", [None, 1, 7])
+@pytest.mark.parametrize("stride", [20, 1, 7])
 def test_windows_never_cross_a_gap(flight, stride):
     x = flight.x.copy()
-    x[:, 0] = flight.t  # each state says when it was
+    x[:, 0] = flight.t  # each state holds its time
     marked = with_repeat(with_gap(FlightLog(flight.t, x, flight.u)))
-    cut = check(log_windows(marked, 20, stride))
+    cut = check(cut_windows([marked], 20, stride).windows)
     times = np.concatenate([cut.x0[:, None, 0], cut.x[:, :, 0]], axis=1)
-    np.testing.assert_allclose(np.diff(times, axis=1), 0.01, atol=1e-9)
-    np.testing.assert_array_equal(cut.u[0], marked.u[:20])
-    expected = sum((part.stop - part.start - 21) // (stride or 20) + 1 for part in segments(marked))
+    np.testing.assert_allclose(np.diff(times, axis=1), 0.01, atol=1e-5)
+    np.testing.assert_array_equal(cut.u[0], marked.u[:20].astype(np.float32))
+    expected = sum((part.stop - part.start - 21) // stride + 1 for part in segments(marked))
     assert len(cut) == expected
 
 
 def test_too_long_windows_and_uneven_samples_are_refused(flight, refusal):
-    refusal(lambda: log_windows(with_gap(flight[:800]), 500), "steps=500", "399 intervals")
+    refusal(lambda: cut_windows([with_gap(flight[:800])], 500), "no window of 500", "longest segment has 399")
     t = flight.t.copy()
     t[50] += 0.003
-    refusal(lambda: log_windows(FlightLog(t, flight.x, flight.u), 10), "resample")
+    refusal(lambda: cut_windows([FlightLog(t, flight.x, flight.u)], 10), "resample")
 
 
 def test_resampling_preserves_the_flight(flight):
@@ -67,7 +67,7 @@ def test_resampling_preserves_the_flight(flight):
     np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-12)
     np.testing.assert_allclose(log.x, flight.x[at], atol=0.02)  # linear between samples: ẍ dt² / 8
     assert "resampled 1200 samples" in done
-    assert len(log_windows(log, 50)) >= 23
+    assert len(cut_windows([log], 50, 50)) >= 23
 
 
 def test_resampling_bridges_gaps_on_request_only(flight):

@@ -9,7 +9,7 @@ import pytest
 
 from hybrid_jax.flights.consistency import OK, check_log
 from hybrid_jax.flights.flight_csv import read_csv
-from hybrid_jax.flights.windows import log_windows
+from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.vehicle import Vehicle
 
 FOLDER = Path(os.environ.get("HYBRID_JAX_FLIGHTS", Path(__file__).parents[3] / "shared" / "flights"))
@@ -37,7 +37,7 @@ def test_real_flights_pass_all_checks(file):
         assert check.verdict == OK, check
     # The payload set is shifted to the gyro, the nanodrone set is only good to ±1.5 samples from run to run.
     assert abs(lag.value) < (2 if file.parent.name in ("bare", "payload") else 25)
-    cut = log_windows(log, 50)
+    cut = cut_windows([log], 50, 50).windows
     assert np.isfinite(cut.x).all()
     assert len(cut) == (len(log) - 1) // 50
 
