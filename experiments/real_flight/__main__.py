@@ -30,7 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not any(word.startswith(("--simulated", "--source", "--vehicle", "--help", "-h")) for word in given):
         print(GUIDE, file=sys.stderr)
         sys.exit(command.BAD_INPUT)
-    command.run(NAME, ABOUT, run, split_lists(given), PRESETS)
+    command.run(NAME, ABOUT, run, split_lists(given), presets=PRESETS)
 
 
 def split_lists(arguments: Sequence[str]) -> list[str]:

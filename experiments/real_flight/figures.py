@@ -46,8 +46,6 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
     Args:
         measure: what an error is, such as "RMSE".
     """
-    if not curves:
-        raise ValueError("curves must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 7.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
     for index, (axes, (name, unit)) in enumerate(zip(panels.flat, QUANTITIES.items(), strict=True)):
@@ -65,8 +63,6 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
     """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    if not sizes:
-        raise ValueError("rows must hold adapted models: there is nothing to draw")
     labels = score_labels(rows)
     figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)

@@ -45,7 +45,7 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
         return jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1)
 
     a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
-    # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle: exact for small ones too.
+    # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle, which is accurate for small angles.
     chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
     angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
     return FlightErrors(length(POSITION), length(VELOCITY), angle, length(BODY_RATES))
@@ -57,20 +57,20 @@ def flight_errors(
     solver: diffrax.AbstractSolver | None = None,
     chunk: int = 2000,
 ) -> FlightErrors:
-    """The errors (n, t) of a field as deployed, of every window at the end of every interval.
+    """Compute the errors (n, t) of a field in inference mode, for every window at the end of every interval.
 
     Args:
-        chunk: windows that are predicted at a time.
+        chunk: number of windows that are predicted at a time.
 
     Raises:
-        ValueError: windows that are malformed, or not of a multirotor.
+        ValueError: malformed windows, or states other than those of a multirotor.
     """
     check(windows, "windows")
     checks.count("chunk", chunk)
     if windows.x.shape[-1] != STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
     check_attitudes(windows, "windows")
-    # The last part is filled up, so that one program serves all.
+    # The last part is padded, so that all parts share one program.
     parts = [np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk)]
     if len(parts) == 1:
         parts = [np.arange(len(windows))]
@@ -85,5 +85,5 @@ def _errors(field, windows: Trajectories, solver) -> FlightErrors:
 
 
 def mean_by_step(errors: FlightErrors) -> FlightErrors:
-    """The mean error (t,) over windows at each step, as the nanodrone protocol plots it."""
+    """Average errors (n, t) over windows: the mean error (t,) at each step, as in the nanodrone protocol."""
     return FlightErrors(*(np.mean(part, axis=0, dtype=float) for part in errors))

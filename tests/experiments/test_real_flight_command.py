@@ -246,7 +246,7 @@ def test_simulated_run_writes_a_complete_report(simulated):
     assert "Traceback" not in run.stderr
 
 
-def test_adaptation_changes_all_parameters_and_the_source_freezes_those_of_the_change(simulated):
+def test_adaptation_changes_all_parameters(simulated):
     rows = json.loads((simulated[0] / "report.json").read_text())["rows"]
     theta = {(row["fold"], row["model"], row["mode"]): row["theta"] for row in rows}
     for (fold, model, mode), adapted in theta.items():

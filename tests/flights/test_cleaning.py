@@ -1,16 +1,9 @@
-"""Cleaning never joins what was apart, says what it did, and does to known signals what it says."""
+"""Cleaning bridges no gaps, describes its changes, and changes known signals as described."""
 
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.cleaning import (
-    align_motors,
-    delay_motors,
-    in_flight,
-    lag_motors,
-    low_pass,
-    resample,
-)
+from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.motor_response import lagged
 from hybrid_jax.flights.segments import gaps, repeats, segments

@@ -1,4 +1,4 @@
-"""What is learned from never judges, and a run in a row is of one flight."""
+"""Training and held-out flights are disjoint, and contiguous windows are of one flight."""
 
 from dataclasses import replace
 
