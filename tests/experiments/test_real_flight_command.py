@@ -242,7 +242,7 @@ def test_simulated_run_writes_a_complete_report(simulated):
     for figure in report["figures"]:
         assert (out / figure).read_bytes().startswith(b"\x89PNG")
         assert f"({figure})" in page
-    assert "Consistency of each log" in page
+    assert "Consistency of the raw logs" in page
     assert "Traceback" not in run.stderr
 
 
