@@ -70,7 +70,7 @@ def changed(row, field, cell):
         (lambda rows: [HEADER, *rows[:5], "0.05,0,0,0,0,0,0,0,0,0,0,0,0,0,9,9,9,9"], ("row 7", "qw", "norm is 0")),
         (lambda rows: [HEADER], ("row 2", "no samples")),
         (lambda rows: [], ("row 1", "empty")),
-        (lambda rows: [HEADER, "1" * 5_000_000], ("row 2", "longer than any row")),
+        (lambda rows: [HEADER, "1" * 5_000_000], ("row 2", "too long for a row")),
     ],
 )
 def test_a_bad_log_is_refused_with_file_row_and_field(flight, written, refusal, lines, words):
