@@ -45,6 +45,7 @@ from hybrid_jax.dynamics import (
     rigid_body,
     with_disturbance,
 )
+from hybrid_jax.flights import load_log, load_windows
 from hybrid_jax.integrate import RK4, SOLVERS, rollout, rollout_batch
 from hybrid_jax.io import Model, check_savable, load, portable, save
 from hybrid_jax.networks import residual_network
@@ -89,7 +90,9 @@ __all__ = [
     "fit_least_squares",
     "intervals",
     "load",
+    "load_log",
     "load_vehicle",
+    "load_windows",
     "multirotor",
     "portable",
     "rates_by_group",

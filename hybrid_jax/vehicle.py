@@ -1,9 +1,9 @@
-"""What is known of a multirotor before any flight: mass, geometry, nominal coefficients."""
+"""The constants of a quadrotor: mass, geometry and nominal coefficients, and their TOML file."""
 
 import math
 import tomllib
-from collections.abc import Callable
-from dataclasses import dataclass, fields
+from collections.abc import Callable, Mapping
+from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ class Vehicle:
         gravity: [m/s²].
 
     Raises:
-        ValueError: a constant that is not finite or not positive, in single precision too, or a list of another length.
+        ValueError: a constant that is not finite and positive in single precision, or a list of the wrong length.
     """
 
     mass: float
@@ -69,8 +69,8 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
 
     Args:
-        variant: the vehicle as changed by a table `[vehicle.VARIANT]`, which gives some of its constants anew, such as
-            the mass with a payload. Variants that are not asked for are checked as well.
+        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
+            All variants of the file are checked.
 
     Raises:
         ValueError: the file, the key and what was expected, in one line.
@@ -79,7 +79,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
-    """The tables of a TOML file.
+    """Read the tables of a TOML file.
 
     Raises:
         ValueError: the file and why it is not readable, in one line.
@@ -90,8 +90,8 @@ def read_tables(path: str | Path) -> dict[str, Any]:
         raise ValueError(f"{path}: not a readable TOML file: {checks.first_line(error)}") from error
 
 
-def vehicle_of(tables: dict[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
-    """The vehicle that the tables of a file describe.
+def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
+    """As `load_vehicle`, of the tables of a file that was read already.
 
     Raises:
         ValueError: as `load_vehicle`.
@@ -105,23 +105,27 @@ def vehicle_of(tables: dict[str, Any], path: str | Path, variant: str | None = N
         found = ", ".join(sorted(map(repr, changes))) or "none"
         raise ValueError(f"{path}: has no table [vehicle.{variant}]; its variants are {found}")
     common = {key: value for key, value in table.items() if key not in changes}
-    vehicle = _made(common, known, f"{path}: [vehicle]")
-    variants = {name: _made(common | changes[name], known, f"{path}: [vehicle.{name}]") for name in sorted(changes)}
+    vehicle = _made(common, f"{path}: [vehicle]")
+    variants = {name: _made(common | changes[name], f"{path}: [vehicle.{name}]") for name in sorted(changes)}
     return vehicle if variant is None else variants[variant]
 
 
-def _made(table: dict[str, Any], known: set[str], where: str) -> Vehicle:
-    unknown = sorted(repr(key) for key in table.keys() - known)
+def _made(table: dict[str, Any], where: str) -> Vehicle:
+    known = [field.name for field in fields(Vehicle)]
+    unknown = sorted(repr(key) for key in table.keys() - set(known))
     if unknown:
-        raise ValueError(f"{where}: {', '.join(unknown)}: no constant of a vehicle")
+        raise ValueError(f"{where}: {', '.join(unknown)}: must be one of {', '.join(known)}")
+    missing = [field.name for field in fields(Vehicle) if field.default is MISSING and field.name not in table]
+    if missing:
+        raise ValueError(f"{where}: {', '.join(missing)}: must be given")
     try:
         return Vehicle(**{key: as_tuple(value) for key, value in table.items()})
-    except (TypeError, ValueError) as error:
-        raise ValueError(f"{where}: {checks.first_line(error).replace('Vehicle.__init__()', 'table')}") from error
+    except ValueError as error:
+        raise ValueError(f"{where}: {checks.first_line(error)}") from error
 
 
 def _require_positive(name: str, value: Any, what: str = "a positive finite number") -> None:
-    if not isinstance(value, int | float):  # a vehicle is hashed and written to files: its numbers are Python's own
+    if not isinstance(value, int | float):  # NumPy's scalars are refused: a vehicle is hashed and written to files
         raise ValueError(f"{name} must be {what}, got {checks.short_repr(value)}")
     checks.positive(name, value, what)
 
@@ -140,11 +144,11 @@ def _is_four(values: Any, is_right: Callable[[Any], bool]) -> bool:
 
 
 def as_tuple(value: Any) -> Any:
-    """A list of TOML, and lists in it, as tuples, which can be hashed."""
+    """Convert nested lists of TOML to tuples, which can be hashed."""
     return tuple(as_tuple(item) for item in value) if isinstance(value, list) else value
 
 
-# Pegasus Simulator's 3DR Iris, as the paper uses it.
+# The 3DR Iris of Pegasus Simulator, as in the paper.
 IRIS = Vehicle(
     name="iris",
     mass=1.5,

@@ -1,4 +1,4 @@
-"""Made-up recordings of a rigid body near hover, and the settings under which they are few but enough."""
+"""Simulated logs of a rigid body near hover, and a configuration for which they suffice."""
 
 from pathlib import Path
 
@@ -8,6 +8,7 @@ import hybrid_jax
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.simulated_logs import csv_of
 from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.vehicle import IRIS
 
@@ -28,6 +29,12 @@ def flights(names, seed=0):
 
 LOGS = flights([f"/logs/{kind}_run{i}.csv" for kind in ("chirp", "random", "square") for i in (1, 2, 3)])
 OTHERS = flights([f"/more/{kind}_run4.csv" for kind in ("chirp", "random", "square", "melon")], seed=1)
+
+
+def windows_of_fold(fold, steps, stride):
+    """Windows of training, validation and test."""
+    parts = ((fold.train, stride), (fold.validation, 1), (fold.test, stride))
+    return [cut_windows(logs, steps, every).windows for logs, every in parts]
 
 
 def samples(windows):

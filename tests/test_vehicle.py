@@ -1,4 +1,4 @@
-"""A vehicle file is read whole or refused in one line that names what is wrong."""
+"""A vehicle file is read, or refused in one line that names what is wrong."""
 
 import math
 from dataclasses import replace
@@ -51,19 +51,19 @@ def test_every_constant_is_read(written):
     hash(vehicle)  # it is part of what a compiled program is found by
 
 
-def test_what_has_a_default_may_be_left_out(written):
+def test_defaults(written):
     vehicle = load_vehicle(written(rotor_radius=None, gravity=None, name=None))
     assert (vehicle.rotor_radius, vehicle.gravity, vehicle.name) == (0.0, 9.81, "vehicle")
 
 
 @pytest.mark.parametrize("key", [key for key in GOOD if key not in ("rotor_radius", "gravity", "name")])
 def test_a_missing_key_is_named(written, key):
-    assert key in refusal(written(**{key: None}))
+    assert refusal(written(**{key: None})) == f": [vehicle]: {key}: must be given"
 
 
 @pytest.mark.parametrize("value", ["-1.0", "0", "nan", "inf", '"heavy"', "[1.0]", "true"])
 @pytest.mark.parametrize("key", ["mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity"])
-def test_a_constant_that_is_no_positive_number_is_named(written, key, value):
+def test_constants_must_be_positive(written, key, value):
     assert key in refusal(written(**{key: value}))
 
 
@@ -87,7 +87,7 @@ def test_a_constant_that_is_no_positive_number_is_named(written, key, value):
         ("rotor_radius", "nan"),
     ],
 )
-def test_a_malformed_constant_is_named(written, key, value):
+def test_malformed_constants_are_named(written, key, value):
     assert key in refusal(written(**{key: value}))
 
 
@@ -101,32 +101,32 @@ def with_payload(written):
     return write
 
 
-def test_a_variant_is_the_vehicle_but_for_what_it_changes(with_payload):
+def test_variant_overrides_constants(with_payload):
     path = with_payload("mass = 2.0")
     assert load_vehicle(path).mass == 1.5
     assert load_vehicle(path, "payload") == replace(load_vehicle(path), mass=2.0)
 
 
 @pytest.mark.parametrize("text", ["mas = 2.0", "mass = -2.0", "[vehicle.payload.heavy]"])
-def test_a_wrong_variant_is_refused_whether_it_is_asked_for_or_not(with_payload, text):
+def test_all_variants_are_checked(with_payload, text):
     assert "[vehicle.payload]" in refusal(with_payload(text))
 
 
-def test_a_variant_that_is_not_there_is_named_with_those_that_are(with_payload):
+def test_unknown_variant_is_refused_with_the_known_ones(with_payload):
     with pytest.raises(ValueError, match=r"no table \[vehicle.load\]; its variants are 'payload'"):
         load_vehicle(with_payload("mass = 2.0"), "load")
 
 
-def test_the_moment_that_is_wrong_is_named(written):
+def test_wrong_moment_is_named(written):
     assert "Iy" in refusal(written(inertia="[0.1, -0.1, 0.1]"))
 
 
-def test_a_key_that_is_no_constant_is_named(written):
+def test_unknown_key_is_refused_with_the_known_ones(written):
     """A misspelt optional constant would silently keep its default."""
-    assert "gravitty" in refusal(written(gravitty="1.6"))
+    assert "'gravitty': must be one of mass, inertia, thrust_coefficient," in refusal(written(gravitty="1.6"))
 
 
-def test_what_is_no_vehicle_file_is_refused(tmp_path):
+def test_other_files_are_refused(tmp_path):
     assert "readable TOML" in refusal(tmp_path / "none.toml")
     assert "readable TOML" in refusal(tmp_path)
     path = tmp_path / "vehicle.toml"

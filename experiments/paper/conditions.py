@@ -25,7 +25,10 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
-FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs that act as a force and a torque → of `make_residual`
+FORCED = {
+    "wrench": "accelerations",
+    "rotors": "rotors",
+}  # outputs of `make_residual` that are forces
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # purposes of a seed's keys
 
 

@@ -13,6 +13,7 @@ import numpy as np
 from experiments.paper.conditions import sampled_indices, settings
 from experiments.paper.config import Config
 from experiments.runner.stages import Stages
+from hybrid_jax.adaptation.disturbance_selection import select_disturbance
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance

@@ -1,0 +1,1 @@
+"""`python -m experiments.real_flight`: train on recorded flights, adapt to a change, test on held-out flights."""

@@ -1,4 +1,4 @@
-"""Figures of models on recorded flight: errors by step and by N, a flight predicted, what the network adds."""
+"""Figures of models on recorded flights: errors against horizon and N, a predicted flight, output of the network."""
 
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -11,16 +11,17 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from experiments.paper.figures import COLOURS, STYLE
-from experiments.real_flight.rows import NAMES, QUANTITIES, SUM, Cell, FlightRow, cell_name, cells, pooled
+from experiments.real_flight.rows import QUANTITIES, SUM, Cell, cell_name, cells, pooled, score_labels
+from experiments.reporting.plots import COLOURS, STYLE, legend_below
+from experiments.reporting.results import Results
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
 BASELINE_COLOURS = {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
 BINS = 12
-LEAST = 10  # samples in a bin that is drawn
-APART = 1.02  # factor in N between the points of two models
-SPAN = 1.5  # factor in N that is shown on both sides of a single one
+MIN_SAMPLES = 10  # of a bin that is drawn
+OFFSET = 1.02  # factor in N between the points of two models
+MARGIN = 1.5  # factor in N on both sides of a single one
 
 
 class Curve(NamedTuple):
@@ -31,7 +32,7 @@ class Curve(NamedTuple):
 
 
 class Restarted(NamedTuple):
-    """Predictions of one model, each from a true state on: time [s] and states of each piece."""
+    """Predictions of one model, each from a measured state: time [s] and states of each piece."""
 
     name: str
     colour: str
@@ -44,12 +45,7 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
 
     Args:
         measure: what an error is, such as "RMSE".
-
-    Raises:
-        ValueError: nothing to draw.
     """
-    if not curves:
-        raise ValueError("curves must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 7.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
     for index, (axes, (name, unit)) in enumerate(zip(panels.flat, QUANTITIES.items(), strict=True)):
@@ -59,21 +55,15 @@ def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure:
         _tick(axes)
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
-    return _with_legend(figure, title, "mean over seeds; band: ± one standard deviation")
+    return legend_below(figure, title, "mean over seeds; band: ± one standard deviation")
 
 
 @mpl.rc_context(STYLE)
-def errors_by_size(rows: Sequence[FlightRow], dt: float, title: str) -> Figure:
-    """A row of panels for each horizon: the error against N, with models that learned from no target window beside it.
-
-    Raises:
-        ValueError: no model was adapted.
-    """
+def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
+    """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    if not sizes:
-        raise ValueError("rows must hold some of adapted models: there is nothing to draw")
-    labels = list(rows[0].scores)
+    labels = score_labels(rows)
     figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)
     for label, line in zip(labels, panels, strict=True):
@@ -85,15 +75,15 @@ def errors_by_size(rows: Sequence[FlightRow], dt: float, title: str) -> Figure:
         axes.set_xticks(sizes, [str(size) for size in sizes])
         axes.xaxis.set_minor_formatter(NullFormatter())
         if len(sizes) == 1:
-            axes.set_xlim(sizes[0] / SPAN, sizes[0] * SPAN)
-    return _with_legend(figure, title, "mean over seeds; bars: ± one standard deviation")
+            axes.set_xlim(sizes[0] / MARGIN, sizes[0] * MARGIN)
+    return legend_below(figure, title, "mean over seeds; bars: ± one standard deviation")
 
 
 @mpl.rc_context(STYLE)
 def predicted_flight(
     time: Float[np.ndarray, " t"], truth: Float[np.ndarray, "t 13"], models: Sequence[Restarted], title: str
 ) -> Figure:
-    """Velocity and body rates of a stretch of one test flight, and predictions that start anew from it now and then."""
+    """Velocity and body rates of a part of one test flight, and predictions that restart from it at intervals."""
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
     places = [*range(*VELOCITY.indices(13)), *range(*BODY_RATES.indices(13))]
@@ -109,19 +99,19 @@ def predicted_flight(
         axes.set(title=f"{name} [{'m/s' if name[0] == 'v' else 'rad/s'}]", ylim=(low - room, high + room))
     for axes in panels[1]:
         axes.set_xlabel("time in flight [s]")
-    return _with_legend(figure, title, "each prediction starts at a dot, from the measured state")
+    return legend_below(figure, title, "each prediction starts at a dot, from the measured state")
 
 
 @mpl.rc_context(STYLE)
 def residual_by_speed(
     speed: Float[np.ndarray, " n"], residuals: Mapping[str, Float[np.ndarray, "n 13"]], title: str
 ) -> Figure:
-    """How much a network adds to ṗ, v̇ and ω̇ on test flights, against speed: median and quartiles of equal bins.
+    """Output of a network on test flights in ṗ, v̇ and ω̇ against speed: median and quartiles of equal bins.
 
-    A derivative to which none of them adds anything has no panel.
+    Derivatives that no network changes have no panel.
 
     Args:
-        residuals: what is added to ẋ at each sample, by the name of the model.
+        residuals: addition to ẋ at each sample, by the label of the model.
     """
     every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
@@ -132,7 +122,7 @@ def residual_by_speed(
         for colour, (model, residual) in zip(colours, residuals.items(), strict=False):
             _draw_bins(axes, speed, np.linalg.norm(residual[:, part], axis=1), colour, model)
         axes.set(xlabel="speed [m/s]", ylabel=f"added to {name}", ylim=(0, None))
-    return _with_legend(figure, title, "median over the samples of a bin; band: quartiles")
+    return legend_below(figure, title, "median over the samples of a bin; band: quartiles")
 
 
 def colour_of(model: str) -> str:
@@ -143,24 +133,24 @@ def colour_of(model: str) -> str:
 def _draw_curve(axes: Axes, cell: Cell, time: np.ndarray, mean: np.ndarray, std: np.ndarray) -> None:
     model, mode, _ = cell
     colour = colour_of(model)
-    axes.plot(time, mean, DASHES[mode], color=colour, label=cell_name(cell))
+    axes.plot(time, mean, DASHES[mode], color=colour, label=cell_name(*cell))
     axes.fill_between(time, np.maximum(mean - std, 0.5 * mean), mean + std, color=colour, alpha=0.15, linewidth=0)
 
 
-def _draw_sizes(axes: Axes, found: Mapping[Cell, Sequence[FlightRow]], sizes, label: str, quantity: str) -> None:
+def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, quantity: str) -> None:
     drawn = dict.fromkeys((model, mode) for model, mode, _ in found)
     adapted = [each for each in drawn if (*each, 0) not in found]
     for model, mode in drawn:
         own = [(n, pooled(found[model, mode, n], label, quantity)) for n in (0, *sizes) if (model, mode, n) in found]
-        name, colour = ", ".join(word for word in (NAMES[model], NAMES[mode]) if word), colour_of(model)
+        name, colour = cell_name(model, mode), colour_of(model)
         if own[0][0] == 0:
             axes.axhline(own[0][1].mean(), color=colour, linestyle=DASHES[mode], linewidth=1.2, label=name)
             continue
         means = [values.mean() for _, values in own]
         spread = [values.std(ddof=1) if len(values) > 1 else 0.0 for _, values in own]
-        # A little apart, or bars would hide each other.
-        aside = APART ** (adapted.index((model, mode)) - (len(adapted) - 1) / 2)
-        at = [n * aside for n, _ in own]
+        # Offset, or bars would hide each other.
+        factor = OFFSET ** (adapted.index((model, mode)) - (len(adapted) - 1) / 2)
+        at = [n * factor for n, _ in own]
         style: dict[str, Any] = {"color": colour, "linestyle": DASHES[mode], "marker": "o", "markersize": 3.5}
         axes.errorbar(at, means, spread, capsize=2, label=name, **style)
     axes.set_yscale("log")
@@ -177,7 +167,7 @@ def _tick(axes: Axes) -> None:
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:
     edges = np.linspace(0, np.quantile(speed, 0.995), BINS + 1)
     inside = [size[(speed >= low) & (speed < high)] for low, high in pairwise(edges)]
-    kept = [index for index, values in enumerate(inside) if len(values) >= LEAST]
+    kept = [index for index, values in enumerate(inside) if len(values) >= MIN_SAMPLES]
     if not kept:
         return
     middle = [(edges[index] + edges[index + 1]) / 2 for index in kept]
@@ -188,11 +178,3 @@ def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, lab
 
 def _when(label: str, dt: float) -> str:
     return "summed over 50 steps" if label == SUM else f"{int(label) * dt:.3g} s"
-
-
-def _with_legend(figure: Figure, title: str, meaning: str) -> Figure:
-    figure.suptitle(title, fontsize=12)
-    pairs = [pair for axes in figure.axes for pair in zip(*axes.get_legend_handles_labels(), strict=True)]
-    entries = {label: handle for handle, label in pairs}
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=3, title=meaning)
-    return figure

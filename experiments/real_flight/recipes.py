@@ -1,4 +1,4 @@
-"""How a model of a real vehicle is trained: stages as data, of source flights and of N windows of the target's."""
+"""How models of a real vehicle are trained: the stages on source flights and on N windows of the target, as data."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -10,8 +10,8 @@ Model = Literal["hybrid", "no_physics", "physics_only"]
 Physics = Literal["multirotor", "torque_off", "frozen_rates"]
 RecipeName = Literal["staged", "turning", "short", "torque_off", "frozen_rates"]
 
-REFERENCE = 1000  # N for which the epochs of an adaptation are given
-NETWORK_ALONE = 5e-3  # rate of a network without physics in the steps that are the physics' own
+REFERENCE = 1000  # N for which a recipe states the epochs of an adaptation
+NETWORK_ALONE = 5e-3  # rate of a network without physics in stages that train physics alone
 
 
 @dataclass(frozen=True)
@@ -19,10 +19,10 @@ class Step:
     """One stage of training.
 
     Attributes:
-        physics, residual: Adam's learning rates; a residual of 0 leaves the network as it is.
+        physics, residual: Adam's learning rates; 0 freezes that part.
         steps: intervals of each window that are trained on.
-        epochs, patience: the most epochs, and how many without a better validation end the stage.
-        kept: names of θ_p that stay as they are.
+        epochs, patience: maximum number of epochs, and epochs without a better validation that end the stage.
+        frozen: names of physical parameters that are not trained.
     """
 
     physics: float
@@ -30,7 +30,7 @@ class Step:
     steps: int
     epochs: int
     patience: int = 20
-    kept: tuple[str, ...] = ()
+    frozen: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -38,17 +38,17 @@ class Recipe:
     """A way to train every model.
 
     Attributes:
-        about: what it is, for the report.
-        window: intervals of the windows that are cut, validated on, and whose baseline errors weigh the channels.
-        source: what is done with plenty of source flights.
-        adaptation: what is done with N windows of the target, from the source's model.
-        scratch: what is done with N windows of the target, from the nominal vehicle.
+        about: description for the report.
+        window: intervals per window, for training and validation.
+        source: stages on the source's flights.
+        adaptation: stages on N windows of the target, from the source's model.
+        scratch: stages on N windows of the target, from the nominal vehicle.
         physics: of the hybrid and of physics-only.
-        learn: names of `multirotor.SHAPES` in place of the vehicle's own; none keeps those.
-        outputs: what a hybrid's network adds to; see `hybrid_jax.networks.factory.make_residual`.
-        position: how many times a simple baseline's error in position counts as 1. Position is the integral of velocity
-            and says of the motion nothing else; where an estimator's two disagree, it would teach wrong accelerations.
-        huber: from how many times a simple baseline's error on an error counts linearly.
+        learn: learned names of `multirotor.SHAPES`; if empty, those of the vehicle.
+        outputs: of a hybrid's network; see `hybrid_jax.networks.views.restricted`.
+        position: factor on the scale of position errors in the loss. Position is the integral of velocity and adds no
+            information; where an estimator's two disagree, a smaller scale would cause wrong accelerations.
+        huber: errors above this multiple of the baseline's error count linearly.
     """
 
     about: str
@@ -64,19 +64,19 @@ class Recipe:
 
 
 _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
-# By which factors a log's velocity is wrong is the estimator's, which no change of the vehicle changes. How late it is
-# is the estimator's too, but flights after the change tell that one number better than the source does.
-_SAME = ("velocity_gain",)
-# A load on a cable comes with the change: fitted to flights without one it would take the air's moments for a pull.
-_BROUGHT = ("cable_pull",)
+# The gain of the velocity estimate is a property of the estimator, which no change of the vehicle affects. So is its
+# lag, but flights after the change determine that single number better than the source does.
+_ESTIMATOR = ("velocity_gain",)
+# A load on a cable comes with the change; fitted to flights without one, the pull would absorb aerodynamic moments.
+_CHANGE = ("cable_pull",)
 _ADAPTATION = (
-    Step(1e-2, 0, 10, 80, 30, _SAME),
-    Step(3e-3, 3e-3, 10, 80, 30, _SAME),
-    Step(1e-3, 1e-3, 25, 60, 20, _SAME),
+    Step(1e-2, 0, 10, 80, 30, _ESTIMATOR),
+    Step(3e-3, 3e-3, 10, 80, 30, _ESTIMATOR),
+    Step(1e-3, 1e-3, 25, 60, 20, _ESTIMATOR),
 )
 _SCRATCH = (Step(2e-2, 0, 10, 120, 40), Step(5e-3, 5e-3, 10, 160, 40), Step(1e-3, 1e-3, 25, 60, 20))
-# For another manoeuvre than those learned from: what turned the vehicle there is forgotten by ending early, and thrust
-# and drag, which hold everywhere, are found where they show, in few steps.
+# For manoeuvres other than those trained on: short training limits overfitting of the rotation, while thrust and drag,
+# which transfer to all manoeuvres, are identified within a few steps.
 _BRIEF = (Step(2e-2, 0, 10, 20), Step(0, 2e-3, 25, 5), Step(0, 1e-3, 50, 5))
 
 _STAGED = Recipe(
@@ -92,7 +92,7 @@ _CAREFUL = Recipe(
     *(50, _BRIEF, _BRIEF, _BRIEF),
     outputs="angular_acceleration",
     position=10.0,
-    # Where one manoeuvre is flown far more wildly than the others, squares would make it all that is learned.
+    # Where one manoeuvre is far more aggressive than the others, squared errors of it would dominate the loss.
     huber=0.2,
 )
 
@@ -116,32 +116,29 @@ RECIPES: Mapping[str, Recipe] = {
 
 
 def before_a_change(recipe: Recipe) -> tuple[Step, ...]:
-    """The steps of the source's flights where a target's follow: what only the change brings stays as it is."""
-    return tuple(replace(step, kept=(*step.kept, *_BROUGHT)) for step in recipe.source)
+    """The stages on the source's flights where a target follows: parameters of the change are frozen."""
+    return tuple(replace(step, frozen=(*step.frozen, *_CHANGE)) for step in recipe.source)
 
 
-def stage_of(step: Step, model: str, share: float = 1.0) -> Stage:
-    """The stage of one model.
+def stage_of(step: Step, model: str, factor: float = 1.0) -> Stage:
+    """The training stage of one model.
 
     Args:
-        share: of the epochs and of the patience.
+        factor: on epochs and patience.
     """
-    epochs, patience = (max(1, round(share * count)) for count in (step.epochs, step.patience))
+    epochs, patience = (max(1, round(factor * count)) for count in (step.epochs, step.patience))
     match model:
         case "hybrid":
             rates = {"physics": step.physics, "residual": step.residual}
-        case "no_physics":
-            # It has no physics to begin with, and is given as many epochs.
+        case "no_physics":  # it has no physics to train first, and gets as many epochs
             rates = {"residual": step.residual or NETWORK_ALONE}
         case _:
             rates = {"": step.physics}
     return Stage(rates, step.steps, epochs, patience)
 
 
-def alike(model: str, recipe: str, among: Sequence[str]) -> str:
-    """The first of some recipes that trains a model as the given one does: what a hybrid's network adds to is no
-    concern of the others.
-    """
+def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
+    """The first of some recipes that trains a model in the same way; only a hybrid depends on `outputs`."""
 
     def training(name: str) -> Recipe:
         how = replace(RECIPES[name], about="")
@@ -150,6 +147,6 @@ def alike(model: str, recipe: str, among: Sequence[str]) -> str:
     return next((name for name in among if training(name) == training(recipe)), recipe)
 
 
-def share_of_epochs(size: int) -> float:
-    """Few windows make few steps an epoch, so N windows are given √(1000 / N) times the epochs of 1000."""
+def epoch_factor(size: int) -> float:
+    """√(1000 / N): an epoch of few windows has few gradient steps, so small N are trained for more epochs."""
     return (REFERENCE / size) ** 0.5

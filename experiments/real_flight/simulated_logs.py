@@ -1,4 +1,4 @@
-"""Logs of simulated flights in the library's own CSV format, to try what real logs go through."""
+"""Logs of simulated flights in the library's CSV format, to try the experiment without logs of one's own."""
 
 import gzip
 import io
@@ -19,7 +19,7 @@ SECONDS = 8.0
 
 
 def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
-    """Fly before and after a change of the inertia; write vehicle.toml and a folder of logs for each.
+    """Simulate flights before and after a change of the inertia; write vehicle.toml and a folder of logs for each.
 
     Returns:
         The vehicle file, and the folders by name: source and target.
@@ -33,7 +33,7 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
 
 
 def vehicle_toml(vehicle: Vehicle) -> str:
-    """A vehicle file with the constants of a vehicle."""
+    """The text of a vehicle file."""
 
     def text(value) -> str:
         if isinstance(value, tuple):
@@ -44,17 +44,17 @@ def vehicle_toml(vehicle: Vehicle) -> str:
 
 
 def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:
-    """A log as flight-log CSV, gzip, the same bytes for the same numbers."""
+    """A log as CSV in gzip; the same numbers give the same bytes."""
     text = io.StringIO()
     np.savetxt(text, np.column_stack([t, x, u]), "%.9g", ",", header=",".join(COLUMNS), comments="")
     return gzip.compress(text.getvalue().encode(), mtime=0)
 
 
 def _flights(domain: Domain, count: int, seed: int) -> list[bytes]:
-    # A flight that goes wrong is left out, so more are flown; they come by the chunk in any case.
+    # Flights that fail are left out, so more are simulated; a chunk of them is simulated in any case.
     found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
     sound = np.flatnonzero(~gone_wrong(found.states))[:count]
     states, inputs = np.asarray(found.states), np.asarray(found.inputs)
     times = DT * np.arange(states.shape[1])
-    # The last inputs are held on: a log says of each sample what the rotors do next.
+    # Each sample of a log holds the inputs of the interval that follows it; the last inputs are repeated.
     return [csv_of(times, states[i], inputs[i][[*range(len(times) - 1), -1]]) for i in sound]

@@ -1,87 +1,97 @@
-"""The course on recorded flights: learn from the source, adapt in each fold, test on what was held out."""
+"""Train and test in every fold."""
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import jax
 import numpy as np
-from rich.console import Console
+from jaxtyping import Float
 
-from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.folds import Fold, folds_of, hold_out_validation, require_windows
-from experiments.real_flight.logs import Flown, cut
-from experiments.real_flight.models import Craft
-from experiments.real_flight.recipes import RECIPES, alike
-from experiments.real_flight.rows import least
+from experiments.real_flight.folds import Fold, hold_out_validation, make_folds, require_windows
+from experiments.real_flight.models import rigid_body_of, thrust_baseline
+from experiments.real_flight.recipes import RECIPES, equivalent_recipe
+from experiments.real_flight.rows import TAGS, least
 from experiments.real_flight.scoring import (
-    INTERVAL_STEPS,
-    Scored,
-    Trial,
+    Test,
     linear_residuals,
-    on,
     parameters,
     relative_error,
     score,
-    score_lanes,
-    trial_of,
+    score_model,
 )
-from experiments.real_flight.train import Course, Lesson, Taught
-from experiments.runner.stages import Stages, stages_of
+from experiments.real_flight.train import (
+    Experiment,
+    TrainedModel,
+    TrainingData,
+    adapt,
+    refit,
+    source_data,
+    target_data,
+    train_on_source,
+    transfer,
+)
+from experiments.reporting.results import Results
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import HoldState
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.scores import flight_errors
-from hybrid_jax.sweep.lanes import count, lane
-from hybrid_jax.training import stages
+from hybrid_jax.flights.windows import count_windows, cut_windows
 
-TRIALS = 2  # seeds by which a recipe is chosen
-FROM_SCRATCH = ("hybrid",)  # whose scratch tells what the source is worth
+CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
+FROM_SCRATCH = ("hybrid",)  # models that are trained from scratch too, to show what the source is worth
 
 
 @dataclass(frozen=True)
-class Study:
-    """What was found.
+class Outputs:
+    """What an experiment found.
 
     Attributes:
-        scored: every test.
-        folds: in order.
-        choices: of each fold, by recipe, the validation error over the baseline's; empty where there was no choice.
-        shown: models of the first fold by (model, mode), for figures.
-        stages: know how long what took.
+        rows: one per test; see `rows`.
+        errors: of each row, by its tags: RMS and mean over windows of the error at every step, (2, 4, t).
+        choices: of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
+        trained: by number of the fold, model and mode.
     """
 
-    scored: list[Scored]
     folds: list[Fold]
-    choices: dict[str, dict[str, float]]
-    taught: dict[tuple[int, str, str], Taught]
-    stages: Stages
+    rows: list[dict[str, Any]] = field(default_factory=list)
+    errors: dict[tuple[Any, ...], Float[np.ndarray, "2 4 t"]] = field(default_factory=dict)
+    choices: dict[str, dict[str, float]] = field(default_factory=dict)
+    trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)
+
+    @property
+    def table(self) -> Results:
+        """The table of results."""
+        return Results(self.rows, TAGS)
+
+    def add(self, tests: Iterable[Test]) -> None:
+        """Add the rows and errors of some tests."""
+        for row, errors in tests:
+            self.rows.append(row)
+            self.errors[tuple(row[tag] for tag in TAGS)] = errors
+
+    def by_step(self, row: Mapping[str, Any]) -> Float[np.ndarray, "2 4 t"]:
+        """The errors of a row at every step."""
+        return self.errors[tuple(row[tag] for tag in TAGS)]
 
 
-def study(before: Craft, after: Craft, flown: Mapping[str, Flown], config: RealFlightConfig, console: Console) -> Study:
-    """Train and test all there is to; finished stages come from the cache.
-
-    Args:
-        flown: "source" and, as far as there are any, "target" and "test".
-
-    Raises:
-        ValueError: too few flights, or too little flight in them, for what is asked.
-    """
-    course = Course(before, after, config, stages_of(config, console), "target" in flown)
-    tested = flown["test"].logs if "test" in flown else None
-    folds = folds_of(flown.get("target", flown["source"]).logs, tested, config)
-    school = Fold("source", *hold_out_validation(flown["source"].logs, config), []) if "target" in flown else None
-    require_windows(folds, school, config)
-    found = Study([], folds, {}, {}, course.stages)
-    if school:
-        _adapt(course, school, found)
+def run_folds(experiment: Experiment) -> Outputs:
+    """Train and test all models in all folds; finished stages come from the cache."""
+    config, logs = experiment.config, experiment.logs
+    tested = logs["test"].logs if "test" in logs else None
+    outputs = Outputs(make_folds(logs.get("target", logs["source"]).logs, tested, config))
+    source = Fold("source", *hold_out_validation(logs["source"].logs, config), []) if "target" in logs else None
+    require_windows(outputs.folds, source, config)
+    if source:
+        _run_with_target(experiment, source, outputs)
     else:
-        _train(course, found)
-    return found
+        _run_without_target(experiment, outputs)
+    return outputs
 
 
-def in_turn(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
-    """The folds with their numbers; in each, the programs of the one before are let go of.
+def each_fold(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
+    """Iterate over the folds; compiled programs of the previous fold are freed.
 
     A program of a sweep takes hundreds of memory maps, and Linux gives a process 65 530.
     """
@@ -90,132 +100,112 @@ def in_turn(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
         yield number, fold
 
 
-def _train(course: Course, found: Study) -> None:
-    """In each fold, models of its flights, tested as they are."""
-    config = course.config
-    for number, fold in in_turn(found.folds):
-        where, trial = f"fold {number}", trial_of(fold, config)
-        chosen = _chosen(course, found, fold, lambda name, fold=fold, where=where: _tried(course, where, fold, name))
-        lesson = course.lesson(fold, chosen)
-        found.scored.extend(_baselines(trial, course.before))
+def _run_without_target(experiment: Experiment, outputs: Outputs) -> None:
+    """Train on the flights of each fold and test."""
+    config, before = experiment.config, experiment.before
+    for number, fold in each_fold(outputs.folds):
+        name = f"fold {number}"
+
+        def candidate(recipe: str, fold=fold, name=name) -> TrainedModel:
+            data, seeds = source_data(experiment, fold, recipe), min(CHOICE_SEEDS, config.seeds)
+            return train_on_source(experiment, f"choice {name}", "hybrid", recipe, data, seeds)
+
+        chosen = _choose_recipe(experiment, outputs, fold, candidate)
+        data, scoring = source_data(experiment, fold, chosen), _scoring(experiment, fold)
+        outputs.add(_baselines(scoring, before))
         for model in config.models:
-            recipe = alike(model, chosen, config.tried)
-            taught = course.taught(where, model, recipe, lesson, config.seeds)
+            recipe = equivalent_recipe(model, chosen, config.tried)
+            trained = train_on_source(experiment, name, model, recipe, data, config.seeds)
             if config.refit:
-                taught = course.retaught(where, model, recipe, fold, lesson, taught)
-            known = _known(taught, lesson)
-            found.scored.extend(score_lanes(trial, model, "source_only", recipe, taught.lanes, taught.trained, known))
-            found.taught[number, model, "source_only"] = taught
-        found.scored.append(_linear_of_source(trial, course.before, course.before, lesson, "source_only"))
+                trained = refit(experiment, name, fold, data, trained)
+            _add(outputs, number, scoring, trained, parameters(trained, data))
+        outputs.add(_linear_of_source(scoring, before, before, data, "source_only"))
 
 
-def _adapt(course: Course, school: Fold, found: Study) -> None:
-    """Source models of each recipe that is chosen, and in each fold what becomes of them."""
-    config = course.config
-    pool = max(len(cut(fold.train, RECIPES[name].window)) for fold in found.folds for name in config.tried)
-    taught: dict[tuple[str, str], Taught] = {}
-    first = {name: course.lesson(school, name) for name in config.tried}
-    for number, fold in in_turn(found.folds):
-        where, trial = f"fold {number}", trial_of(fold, config)
+def _run_with_target(experiment: Experiment, source: Fold, outputs: Outputs) -> None:
+    """Train on the source once per recipe, adapt in each fold and test."""
+    config = experiment.config
+    windows = {RECIPES[name].window for name in config.tried}
+    capacity = max(count_windows(fold.train, steps) for fold in outputs.folds for steps in windows)
+    sources = {name: source_data(experiment, source, name) for name in config.tried}
+    trained: dict[tuple[str, str], TrainedModel] = {}
+    for number, fold in each_fold(outputs.folds):
+        name = f"fold {number}"
 
-        def tried(recipe: str, where=where, fold=fold) -> list[AbstractVectorField]:
-            return _tried_after(course, where, first[recipe], fold, recipe, pool)
+        def candidate(recipe: str, fold=fold, name=name) -> TrainedModel:
+            data, seeds = sources[recipe], min(CHOICE_SEEDS, config.seeds)
+            start = transfer(experiment, train_on_source(experiment, "choice source", "hybrid", recipe, data, seeds))
+            here = target_data(experiment, fold, recipe, data.objective, capacity)
+            return adapt(experiment, f"choice {name}", "fine_tuned", start, here, [max(config.n)])
 
-        chosen = _chosen(course, found, fold, tried)
-        lesson = first[chosen]
-        here = course.lesson_after(fold, chosen, lesson)
-        found.scored.extend(_baselines(trial, course.after))
+        chosen = _choose_recipe(experiment, outputs, fold, candidate)
+        data, scoring = sources[chosen], _scoring(experiment, fold)
+        here = target_data(experiment, fold, chosen, data.objective, capacity)
+        outputs.add(_baselines(scoring, experiment.after))
         for model in config.models:
-            recipe = alike(model, chosen, config.tried)
-            if (model, recipe) not in taught:
-                taught[model, recipe] = course.taught("source", model, recipe, lesson, config.seeds)
-            source = taught[model, recipe]
-            carried = course.carried(source)
-            found.taught[number, model, "zero_shot"] = carried
-            known = _known(source, lesson)
-            found.scored.extend(score_lanes(trial, model, "zero_shot", recipe, carried.lanes, carried.trained, known))
-            starts = {"fine_tuned": carried} | ({"scratch": None} if model in FROM_SCRATCH else {})
-            for mode, start in starts.items():
-                after = course.adapted(f"{where} {mode}", model, recipe, here, start, config.n, pool)
-                known = _known(after, here)
-                found.scored.extend(score_lanes(trial, model, mode, recipe, after.lanes, after.trained, known))
-                found.taught[number, model, mode] = after
-        found.scored.append(_linear_of_source(trial, course.before, course.after, lesson, "zero_shot"))
-        found.scored.extend(_linear_after(course, trial, here, after.lanes))
+            recipe = equivalent_recipe(model, chosen, config.tried)
+            if (model, recipe) not in trained:
+                trained[model, recipe] = train_on_source(experiment, "source", model, recipe, data, config.seeds)
+            start = transfer(experiment, trained[model, recipe])
+            _add(outputs, number, scoring, start, parameters(trained[model, recipe], data))
+            for mode in ("fine_tuned", "scratch") if model in FROM_SCRATCH else ("fine_tuned",):
+                adapted = adapt(experiment, name, mode, start, here, config.n)
+                _add(outputs, number, scoring, adapted, parameters(adapted, here))
+        outputs.add(_linear_of_source(scoring, experiment.before, experiment.after, data, "zero_shot"))
+        outputs.add(_linear_of_target(scoring, experiment.after, here, adapted))
 
 
-def _chosen(course: Course, found: Study, fold: Fold, tried: Callable[[str], Sequence[AbstractVectorField]]) -> str:
-    """The recipe whose hybrids do best on the fold's validation flights; of one, that one."""
-    names = course.config.tried
-    if len(names) == 1:
-        return names[0]
-    windows = cut(fold.validation, course.config.longest).windows
-    baseline = flight_errors(course.after.thrust(), windows)
-
-    def error(field: AbstractVectorField) -> float:
-        return relative_error(flight_errors(field, windows), baseline, course.config.horizon)
-
-    errors = {name: float(np.mean([error(field) for field in tried(name)])) for name in names}
-    found.choices[fold.name] = errors
-    return least(errors)
+def _scoring(experiment: Experiment, fold: Fold) -> Callable[..., Test]:
+    """Bind `score` to the test windows of a fold, one from every sample."""
+    windows = cut_windows(fold.test, experiment.config.longest).windows
+    return partial(score, windows=windows, config=experiment.config, fold=fold.name)
 
 
-def _tried(course: Course, where: str, fold: Fold, recipe: str) -> list[AbstractVectorField]:
-    """Hybrids of a fold, of a few seeds; what judges them they have not learned from."""
-    lesson = course.lesson(fold, recipe)
-    return _fields(course.taught(f"choice {where}", "hybrid", recipe, lesson, min(TRIALS, course.config.seeds)))
+def _add(outputs: Outputs, number: int, scoring: Callable[..., Test], trained: TrainedModel, theta) -> None:
+    outputs.add(score_model(scoring, trained, theta))
+    outputs.trained[number, trained.model, trained.mode] = trained
 
 
-def _tried_after(
-    course: Course, where: str, lesson: Lesson, fold: Fold, recipe: str, pool: int
-) -> list[AbstractVectorField]:
-    """Hybrids of the source, fine-tuned on the most windows of a fold."""
-    source = course.taught("choice source", "hybrid", recipe, lesson, min(TRIALS, course.config.seeds))
-    here, most = course.lesson_after(fold, recipe, lesson), max(course.config.n)
-    return _fields(course.adapted(f"choice {where}", "hybrid", recipe, here, course.carried(source), [most], pool))
+def _choose_recipe(
+    experiment: Experiment, outputs: Outputs, fold: Fold, candidate: Callable[[str], TrainedModel]
+) -> str:
+    """Choose the recipe whose hybrids do best on the fold's validation flights; of one recipe, take that."""
+    config = experiment.config
+    if len(config.tried) == 1:
+        return config.tried[0]
+    windows = cut_windows(fold.validation, config.longest).windows
+    baseline = flight_errors(thrust_baseline(experiment.after), windows)
+
+    def error(trained: TrainedModel) -> float:
+        found = [flight_errors(trained.run(index), windows) for index in range(len(trained))]
+        return float(np.mean([relative_error(errors, baseline, config.horizon) for errors in found]))
+
+    outputs.choices[fold.name] = {name: error(candidate(name)) for name in config.tried}
+    return least(outputs.choices[fold.name])
 
 
-def _known(taught: Taught, lesson: Lesson) -> list[dict[str, Any]]:
-    """θ_p of what was taught, and its intervals."""
-    objective: Any = lesson.settings.objective
-    return parameters(taught.trained.fields, taught.lanes, lesson.lessons.train, objective)
+def _baselines(scoring: Callable[..., Test], model: VehicleModel) -> list[Test]:
+    fields: Mapping[str, AbstractVectorField] = {"hold": HoldState(), "thrust": thrust_baseline(model)}
+    return [scoring(field, model=name, mode="nominal") for name, field in fields.items()]
 
 
-def _fields(taught: Taught) -> list[AbstractVectorField]:
-    return [lane(taught.trained.fields, index) for index in range(count(taught.trained.fields))]
+def _linear_of_source(
+    scoring: Callable[..., Test], before: VehicleModel, after: VehicleModel, data: TrainingData, mode: str
+) -> list[Test]:
+    """Fit a linear residual of the rigid body to all source windows, and test it on the present vehicle."""
+    windows = [np.arange(len(data.train))]
+    (field,) = linear_residuals(rigid_body_of(before), data, windows, rigid_body_of(after))
+    return [scoring(field, model="linear_residual", mode=mode)]
 
 
-def _baseline(model: str, mode: str, n_train: int = 0, seed: int = 0) -> dict[str, Any]:
-    return {"model": model, "mode": mode, "n_train": n_train, "seed": seed, "recipe": ""}
-
-
-def _baselines(trial: Trial, craft: Craft) -> list[Scored]:
-    fields = {"hold": HoldState(), "thrust": craft.thrust()}
-    return [score(trial, field, **_baseline(model, "nominal")) for model, field in fields.items()]
-
-
-def _linear(craft: Craft, lesson: Lesson, subsets: Sequence[np.ndarray]) -> Any:
-    windows = lesson.lessons.train.windows
-    short = stages.cut(windows, min(INTERVAL_STEPS, windows.horizon))
-    return linear_residuals(_rigid(craft), short, subsets, lesson.lessons.validation)
-
-
-def _rigid(craft: Craft) -> AbstractVectorField:
-    return multirotor(craft.vehicle, (), craft.terms)
-
-
-def _linear_of_source(trial: Trial, before: Craft, after: Craft, lesson: Lesson, mode: str) -> Scored:
-    """The rigid body with a linear residual of all source windows, on the vehicle as it is now."""
-    linear = _linear(before, lesson, [np.arange(len(lesson.lessons.train))])
-    return score(trial, on(_rigid(after), linear)[0], **_baseline("linear_residual", mode))
-
-
-def _linear_after(course: Course, trial: Trial, here: Lesson, lanes: Sequence) -> list[Scored]:
-    """The rigid body with a linear residual of each lane's windows."""
-    scored = []
-    for size in course.config.n:
-        own = [each for each in lanes if len(each.subset) == size]
-        fields = on(_rigid(course.after), _linear(course.after, here, [each.subset for each in own]))
-        known = [_baseline("linear_residual", "scratch", size, each.seed) for each in own]
-        scored += [score(trial, field, **row) for field, row in zip(fields, known, strict=True)]
-    return scored
+def _linear_of_target(
+    scoring: Callable[..., Test], model: VehicleModel, data: TrainingData, adapted: TrainedModel
+) -> list[Test]:
+    """Fit a linear residual of the rigid body to the windows of each adapted run, and test it."""
+    tests, body = [], rigid_body_of(model)
+    for size in dict.fromkeys(map(len, adapted.subsets)):
+        runs = [run for run, subset in enumerate(adapted.subsets) if len(subset) == size]
+        fields = linear_residuals(body, data, [adapted.subsets[run] for run in runs], body)
+        columns = {"model": "linear_residual", "mode": "scratch", "n_train": size}
+        tests += [scoring(each, **columns, seed=adapted.seeds[i]) for i, each in zip(runs, fields, strict=True)]
+    return tests

@@ -1,13 +1,17 @@
-"""The tables of a report on recorded flights as text: scores, folds, physical parameters, and the logs themselves."""
+"""Tables of a report on recorded flights: scores, folds, physical parameters, recipes and logs."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any
 
 import numpy as np
 
-from experiments.real_flight.rows import QUANTITIES, SUM, FlightRow, cell_name, cells, least, pooled
-from experiments.reporting.report_tables import Table
+from experiments.real_flight.rows import QUANTITIES, SUM, cell_name, cells, least, pooled, score_labels
+from experiments.reporting.results import Results
+from experiments.reporting.stats import spread
+from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, spread_text, tabulate
+from hybrid_jax.flights.consistency import FAILS
 
 VERDICTS = {"ok": "ok", "fails": "FAILS", "cannot tell": "?"}
 SHORT = {
@@ -23,129 +27,116 @@ SHORT = {
 }
 
 
-def score_tables(rows: Sequence[FlightRow], dt: float) -> list[Table]:
-    """A table for each horizon: a line per model, mode and N; all folds' windows together, mean ± std over seeds."""
-    return [_scores(rows, label, dt) for label in rows[0].scores] if rows else []
+def score_tables(rows: Results, dt: float) -> list[Table]:
+    """Make a table per horizon: a line per model, mode and N, over the test windows of all folds."""
+
+    def title(label: str) -> str:
+        at = f"RMSE at step {label}" if label != SUM else "Mean error of steps 1 to 50, summed"
+        seconds = f" ({int(label) * dt:.3g} s)" if label != SUM else ""
+        return f"{at}{seconds}; {mean_over_seeds(rows)}, test windows of all folds"
+
+    named = {cell_name(*cell): group for cell, group in cells(rows).items()}
+    return [tabulate(title(label), named, _errors(label)) for label in score_labels(rows)]
 
 
-def fold_tables(rows: Sequence[FlightRow]) -> list[Table]:
-    """Where there are several folds: what the baselines and the best-taught hybrids did in each, at each horizon."""
-    folds = list(dict.fromkeys(row.fold for row in rows))
+def fold_tables(rows: Results) -> list[Table]:
+    """With several folds, make a table of baselines and best hybrids in each, at each horizon."""
+    folds, found = rows.unique("fold"), cells(rows)
     if len(folds) < 2:
         return []
-    found = cells(rows)
     most = max(n for _, _, n in found)
     kept = [cell for cell in found if cell[0] in ("hold", "thrust") or (cell[0] == "hybrid" and cell[2] in (0, most))]
     lines = [
-        (fold, cell_name(cell), label, *_errors([row for row in found[cell] if row.fold == fold], label))
+        (fold, cell_name(*cell), label, *(text(found[cell].where(fold=fold)) for text in _errors(label).values()))
         for fold in folds
         for cell in kept
-        for label in found[cell][0].scores
+        for label in score_labels(rows)
     ]
-    return [Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_units()), lines)]
+    return [Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_errors("")), lines)]
 
 
-def parameter_tables(rows: Sequence[FlightRow], nominal: Mapping[str, float]) -> list[Table]:
-    """θ_p of the hybrid and of physics alone: the mean over folds and seeds, their spread, and the mean interval.
+def parameter_tables(rows: Results, nominal: Mapping[str, float]) -> list[Table]:
+    """Make a table of θ_p: mean over folds and seeds, spread, and mean 95 % interval.
 
     Args:
         nominal: of each parameter by name, as in the rows.
     """
-    found = {cell: group for cell, group in cells(rows).items() if any(row.theta for row in group)}
+    found = cells(rows.where(lambda row: bool(row["theta"])))
     most = max((n for _, _, n in found), default=0)
-    kept = [cell for cell in found if cell[1] != "scratch" and cell[2] in (0, most)]
-    names = list(dict.fromkeys(name for cell in kept for row in found[cell] for name in row.theta or ()))
-    lines = [(name, _number(nominal.get(name)), *(_parameter(found[cell], name) for cell in kept)) for name in names]
+    kept = [group for (_, mode, n), group in found.items() if mode != "scratch" and n in (0, most)]
+    names = list(dict.fromkeys(name for group in kept for row in group for name in row["theta"]))
+    lines = [(name, _number(nominal.get(name)), *(_parameter(group, name) for group in kept)) for name in names]
     if not lines:
         return []
     title = "Physical parameters, SI units (mean ± std over folds and seeds; mean ends of the 95 % intervals)"
-    return [Table(title, ("", "nominal", *map(cell_name, kept)), lines)]
+    header = [cell_name(*(group[0][tag] for tag in ("model", "mode", "n_train"))) for group in kept]
+    return [Table(title, ("", "nominal", *header), lines)]
 
 
 def choice_tables(choices: Mapping[str, Mapping[str, float]]) -> list[Table]:
-    """By which recipe a fold was learned: of each candidate, the error on validation flights over the baseline's."""
+    """Make a table of the recipes tried in each fold: validation error over that of the baseline."""
     if not choices:
         return []
     names = list(next(iter(choices.values())))
     lines = [(fold, *(f"{error:.3f}" for error in errors.values()), least(errors)) for fold, errors in choices.items()]
-    title = "Recipes: error on validation flights over that of thrust with frozen rates; the least was taken"
-    return [Table(title, ("tested on", *names, "taken"), lines)]
+    title = "Recipes: error on validation flights over that of thrust with frozen rates; the smallest is chosen"
+    return [Table(title, ("tested on", *names, "chosen"), lines)]
 
 
 def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """What is known of each log: its length, gaps, what was done, and every check with its verdict."""
+    """Make tables of the logs: length, gaps, changes, every check, and what would repair the failed ones."""
     if not records:
         return []
     names: list[str] = [check["name"] for check in records[0]["checks"]]
     flights = [(f"{record['folder']}/{record['flight']}", record) for record in records]
     lines = [
         (name, str(record["samples"]), f"{record['seconds']:.1f}", f"{record['dt']:g}", str(record["gaps"]),
-         str(record["repeated_samples"]), str(record["used_samples"]), "; ".join(record["done"]) or "nothing")
+         str(record["repeated_samples"]), str(record["used_samples"]), "; ".join(record["done"]) or "none")
         for name, record in flights
     ]  # fmt: skip
-    logs = Table(
-        "Logs", ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "samples in use", "what was done"), lines
-    )
-    verdicts = [(name, *map(_verdict, record["checks"])) for name, record in flights]
-    checks = Table(
-        "Consistency of each log, as it was read", ("flight", *(SHORT.get(name, name) for name in names)), verdicts
-    )
-    advice = [
+    header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
+    verdicts = [
+        (name, *(f"{VERDICTS[check['verdict']]} {_value(check)}".strip() for check in record["checks"]))
+        for name, record in flights
+    ]
+    failed = [
         (name, check["name"], _value(check), check["suggestion"])
         for name, record in flights
         for check in record["checks"]
-        if check["verdict"] == "fails"
+        if check["verdict"] == FAILS
     ]
-    failed = [Table("Checks that fail, and what would mend them", ("flight", "check", "value", "suggestion"), advice)]
-    return [logs, checks, *(failed if advice else [])]
+    tables = [
+        Table("Logs", header, lines),
+        Table("Consistency of the raw logs", ("flight", *(SHORT.get(name, name) for name in names)), verdicts),
+        Table("Failed checks, and how to repair them", ("flight", "check", "value", "suggestion"), failed),
+    ]
+    return tables if failed else tables[:2]
 
 
-def _scores(rows: Sequence[FlightRow], label: str, dt: float) -> Table:
-    lines = [(cell_name(cell), *_errors(group, label)) for cell, group in cells(rows).items()]
-    what = "mean error of steps 1 to 50, summed" if label == SUM else f"RMSE at step {label} ({int(label) * dt:.3g} s)"
-    seeds = len({row.seed for row in rows})
-    of = f"mean ± std over {seeds} seeds" if seeds > 1 else "one seed"
-    return Table(f"{what[0].upper()}{what[1:]}; {of}, test windows of all folds", ("model", *_units()), lines)
+def _errors(label: str) -> dict[str, Callable[[Results], str]]:
+    """The columns of a score: the error in each quantity."""
+
+    def text(quantity: str, rows: Results) -> str:
+        return spread_text(spread(pooled(rows, label, quantity)), ".4g", ".2g")
+
+    return {f"{name.replace('_', ' ')} [{unit}]": partial(text, name) for name, unit in QUANTITIES.items()}
 
 
-def _errors(rows: Sequence[FlightRow], label: str) -> list[str]:
-    return [_spread(pooled(rows, label, quantity)) for quantity in QUANTITIES]
-
-
-def _units() -> list[str]:
-    return [f"{name.replace('_', ' ')} [{unit}]" for name, unit in QUANTITIES.items()]
-
-
-def _spread(values: np.ndarray) -> str:
-    if not np.isfinite(values).all():
-        return f"∞ ({int((~np.isfinite(values)).sum())} of {len(values)} seeds)"
-    text = f"{values.mean():.4g}"
-    return text if len(values) == 1 else f"{text} ± {values.std(ddof=1):.2g}"
-
-
-def _parameter(rows: Sequence[FlightRow], name: str) -> str:
-    having = [row for row in rows if name in (row.theta or {})]  # another fold's recipe may not learn it
-    if not having:
-        return "–"
-    values = np.array([_float((row.theta or {})[name]) for row in having])
+def _parameter(rows: Results, name: str) -> str:
+    having = rows.where(lambda row: name in row["theta"])  # the recipe of another fold may not learn it
+    if not len(having):
+        return EMPTY
+    values = having.numbers(lambda row: math.nan if row["theta"][name] is None else row["theta"][name])
     text = _number(values.mean()) + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
-    ends = [(row.theta_interval or {}).get(name) for row in having]
+    ends = [(row["theta_interval"] or {}).get(name) for row in having]
     known = np.array([end for end in ends if end is not None and None not in end], float)
     text += f" [{_number(known[:, 0].mean())}, {_number(known[:, 1].mean())}]" if len(known) else ""
-    folds, all_folds = (len({row.fold for row in group}) for group in (having, rows))
+    folds, all_folds = (len(group.unique("fold")) for group in (having, rows))
     return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
 
 
-def _float(value: float | None) -> float:
-    return math.nan if value is None else value
-
-
 def _number(value: float | None) -> str:
-    return "–" if value is None else f"{value:.3g}"
-
-
-def _verdict(check: Mapping[str, Any]) -> str:
-    return f"{VERDICTS[check['verdict']]} {_value(check)}".strip()
+    return EMPTY if value is None else f"{value:.3g}"
 
 
 def _value(check: Mapping[str, Any]) -> str:

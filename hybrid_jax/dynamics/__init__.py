@@ -11,7 +11,7 @@ from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.dynamics.vehicle_file import VehicleDescription, load_description
+from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
 __all__ = [
     "AbstractVectorField",
@@ -24,9 +24,9 @@ __all__ = [
     "Multirotor",
     "RigidBody",
     "Terms",
-    "VehicleDescription",
+    "VehicleModel",
     "disturbed",
-    "load_description",
+    "load_vehicle_model",
     "multirotor",
     "perturbed",
     "rigid_body",

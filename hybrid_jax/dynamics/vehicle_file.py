@@ -1,4 +1,4 @@
-"""A vehicle file read whole: what flies, what else is known of it, and what may be learned.
+"""A whole vehicle file: constants of the vehicle, nominal values of further terms, and what is to be learned.
 
 learn = ["Ix", "Iy", "k_rotors", "drag", "aerodynamic_moment"]    # names of `multirotor.SHAPES`; above all tables
 
@@ -6,15 +6,17 @@ learn = ["Ix", "Iy", "k_rotors", "drag", "aerodynamic_moment"]    # names of `mu
 mass = 0.037
 …
 
-[vehicle.payload]    # a variant: some constants anew
+[vehicle.payload]    # a variant: constants that differ
 mass = 0.0444
 
-[terms]              # nominal values of `Terms`, known or to start from; zero where not given
+[terms]              # nominal values of `Terms`, known or initial; the defaults where not given
 drag = [0.01, 0.01, 0.0]
 """
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
+from typing import Any
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
@@ -22,21 +24,21 @@ from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import SHAPES, Terms, check_names
 from hybrid_jax.vehicle import Vehicle, as_tuple, read_tables, vehicle_of
 
-LAG = "motor_time_constant"  # learned on the logs: see `hybrid_jax.flights.rotor_lag`
+LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.rotor_lag`
 TABLES = ("vehicle", "learn", "terms")
 
 
 @dataclass(frozen=True)
-class VehicleDescription:
-    """What a vehicle file says.
+class VehicleModel:
+    """A vehicle, and what is to be learned of it.
 
     Attributes:
-        vehicle: the known constants and nominal values.
-        terms: nominal values of what a rigid body leaves out.
-        learn: names of `multirotor.SHAPES`, and "motor_time_constant" where the rotors' lag is to be found.
+        vehicle: known constants and nominal values.
+        terms: nominal values of effects beyond a rigid body.
+        learn: names of `multirotor.SHAPES`, and "motor_time_constant" to choose the rotors' lag from logs.
 
     Raises:
-        ValueError: a name of nothing that can be learned.
+        ValueError: an unknown name in `learn`.
     """
 
     vehicle: Vehicle
@@ -46,37 +48,33 @@ class VehicleDescription:
     def __post_init__(self):
         check_learned(self.learn)
 
-    @property
-    def learns_motor_lag(self) -> bool:
-        """Whether the rotors' time constant is to be found from the logs."""
-        return LAG in self.learn
-
     def physics(self) -> Multirotor:
         """The field at its nominal values."""
-        return multirotor(self.vehicle, of_field(self.learn), self.terms)
+        return multirotor(self.vehicle, learned_by_field(self.learn), self.terms)
 
 
 def check_learned(learn: tuple[str, ...]) -> None:
-    """Refuse names of nothing that a field or, of the rotors' lag, the logs can teach.
+    """Check the names of parameters to learn.
 
     Raises:
-        ValueError: what is there to be named, or which names do not go together.
+        ValueError: the known names, or names that exclude each other.
     """
     if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
         raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
     if learn.count(LAG) > 1 or not set(learn) <= {*SHAPES, LAG}:
         raise ValueError(f"learn must be names of {', '.join([*SHAPES, LAG])}, each once, got {', '.join(learn)}")
-    check_names(of_field(learn))
+    check_names(learned_by_field(learn))
 
 
-def of_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """Those names that a field learns: all but the rotors' lag."""
+def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
+    """The names that a field learns: all but the rotors' time constant."""
     return tuple(name for name in learn if name != LAG)
 
 
-def load_description(path: str | Path, variant: str | None = None) -> VehicleDescription:
-    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; without the last two it is a rigid body that learns
-    Ix, Iy and k.
+def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
+    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`.
+
+    Without the last two it is a rigid body that learns Ix, Iy and k.
 
     Args:
         variant: as for `load_vehicle`.
@@ -84,27 +82,32 @@ def load_description(path: str | Path, variant: str | None = None) -> VehicleDes
     Raises:
         ValueError: the file, the key and what was expected, in one line.
     """
-    tables = read_tables(path)
-    unknown = sorted(repr(key) for key in tables.keys() - set(TABLES))
-    if unknown:
-        raise ValueError(f"{path}: {', '.join(unknown)}: must be one of {', '.join(TABLES)}")
+    return vehicle_model_of(read_tables(path), path, variant)
+
+
+def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> VehicleModel:
+    """As `load_vehicle_model`, of the tables of a file that was read already."""
+    _require_known(f"{path}:", tables, TABLES)
     if "learn" in (tables["vehicle"] if isinstance(tables.get("vehicle"), dict) else {}):
         raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
     vehicle = vehicle_of(tables, path, variant)
     try:
-        return VehicleDescription(vehicle, _terms(tables.get("terms", {})), as_tuple(tables.get("learn", [*LEARNED])))
+        return VehicleModel(vehicle, _terms(tables.get("terms", {})), as_tuple(tables.get("learn", [*LEARNED])))
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
 
 
-def _terms(table) -> Terms:
+def _terms(table: Any) -> Terms:
     if not isinstance(table, dict):
         raise ValueError(f"terms must be a table [terms], got {checks.short_repr(table)}")
-    known = [entry.name for entry in fields(Terms)]
-    unknown = sorted(repr(key) for key in table.keys() - set(known))
-    if unknown:
-        raise ValueError(f"[terms]: {', '.join(unknown)}: must be one of {', '.join(known)}")
+    _require_known("[terms]:", table, [entry.name for entry in fields(Terms)])
     try:
         return Terms(**{key: as_tuple(value) for key, value in table.items()})
     except ValueError as error:
         raise ValueError(f"[terms]: {checks.first_line(error)}") from error
+
+
+def _require_known(where: str, table: Mapping[str, Any], known) -> None:
+    unknown = sorted(repr(key) for key in table.keys() - set(known))
+    if unknown:
+        raise ValueError(f"{where} {', '.join(unknown)}: must be one of {', '.join(known)}")

@@ -1,1 +1,53 @@
-"""Recorded flights: reading logs, checking what they claim to be, cleaning them and cutting them into windows."""
+"""Recorded flights: read logs, check them, clean them and cut them into training windows.
+
+    import hybrid_jax as hj
+
+    vehicle = hj.load_vehicle("vehicle.toml")
+    windows = hj.load_windows("flights/", vehicle, steps=10)  # one CSV or ULog file per flight
+
+`load_windows` joins steps that can be taken one by one. Split by flight before cutting, since windows of one flight
+share samples, wind and battery:
+
+    from hybrid_jax.flights import cut_windows, hold_out, load_logs
+
+    train, test = hold_out(load_logs("flights/"), ["flight_07"])
+    windows = cut_windows(train, steps=10).windows
+
+- log, flight_csv, column_map, ulog: reading; attitude: frames.
+- consistency, readings, motor_response: checks of a log against itself and the vehicle.
+- segments, cleaning, rotor_lag: gaps, resampling, filtering, delays of the motors.
+- splits, windows, scores: flights for training and test, windows, prediction errors.
+"""
+
+from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
+from hybrid_jax.flights.column_map import ColumnMap, load_column_map
+from hybrid_jax.flights.consistency import Check, check_log
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.rotor_lag import choose_time_constant
+from hybrid_jax.flights.scores import FlightErrors, flight_errors
+from hybrid_jax.flights.splits import folds, hold_out
+from hybrid_jax.flights.windows import LogWindows, cut_windows, load_log, load_logs, load_windows
+
+__all__ = [
+    "Check",
+    "ColumnMap",
+    "FlightErrors",
+    "FlightLog",
+    "LogWindows",
+    "align_motors",
+    "check_log",
+    "choose_time_constant",
+    "cut_windows",
+    "delay_motors",
+    "flight_errors",
+    "folds",
+    "hold_out",
+    "in_flight",
+    "lag_motors",
+    "load_column_map",
+    "load_log",
+    "load_logs",
+    "load_windows",
+    "low_pass",
+    "resample",
+]

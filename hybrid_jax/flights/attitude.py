@@ -20,7 +20,7 @@ VELOCITY_FRAMES = ("world", "body")
 
 @dataclass(frozen=True)
 class Frames:
-    """In which frames a log states its vectors.
+    """The frames of the vectors in a log.
 
     Attributes:
         world: "ENU" (or any other frame with z up) or "NED".
@@ -42,7 +42,7 @@ class Frames:
 
 
 def rotation_of(q: Quaternions) -> Rotation:
-    """SciPy keeps the scalar last."""
+    """Convert to SciPy, which puts the scalar last."""
     return Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
@@ -81,14 +81,14 @@ def interpolate(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values:
 
 
 def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):
-    """What values held from each of `at` to the next are on average from each t to the next; held at the last t.
+    """Average values, each held from `at` to the next, over each interval of t; the last is held.
 
-    Where values change more slowly than t, this is the held value itself; where faster, none of them is lost.
+    Slow values are returned as they are; of fast ones, none is lost.
     """
     if len(t) == 1:
         return values[np.searchsorted(at, t, side="right") - 1]
     area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(at)[:, None], axis=0)])
-    # Beyond the last sample its value is held on.
+    # The last value is held beyond its sample.
     end = max(t[-1], at[-1]) + 1.0
     area = np.concatenate([area, area[-1:] + values[-1:] * (end - at[-1])])
     mean = np.diff(interpolate(t, np.append(at, end), area), axis=0) / np.diff(t)[:, None]

@@ -1,34 +1,33 @@
-"""Changes to a log that a user asks for by name; each returns the new log and a line that says what was done."""
+"""Changes to a log; each returns the new log and one line that describes the change."""
 
 import numpy as np
 from scipy import signal
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import estimate_time_constant, lagged, respond
-from hybrid_jax.flights.segments import GAP, at_rest, repeats, segments
+from hybrid_jax.flights.motor_response import lagged, respond
+from hybrid_jax.flights.segments import GAP, at_rest, even_segments, repeats, segments
 from hybrid_jax.state import QUATERNION
-from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
-
-JITTER = 0.1  # intervals may differ from their median by this share and still count as equal
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
-    """Samples at multiples of dt [s] in each segment: linear, attitude spherically, motors the mean of what is held.
+    """Resample each segment at multiples of dt [s].
+
+    States are interpolated linearly, attitudes spherically; motor values are means over each interval.
 
     Args:
-        longest_gap: gaps and repeats no longer than this [s] are interpolated across.
+        longest_gap: interpolate across gaps and repeated samples up to this long [s].
 
     Raises:
-        ValueError: dt is not positive, or no segment is as long as dt.
+        ValueError: dt is not positive, or all segments are shorter than dt.
     """
     if not dt > 0:
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
     fresh, parts = log[~repeats(log)], []
     for part in _joined(log, fresh, longest_gap):
         piece = fresh[part]
-        # A little is forgiven, or rounded times would cost the last sample.
+        # The tolerance keeps the last sample despite rounded times.
         first, last = np.ceil(piece.t[0] / dt - 1e-6), np.floor(piece.t[-1] / dt + 1e-6)
         if last > first:
             parts.append(_sampled(piece, np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])))
@@ -41,14 +40,13 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
 
 
 def _kept_apart(parts: list[FlightLog], dt: float) -> list[FlightLog]:
-    """The segments without the last samples of those that would seem to go on in the next: a gap stays a gap."""
+    """Drop last samples of segments so that every gap remains longer than the threshold for gaps."""
     ends = [following.t[0] - GAP * dt for following in parts[1:]] + [np.inf]
-    short = [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
-    return short
+    return [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
 
 
 def _joined(log: FlightLog, fresh: FlightLog, longest_gap: float) -> list[slice]:
-    """Runs of the fresh samples whose intervals are sound or no longer than the longest gap."""
+    """Segments of the fresh samples, with intervals up to the longest gap."""
     whole = np.diff(fresh.t) <= max(1.5 * log.dt, longest_gap)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
@@ -61,10 +59,10 @@ def _sampled(piece: FlightLog, t) -> FlightLog:
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
-    """The log without samples of half a second and more in which the rotors hardly push: it stands on the ground.
+    """Cut out periods of half a second and more with hardly any thrust, when the vehicle is on the ground.
 
     Raises:
-        ValueError: nothing is left.
+        ValueError: no samples remain.
     """
     flying = ~at_rest(log)
     if not flying.any():
@@ -73,11 +71,11 @@ def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
 
 
 def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[FlightLog, str]:
-    """Second-order Butterworth filter of states and motors alike, segment by segment, so that none lags another.
+    """Filter states and motors with the same second-order Butterworth filter, segment by segment.
 
     Args:
-        cutoff: −3 dB frequency [Hz] (zero phase: −6 dB, since the filter runs forward and back).
-        causal: filter forward only, as on board; what is slow then comes √2 / (2π cutoff) late.
+        cutoff: −3 dB frequency [Hz] (−6 dB at zero phase, where the filter runs forward and back).
+        causal: filter forward only, as on board; slow signals are delayed by √2 / (2π cutoff).
 
     Raises:
         ValueError: the cutoff is not between 0 and half the sampling frequency, or samples are not evenly spaced.
@@ -86,7 +84,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"cutoff must lie between 0 and half the sampling frequency {rate / 2:.6g} Hz, got {cutoff!r}")
     sections = signal.butter(2, cutoff, fs=rate, output="sos")
-    log, all_samples = log[~repeats(log)], len(log)  # a copy of what came before would no longer be known as one
+    log, all_samples = log[~repeats(log)], len(log)  # filtered, they could no longer be recognised
     x, u = log.x.copy(), log.u.copy()
     for part in even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
@@ -110,7 +108,7 @@ def _both_ways(sections, values):
 
 
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
-    """Motor values as they were `lag` [s] before (negative: after); samples that would need unknown ones are cut.
+    """Delay the motor values by `lag` [s]; samples that would need unknown values are cut.
 
     Raises:
         ValueError: no segment is longer than the lag.
@@ -118,7 +116,7 @@ def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
     parts = []
     for part in segments(log):
         piece = log[part]
-        end = piece.t[-1] + log.dt  # the last value is held for one more interval
+        end = piece.t[-1] + log.dt  # the last value is held for one interval
         inside = (piece.t - lag >= piece.t[0] - 1e-9) & (piece.t + log.dt - lag <= end + 1e-9)
         if inside.sum() > 1:
             at = np.append(piece.t[inside], piece.t[inside][-1] + log.dt) - lag
@@ -131,7 +129,7 @@ def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
 
 
 def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
-    """Rotor speeds that follow the log's motor values as τ ẇ = u − w, averaged over each interval.
+    """Replace motor values u by rotor speeds w with τ ẇ = u − w, averaged over each interval.
 
     Raises:
         ValueError: the time constant is negative, or samples are not evenly spaced.
@@ -144,54 +142,12 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
 
 
 def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
-    """`delay_motors` by the lag that cross-correlation with the angular acceleration finds.
+    """Apply `delay_motors` with the lag of the best cross-correlation with the angular acceleration.
 
     Raises:
-        ValueError: too little flight to tell the lag.
+        ValueError: the log has too little motion to estimate the lag.
     """
     found = respond(log, vehicle)
     if found is None or sum(found.correlations[:2]) < 0.2:
-        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be told")
+        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be estimated")
     return delay_motors(log, found.lag)
-
-
-def follow_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
-    """`lag_motors` by the time constant that explains roll and pitch best.
-
-    Raises:
-        ValueError: too little flight to tell the time constant.
-    """
-    return lag_motors(log, estimate_time_constant(log, vehicle))
-
-
-def windows(log: FlightLog, steps: int, stride: int | None = None) -> Trajectories:
-    """Windows of `steps` intervals within segments, every `stride` intervals (by default they touch).
-
-    Raises:
-        ValueError: samples are not evenly spaced, or no segment is as long as a window.
-    """
-    parts = [
-        windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps, stride=stride)
-        for part in even_segments(log)
-        if part.stop - part.start > steps
-    ]
-    if not parts:
-        longest = max((part.stop - part.start - 1 for part in segments(log)), default=0)
-        raise ValueError(
-            f"{log.name}: no window of steps={steps}: the longest segment without gaps has {longest} intervals"
-        )
-    return concatenate(parts)
-
-
-def even_segments(log: FlightLog) -> list[slice]:
-    """Its segments, if the samples of each are evenly spaced.
-
-    Raises:
-        ValueError: where they are not.
-    """
-    for part in (found := segments(log)):
-        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
-        if uneven.any():
-            at = log.t[part][int(uneven.argmax())]
-            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
-    return found

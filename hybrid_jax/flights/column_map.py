@@ -1,4 +1,4 @@
-"""Any CSV log through a TOML file that says what its columns mean. Nothing about units or frames is assumed:
+"""Read any CSV log through a TOML file that states the meaning of its columns; no unit or frame is assumed.
 
 [frames]
 world = "NED"                 # or "ENU" (any frame with z up)
@@ -19,12 +19,12 @@ unit = "m/s"                  # m/s, cm/s, mm/s
 [body_rates]
 columns = ["p", "q", "r"]
 unit = "deg/s"                # rad/s, deg/s
-[motors]                      # in the order of the vehicle's rotors; which way they spin is the vehicle's
+[motors]                      # in the order of the vehicle's rotors, whose spin is in the vehicle file
 columns = ["m3", "m1", "m4", "m2"]
 unit = "rpm"                  # rad/s, rpm, rev/s, or command with
 # polynomial = [150.0, 900.0] # rad/s = c0 + c1 command + c2 command² …
 [format]
-delimiter = ";"               # may be left out: a comma
+delimiter = ";"               # optional, by default a comma
 """
 
 import math
@@ -36,7 +36,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
-from hybrid_jax.flights.flight_csv import MOST_ROWS, flight_log, read_table
+from hybrid_jax.flights.flight_csv import MAX_ROWS, flight_log, read_table
 from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
 from hybrid_jax.vehicle import read_tables
 
@@ -53,7 +53,7 @@ COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "motors": 4}
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of one quantity and the unit they are in; for motors, the map of a command to rad/s.
+    """The columns of one quantity and their unit; for motors also the map from command to rad/s.
 
     Attributes:
         columns: names in the header.
@@ -68,10 +68,10 @@ class Columns:
 
 @dataclass(frozen=True)
 class ColumnMap:
-    """What the columns of a CSV log mean; `quantities` has one entry for each key of `SCALES`.
+    """The meaning of the columns of a CSV log; `quantities` has one entry for each key of `SCALES`.
 
     Raises:
-        ValueError: the table and the key that cannot be, in one line.
+        ValueError: the table, the key and what was expected, in one line.
     """
 
     frames: Frames
@@ -86,7 +86,7 @@ class ColumnMap:
         for name, stated in self.quantities.items():
             for column in stated.columns:
                 if self.names.count(column) > 1:
-                    raise ValueError(f"[{name}]: column {column!r} is named twice; each has one meaning")
+                    raise ValueError(f"[{name}]: column {column!r} is named twice")
         if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
             raise ValueError(f"[format]: delimiter must be one character, got {self.delimiter!r}")
 
@@ -109,18 +109,18 @@ def load_column_map(path: str | Path) -> ColumnMap:
         raise ValueError(f"{path}: {error}") from error
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap, *, most_rows: int = MOST_ROWS) -> FlightLog:
+def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_ROWS) -> FlightLog:
     """Read one flight of a CSV file, plain or gzip, into the library's units and frames.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
-    table = read_table(path, column_map.names, delimiter=column_map.delimiter, most_rows=most_rows)
+    table = read_table(path, column_map.names, delimiter=column_map.delimiter, max_rows=max_rows)
     return flight_log(path, convert(table, column_map, str(path)))
 
 
 def convert(table: Float[np.ndarray, "n c"], column_map: ColumnMap, origin: str = "table") -> Float[np.ndarray, "n 18"]:
-    """Numbers in the order of `column_map.names` → t, state, rotor speeds as in `hybrid_jax.state`.
+    """Convert numbers in the order of `column_map.names` to t, state and rotor speeds as in `hybrid_jax.state`.
 
     Raises:
         ValueError: angles declared in rad that are degrees, or an attitude of norm zero.

@@ -1,6 +1,6 @@
-"""Is a log what it is taken for? Each check holds two independent records of one motion against each other.
+"""Consistency checks of a log: each compares two independent records of one motion.
 
-Where they disagree, the usual mistakes are undone one at a time, and the one that makes them agree is suggested.
+Where they disagree, common mistakes are undone one at a time, and the one that resolves the disagreement is suggested.
 """
 
 from collections.abc import Callable
@@ -30,35 +30,35 @@ from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
 MORE_FLIGHT = "check on a flight with more motion"
-UNUSUAL = "no usual mistake explains it: look at sensors, time stamps and columns"
-MOST_SAMPLES = 100_000  # of a longer log, its middle
+UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
+MAX_SAMPLES = 100_000  # the middle of longer logs is checked
 
-LONGEST_INTERVAL = 0.5  # s; no vehicle is flown by fewer samples
-# Relative errors: 0 where two records agree, 1 where they have nothing in common, √2 where they are opposed.
+LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
+# Relative errors: 0 for equal records, 1 for uncorrelated ones, √2 for opposite ones.
 KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
-AXIS_LIMIT = 0.8  # of one axis alone, where less motion is more noise
+AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
-YAW_LIMIT = 0.3  # correlation: rotors turn the body about z by little, and two of four wrong signs leave half of it
+YAW_LIMIT = 0.3  # correlation: rotor torque about z is small, and two wrong signs of four leave half of it
 OPPOSED = -0.1  # correlation
-NOISE = 0.2  # of the least motion: readings that differ by less are the same
-CLEAR = 1.0  # times the least motion that an axis must move to be judged alone
+NOISE = 0.2  # share of the least motion below which two readings count as equal
+CLEAR = 1.0  # multiple of the least motion needed to check a single axis
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
 
-Law = Callable[[Vectors, Vectors, float], str]  # of two records and the least motion: what is wrong, if anything
+Law = Callable[[Vectors, Vectors, float], str]  # two records and the least motion → suggestion, empty if it holds
 
 
 @dataclass(frozen=True)
 class Check:
-    """One line of the table.
+    """The result of one check.
 
     Attributes:
-        name: what was held against what.
-        value, unit, limit: what was measured and what it may be at most (correlations: at least).
+        name: the two records compared.
+        value, unit, limit: measured value and its maximum (for correlations its minimum).
         verdict: "ok", "fails" or "cannot tell".
-        suggestion: what to correct, or that there is nothing.
+        suggestion: what to correct, if anything.
     """
 
     name: str
@@ -70,19 +70,19 @@ class Check:
 
 
 def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
-    """Every check that a log and what is known of its vehicle allow.
+    """Run all checks of a log against itself and its vehicle.
 
     Raises:
         ValueError: fewer than two samples.
     """
-    skip = max(0, (len(log) - MOST_SAMPLES) // 2)
-    log = log[skip : skip + MOST_SAMPLES]
-    exact = _no_axis_apart, _one_scale  # kinematics; wind and drag part v̇ from thrust
+    skip = max(0, (len(log) - MAX_SAMPLES) // 2)
+    log = log[skip : skip + MAX_SAMPLES]
+    exact = _axes_agree, _one_scale  # of kinematics alone: wind and drag separate v̇ from thrust
     return [
         *_samples(log),
-        _judge(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
-        _judge(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
-        _judge(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
+        _compare(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
+        _compare(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
+        _compare(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
         *_thrust(log, vehicle),
         _columns(log),
         *_motors(log, vehicle),
@@ -92,7 +92,7 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
 def _samples(log: FlightLog) -> list[Check]:
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
     clock = "the time is in ms or µs: declare its unit"
-    split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones if you ask"
+    split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones"
     return [
         Check("interval between samples", log.dt, "s", LONGEST_INTERVAL, *_at_most(log.dt, LONGEST_INTERVAL, clock)),
         Check("gaps", lost, "share of intervals", 0.01, *_at_most(lost, 0.01, split)),
@@ -105,17 +105,17 @@ def _at_most(value: float, limit: float, suggestion: str) -> tuple[str, str]:
 
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
-    """How long the vehicle stood, and while it flew the mean specific force along body z over k Σu² / m."""
+    """Check time on the ground, and in flight the mean specific force along body z over k Σu² / m."""
     name, resting = "specific force over thrust per mass", at_rest(log)
     flying = sound_intervals(log) & ~resting[:-1]
-    stood = float(resting.mean())
-    advice = "cut out what is not flight: in_flight(log), or --cleaning.in-flight"
-    ground = Check("time on the ground", stood, "share of samples", 0.01, *_at_most(stood, 0.01, advice))
+    grounded = float(resting.mean())
+    advice = "cut it out: in_flight(log), or --cleaning.in-flight"
+    ground = Check("time on the ground", grounded, "share of samples", 0.01, *_at_most(grounded, 0.01, advice))
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
-        still = "the motors stand still: check in flight"
+        still = "the motors stand still: check a log in flight"
         return [ground, Check(name, float("nan"), "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)]
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
@@ -135,7 +135,7 @@ def _thrust_suggestion(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
 
 
 def _columns(log: FlightLog) -> Check:
-    """Motors that are always equal, or a rate that never changes, are a column read twice or not at all."""
+    """Check for equal motors and constant columns: a column was read twice or not recorded."""
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
     columns: dict[str, np.ndarray] = dict(zip(COLUMNS[-len(values) :], values, strict=True))
     moving = [name for name, values in columns.items() if (values != values[0]).any()]
@@ -143,9 +143,10 @@ def _columns(log: FlightLog) -> Check:
     alike = [(a, b) for a, b in combinations(motors, 2) if (columns[a] == columns[b]).all()]
     kinds = [[name for name in columns if name[0] == kind] for kind in "vwu"]
     still = [name for kind in kinds if {*kind} & {*moving} for name in kind if name not in moving]
-    said = [f"{a} and {b} are equal in every sample" for a, b in alike] + [f"{name} never changes" for name in still]
-    verdict = (FAILS, f"{'; '.join(said)}: name the columns that were measured") if said else (OK, NOTHING)
-    return Check("columns", float(len(said)), "suspect", 0.0, *verdict)
+    problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
+    problems += [f"{name} never changes" for name in still]
+    verdict = (FAILS, f"{'; '.join(problems)}: name the measured columns") if problems else (OK, NOTHING)
+    return Check("columns", float(len(problems)), "suspect", 0.0, *verdict)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
@@ -185,8 +186,8 @@ def _lag(lag: float, limit: float) -> Check:
     return Check("lag of the gyro behind the motors", lag, "ms", limit, *_at_most(abs(lag), limit, advice))
 
 
-def _judge(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
-    """Compare two records under every reading, and by what else must hold of them."""
+def _compare(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
+    """Compare two records under every reading and by further laws."""
     smooth = smoother(log)
     pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in readings.items()}
     a, b = pairs[NOTHING]
@@ -199,28 +200,28 @@ def _judge(log: FlightLog, name: str, readings: Readings, limit: float, least: f
 
 
 def _nearer(pairs: Readings, limit: float, least: float) -> str:
-    """The reading under which the records are nearest to each other, if that is another than the log's own."""
+    """Find the reading under which the records agree best; empty if that is the unchanged log."""
     left = {reading: a - b for reading, (a, b) in pairs.items()}
     own = left[NOTHING]
-    # Nearer by any margin counts, if the two readings differ by more than noise: a slow axis is a small part of all.
+    # Any improvement counts if two readings differ by more than noise: an axis with little motion contributes little.
     nearer = [r for r, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
     best = min(nearer, key=lambda reading: _size(left[reading]), default=NOTHING)
     return best if nearer and _relative_error(*pairs[best]) <= limit else ""
 
 
-def _no_axis_apart(a: Vectors, b: Vectors, least: float) -> str:
+def _axes_agree(a: Vectors, b: Vectors, least: float) -> str:
     apart = [axis for axis, ratio in zip("xyz", _by_axis(a, b, least), strict=True) if ratio > AXIS_LIMIT]
     return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
 
 
 def _one_scale(a: Vectors, b: Vectors, least: float) -> str:
     gain = float((a * b).sum() / (b * b).sum())
-    said = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
-    return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else said
+    message = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
+    return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else message
 
 
 def _by_axis(a: Vectors, b: Vectors, least: float) -> list[float]:
-    """The relative error of each axis; 0 where there is little motion along it."""
+    """The relative error of each axis; 0 with little motion along it."""
     columns = [(a[:, [axis]], b[:, [axis]]) for axis in range(3)]
     return [_relative_error(*pair) if max(map(_size, pair)) > CLEAR * least else 0.0 for pair in columns]
 

@@ -1,6 +1,6 @@
 """Flight-log CSV, plain or gzip: t, then the state, then the rotor speeds, one row per sample; SI units.
 
-The header names the columns; their order is free and columns of other names are left out.
+The header names the columns. Their order is free, and other columns are ignored.
 """
 
 import gzip
@@ -18,21 +18,21 @@ from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
 from hybrid_jax.state import BODY_RATES, QUATERNION
 
 BLOCK = 1 << 22  # characters read at once
-LONGEST_ROW = 1 << 16
-MOST_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
+MAX_ROW_LENGTH = 1 << 16
+MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
 
 
-def read_csv(path: str | Path, *, most_rows: int = MOST_ROWS) -> FlightLog:
+def read_csv(path: str | Path, *, max_rows: int = MAX_ROWS) -> FlightLog:
     """Read one flight.
 
     Raises:
         ValueError: file, row (the first line is row 1), field and what to do, in one line.
     """
-    return flight_log(path, read_table(path, COLUMNS, most_rows=most_rows))
+    return flight_log(path, read_table(path, COLUMNS, max_rows=max_rows))
 
 
 def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
-    """The flight of a file whose row i + 2 holds table[i] in the order of `COLUMNS`, SI units and the library's frames.
+    """Make the log of a file from its table in the order of `COLUMNS`; row i + 2 of the file holds table[i].
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
@@ -45,16 +45,16 @@ def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
 
 
 def read_table(
-    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", most_rows: int = MOST_ROWS
+    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", max_rows: int = MAX_ROWS
 ) -> Float[np.ndarray, "n c"]:
-    """The named columns of a CSV file with a header, in the order asked for; every number is finite.
+    """Read the named columns of a CSV file with a header, in the given order; all numbers must be finite.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
     try:
         with Path(path).open("rb") as file:
-            parts = list(_parts(path, _text(file), columns, delimiter, most_rows))
+            parts = list(_parts(path, _text(file), columns, delimiter, max_rows))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
@@ -72,23 +72,23 @@ def _text(file: IO[bytes]) -> IO[str]:
     return io.TextIOWrapper(gzip.open(file) if packed else file, encoding="utf-8-sig")  # type: ignore[arg-type]
 
 
-def _parts(path, text: IO[str], columns, delimiter: str, most_rows: int) -> Iterator[Float[np.ndarray, "n c"]]:
-    header = text.readline(LONGEST_ROW)
+def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int) -> Iterator[Float[np.ndarray, "n c"]]:
+    header = text.readline(MAX_ROW_LENGTH)
     names = [name.strip() for name in header.split(delimiter)]
     for name in columns:
         if names.count(name) != 1:
             raise ValueError(_header_complaint(path, name, names, header))
     picked, row = [names.index(name) for name in columns], 2
     while block := text.read(BLOCK):
-        lines = (block + text.readline(LONGEST_ROW)).split("\n")
+        lines = (block + text.readline(MAX_ROW_LENGTH)).split("\n")
         if not lines[-1]:
             lines.pop()
-        elif len(lines[-1]) >= LONGEST_ROW:
+        elif len(lines[-1]) >= MAX_ROW_LENGTH:
             raise ValueError(
-                f"{path}: row {row + len(lines) - 1}: is longer than any row of numbers; is this a CSV file?"
+                f"{path}: row {row + len(lines) - 1}: is too long for a row of numbers; is this a CSV file?"
             )
-        if row - 2 + len(lines) > most_rows:
-            raise ValueError(f"{path}: row {most_rows + 2}: more than {most_rows} rows; split the file by flight")
+        if row - 2 + len(lines) > max_rows:
+            raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
         yield _numbers(path, lines, row, names, picked, delimiter)
         row += len(lines)
     if row == 2:
@@ -105,7 +105,7 @@ def _header_complaint(path, name: str, names: list[str], header: str) -> str:
 
 
 def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) -> Float[np.ndarray, "n c"]:
-    """The picked cells of some lines, the first of which is the given row."""
+    """Parse the picked cells of some lines, the first of which is the given row."""
     commas = len(names) - 1
     for at, line in enumerate(lines):
         if line.count(delimiter) != commas:
@@ -136,13 +136,13 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
 
 
 def _refuse_degrees(log: FlightLog, path: str | Path) -> None:
-    """Body rates that are 180/π times what the attitude does are degrees."""
+    """Refuse body rates that are about 180/π times those of the attitude."""
     if len(log) < 3:
         return
-    log = log[:100_000]  # enough to tell, and no second copy of a long log
+    log = log[:100_000]  # enough to decide, without a copy of a long log
     turned = np.linalg.norm(rates_between(log.t, log.x[:, QUATERNION]), axis=1)
     stated = np.linalg.norm(log.x[:-1, BODY_RATES], axis=1)
-    # Medians: noise and lost samples are no unit.
+    # Medians are robust to noise and lost samples.
     if np.median(turned) > 0.02 and 30 < np.median(stated) / np.median(turned) < 110:
         row = int(stated.argmax()) + 2
         raise ValueError(

@@ -1,4 +1,4 @@
-"""A recorded flight in the library's frames and units, checked once when it is made."""
+"""A recorded flight in the library's frames and units, checked when it is created."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -8,22 +8,22 @@ from jaxtyping import Float
 
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, QUATERNION, STATE_NAMES, STATE_SIZE
 
-NORM_TOLERANCE = 0.02  # |q| of a log printed with two digits is still within it, that of a wrong column hardly ever
+NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)
 
 
 @dataclass(frozen=True)
 class FlightLog:
-    """n samples of one flight; quaternions are made unit and of continuous sign, the first with w ≥ 0.
+    """n samples of one flight. Quaternions are normalised and their signs made continuous, the first with w ≥ 0.
 
     Attributes:
         t: time of each sample [s], strictly increasing.
         x: state at that time, as in `hybrid_jax.state`: z up, forward-left-up, SI.
         u: rotor speeds held from this sample to the next [rad/s].
-        name: what the flight is called in messages and reports, usually its file.
+        name: of the flight in messages and reports, usually its file.
 
     Raises:
-        ValueError: shapes that do not agree, or the first sample and field that cannot be, in one line.
+        ValueError: inconsistent shapes, or the first impossible sample and field, in one line.
     """
 
     t: Float[np.ndarray, " n"] = field(repr=False)
@@ -44,12 +44,12 @@ class FlightLog:
         return len(self.t)
 
     def __getitem__(self, rows) -> "FlightLog":
-        """The samples that a slice, mask or increasing indices pick."""
+        """The samples selected by a slice, a mask or increasing indices."""
         return FlightLog(self.t[rows], self.x[rows], self.u[rows], self.name)
 
     @property
     def dt(self) -> float:
-        """The median interval between samples [s], to the nanosecond: logs of one rate have one dt.
+        """The median interval between samples [s], rounded to nanoseconds so that logs of one rate agree.
 
         Raises:
             ValueError: fewer than two samples.
@@ -67,10 +67,10 @@ def require_possible(
     unit: str,
     first: int,
 ) -> None:
-    """Refuse numbers that no flight has.
+    """Refuse numbers that are impossible in a flight.
 
     Args:
-        unit, first: how a sample is called in the message and the number of the first, such as ("row", 2).
+        unit, first: name of a sample in messages and the number of the first, such as ("row", 2).
 
     Raises:
         ValueError: origin, sample, field and what to do, in one line.
@@ -91,7 +91,7 @@ def _infinite(t, x, u):
 
 
 def _disordered(t):
-    # Finite times may still overflow in a difference, so they are compared.
+    # Compare, as a difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         word = "repeats" if t[row] == t[row - 1] else "goes back from"
         yield (
@@ -102,7 +102,7 @@ def _disordered(t):
 
 
 def _not_rotations(q):
-    with np.errstate(over="ignore"):  # an infinite norm is no unit either
+    with np.errstate(over="ignore"):  # an infinite norm is refused too
         norm = np.linalg.norm(q, axis=1)
     for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
         advice = "cut out samples without an attitude" if norm[row] == 0 else "are these the four quaternion columns?"
@@ -115,7 +115,7 @@ def _backwards(u):
 
 
 def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
-    """Unit quaternions without jumps from q to −q: one rotation, one set of numbers."""
+    """Unit quaternions without jumps from q to −q."""
     q = q / np.linalg.norm(q, axis=1, keepdims=True)
     flips = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     start = -1.0 if q[0, 0] < 0 else 1.0

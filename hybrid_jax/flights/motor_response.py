@@ -1,4 +1,4 @@
-"""How a vehicle's angular acceleration follows its rotors: which column is which rotor, which way, and how late."""
+"""Estimate from angular acceleration the order of the motors, their direction of spin and their lag."""
 
 from dataclasses import dataclass
 from itertools import permutations
@@ -13,24 +13,24 @@ from hybrid_jax.state import BODY_RATES
 from hybrid_jax.vehicle import Vehicle
 
 LONGEST_LAG = 0.1  # s, either way
-# Moving means, the same for torque and motors: the short one takes away noise, taking away the long one leaves out
-# aerodynamic moments and offsets of the centre of mass, which the motors counteract and so seem to cause.
+# Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
+# and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s
-YAW_LEAD = 0.02  # s by which yaw may seem to precede or follow roll and pitch
+YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
 ORDERS = np.array(list(permutations(range(4))))
 TIME_CONSTANTS = np.concatenate([[0.0], np.geomspace(0.005, 0.2, 24)])  # s
 
 
 @dataclass(frozen=True)
 class Response:
-    """The order of motors and the lag that explain roll and pitch best together, and what they do to yaw.
+    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw.
 
     Attributes:
         order: `u[:, order]` is in the order of the vehicle's rotors.
-        yaw_sign: −1 if every rotor spins against what the vehicle says.
+        yaw_sign: −1 if every rotor spins opposite to the vehicle file.
         lag: time by which angular acceleration follows the motors [s]; negative if it precedes them.
         correlations: of roll and pitch at that order and lag, of yaw at its own best lag near it.
-        as_is: of roll, pitch and yaw for the motors as they are, at that lag.
+        as_is: of roll, pitch and yaw for the motors in their present order, at that lag.
     """
 
     order: tuple[int, int, int, int]
@@ -41,19 +41,19 @@ class Response:
 
 
 def mixer(vehicle: Vehicle) -> Float[np.ndarray, "3 4"]:
-    """Roll, pitch and yaw torque per u² of each rotor, up to a positive factor for each row."""
+    """Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row."""
     arms = np.asarray(vehicle.rotor_positions)
     return np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
 
 
 def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
-    """The best of all orders and lags up to ±0.1 s by correlation, then the sign of yaw; None: too little flight."""
+    """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
     reach = round(LONGEST_LAG / log.dt)
     torque, squares = _quick(log, vehicle)
     if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
         return None
     table = np.stack([correlations(torque, squares, mixer(vehicle), lag) for lag in range(-reach, reach + 1)])
-    # Yaw has no say: a rotor that speeds up turns the body at once, so yaw seems to precede the motors.
+    # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
     score = table[..., 0] + table[..., 1]
     at, best = np.unravel_index(score.argmax(), score.shape)
     near = round(YAW_LEAD / log.dt)
@@ -69,7 +69,7 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
 def correlations(
     torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n 4"], mix: Float[np.ndarray, "3 4"], lag: int
 ) -> Float[np.ndarray, "24 3"]:
-    """Correlation of torque with what each order of the motors predicts `lag` samples before."""
+    """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
     ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
     cross, spread = ahead.T @ behind, behind.T @ behind
     shared = np.einsum("aj,aoj->oa", mix, cross[:, ORDERS])
@@ -77,23 +77,8 @@ def correlations(
     return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
 
 
-def estimate_time_constant(log: FlightLog, vehicle: Vehicle) -> float:
-    """The first-order lag [s] of the rotors behind the log's motor values that explains roll and pitch best.
-
-    Raises:
-        ValueError: too little flight to tell.
-    """
-    scores = []
-    for time_constant in TIME_CONSTANTS:
-        torque, squares = _quick(FlightLog(log.t, log.x, lagged(log, time_constant), log.name), vehicle)
-        scores.append(correlations(torque, squares, mixer(vehicle), 0)[0, :2].sum())
-    if not max(scores) > 0.2:
-        raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be told")
-    return float(TIME_CONSTANTS[int(np.argmax(scores))])
-
-
 def lagged(log: FlightLog, time_constant: float) -> Float[np.ndarray, "n 4"]:
-    """Mean rotor speed over each interval if rotors follow u as τ ẇ = u − w; each segment starts in equilibrium.
+    """Mean rotor speed over each interval for τ ẇ = u − w; each segment starts in equilibrium.
 
     Samples must be evenly spaced within a segment.
     """
@@ -109,7 +94,7 @@ def lagged(log: FlightLog, time_constant: float) -> Float[np.ndarray, "n 4"]:
 
 
 def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
-    """J ω̇ + ω × J ω and u² of each interval, of time scales from `FAST` to `SLOW`; zero near gaps."""
+    """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
     fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
     sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
     if len(sound) < fast + slow:
@@ -126,13 +111,13 @@ def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], 
 
 
 def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
-    """The mean of each `width` rows in a row."""
+    """The mean of each `width` consecutive rows."""
     total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
     return (total[width:] - total[:-width]) / width
 
 
 def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
-    """Where between samples a parabola through the maximum and its neighbours peaks, −0.5 … 0.5."""
+    """Sub-sample position of the peak, −0.5 … 0.5, by a parabola through the maximum and its neighbours."""
     if not 0 < at < len(score) - 1:
         return 0.0
     left, top, right = score[at - 1 : at + 2]

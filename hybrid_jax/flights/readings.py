@@ -1,7 +1,7 @@
-"""How the numbers of a log may have to be read: each usual mistake undone, one at a time.
+"""Common mistakes in a log, undone one at a time.
 
-A reading is a pair of records that should be equal, such as dp/dt and v, as they are if that mistake was made. The
-first, `NOTHING`, is the log as it stands.
+A reading is a pair of records that should be equal, such as dp/dt and v, after undoing one mistake. The first reading,
+`NOTHING`, is the unchanged log.
 """
 
 from collections.abc import Callable
@@ -18,7 +18,7 @@ from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 NOTHING = "nothing to correct"
 SPAN = 0.05  # s of moving average on both sides of an equation
-LATE = 0.1  # s by which a velocity is tried to be late or early
+LATE = 0.1  # delay or advance of a velocity that is tried [s]
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
 
@@ -87,7 +87,7 @@ def accelerations(log: FlightLog) -> Readings:
         ),
         'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
     }
-    # The other readings of attitudes turn thrust about z alone, which wind or a load may do as well.
+    # Other readings of attitudes rotate thrust about z only, which wind or a load may do as well.
     stated |= {reading: (other, v) for reading, other in list(_attitudes(q).items())[:2]}
     return {reading: _by_thrust(log, q, v, thrust) for reading, (q, v) in stated.items()}
 
@@ -107,7 +107,7 @@ def _one_axis_flipped() -> Float[np.ndarray, "3 3"]:
 
 
 def _shifted(values: Vectors, samples: int) -> Vectors:
-    """What is stated so many samples later; the ends are held."""
+    """Shift values by some samples; the ends are repeated."""
     return values[np.clip(np.arange(len(values)) + samples, 0, len(values) - 1)]
 
 
@@ -125,12 +125,12 @@ def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
 
 
 def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
-    """Means of neighbouring samples."""
+    """Means of adjacent samples."""
     return 0.5 * (values[1:] + values[:-1])
 
 
 def smoother(log: FlightLog) -> Callable[[Vectors], Vectors]:
-    """Means over `SPAN` of sound intervals only."""
+    """Return a moving mean over `SPAN` that uses sound intervals only."""
     sound = sound_intervals(log)[:, None].astype(float)
     width = min(max(1, round(SPAN / log.dt)), len(sound))
     whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9

@@ -1,8 +1,4 @@
-"""The rotors' time constant by what it does to a model's predictions, where the log tells what rotors were told.
-
-`cleaning.follow_motors` finds it by correlation with the gyro in one log; this finds the one value for many logs with
-which a model, fitted anew for each candidate, predicts best.
-"""
+"""Estimate the rotor time constant by minimising prediction error, for logs that record commands, not rotor speeds."""
 
 from collections.abc import Callable, Sequence
 
@@ -18,15 +14,15 @@ def choose_time_constant(
     error: Callable[[list[FlightLog]], float],
     candidates: Sequence[float] = tuple(TIME_CONSTANTS.tolist()),
 ) -> tuple[float, list[float]]:
-    """The candidate [s] with the least error, and the error of each.
+    """Choose the time constant [s] with the smallest error; also return the error of each candidate.
 
     Args:
-        error: of logs whose motors follow with the candidate; fits and judges a model on them.
+        error: prediction error of a model fitted to logs to which a candidate was applied.
 
     Raises:
-        ValueError: no error is finite, or what `cleaning.lag_motors` refuses.
+        ValueError: no error is finite, or as `lag_motors`.
     """
     errors = [float(error([lag_motors(log, candidate)[0] for log in logs])) for candidate in candidates]
     if not np.isfinite(errors).any():
-        raise ValueError("error is finite for no candidate, so the time constant cannot be told")
+        raise ValueError("error is finite for no candidate, so no time constant can be chosen")
     return float(candidates[int(np.nanargmin(np.where(np.isfinite(errors), errors, np.nan)))]), errors

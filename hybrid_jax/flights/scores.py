@@ -1,11 +1,9 @@
-"""How well a field predicts recorded flight, in four quantities that have units, and in the two ways others report it.
+"""Prediction errors on recorded flight in position, velocity, rotation and body rates.
 
-- At horizons: the root mean square, over windows, of the length of the error after 10, 50, … intervals.
-- The nanodrone protocol: from every sample, 50 intervals open loop; the mean error of each step, summed over steps
-  (windows with a stride of 1 and a horizon of 50).
+Two protocols use them: the RMSE over windows after 10, 50, … intervals, and that of the nanodrone benchmark, the mean
+error of each of 50 steps from every sample, summed over steps.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import diffrax
@@ -25,7 +23,7 @@ Errors = Float[np.ndarray, "n t"]
 
 
 class FlightErrors(NamedTuple):
-    """One number, or an array of them, for each quantity.
+    """An error for each quantity.
 
     Attributes:
         position: length of the error vector [m].
@@ -41,13 +39,13 @@ class FlightErrors(NamedTuple):
 
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
-    """The error of each predicted state."""
+    """Compute the error of each predicted state."""
 
     def length(part: slice):
         return jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1)
 
     a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
-    # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle: exact for small ones too.
+    # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle, which is accurate for small angles.
     chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
     angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
     return FlightErrors(length(POSITION), length(VELOCITY), angle, length(BODY_RATES))
@@ -59,20 +57,20 @@ def flight_errors(
     solver: diffrax.AbstractSolver | None = None,
     chunk: int = 2000,
 ) -> FlightErrors:
-    """The errors (n, t) of a field as deployed, of every window at the end of every interval.
+    """Compute the errors (n, t) of a field in inference mode, for every window at the end of every interval.
 
     Args:
-        chunk: windows that are predicted at a time.
+        chunk: number of windows that are predicted at a time.
 
     Raises:
-        ValueError: windows that are malformed, or not of a multirotor.
+        ValueError: malformed windows, or states other than those of a multirotor.
     """
     check(windows, "windows")
     checks.count("chunk", chunk)
     if windows.x.shape[-1] != STATE_SIZE:
         raise ValueError(f"windows: states of {STATE_SIZE} expected, as in state.py, got {windows.x.shape[-1]}")
     check_attitudes(windows, "windows")
-    # The last part is filled up, so that one program serves all.
+    # The last part is padded, so that all parts share one program.
     parts = [np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk)]
     if len(parts) == 1:
         parts = [np.arange(len(windows))]
@@ -86,30 +84,6 @@ def _errors(field, windows: Trajectories, solver) -> FlightErrors:
     return errors_between(predicted, jnp.asarray(windows.x))
 
 
-def rmse_at(errors: FlightErrors, horizons: Sequence[int]) -> dict[int, FlightErrors]:
-    """The root mean square over windows of the errors (n, t) after each of some numbers of intervals.
-
-    Raises:
-        ValueError: a horizon beyond that of the windows.
-    """
-    longest = np.shape(errors.position)[1]
-    for steps in horizons:
-        checks.count("horizons", steps)
-        if steps > longest:
-            raise ValueError(f"horizons must be at most the {longest} intervals of the windows, got {steps}")
-
-    def rms(part) -> list[float]:
-        return [float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float)))) for steps in horizons]
-
-    columns = zip(*map(rms, errors), strict=True)
-    return {steps: FlightErrors(*column) for steps, column in zip(horizons, columns, strict=True)}
-
-
 def mean_by_step(errors: FlightErrors) -> FlightErrors:
-    """The mean error (t,) over windows at each step, as the nanodrone protocol plots it."""
+    """Average errors (n, t) over windows: the mean error (t,) at each step, as in the nanodrone protocol."""
     return FlightErrors(*(np.mean(part, axis=0, dtype=float) for part in errors))
-
-
-def summed_mean(errors: FlightErrors) -> FlightErrors:
-    """The mean error over windows at each step, summed over steps: the nanodrone protocol's score."""
-    return FlightErrors(*(float(np.sum(part)) for part in mean_by_step(errors)))

@@ -1,4 +1,4 @@
-"""Where a log may be integrated: stretches without gaps and without samples that were repeated because none came."""
+"""Segments of a log without gaps and without repeated samples."""
 
 import numpy as np
 from jaxtyping import Bool
@@ -6,8 +6,9 @@ from jaxtyping import Bool
 from hybrid_jax.flights.log import FlightLog
 
 GAP = 1.5  # intervals longer than this many times the median are gaps
-IDLE = 0.3  # of the thrust in flight: below it a vehicle stands, falls or rolls
-RESTING = 0.5  # s that it does so at least before it is said to stand
+IDLE = 0.3  # share of the thrust in flight below which a vehicle is on the ground
+JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
+RESTING = 0.5  # minimum time [s] with idle motors to count as on the ground
 
 
 def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
@@ -16,24 +17,47 @@ def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
 
 
 def repeats(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Whether a sample's state is, to the last digit, that of the sample before: a vehicle in flight has noise."""
+    """Whether a state equals the one before in every digit, which noise rules out for fresh samples."""
     return np.concatenate([[False], (np.diff(log.x, axis=0) == 0).all(axis=1)])
 
 
 def sound_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
-    """Whether an interval has no gap and two measured ends."""
+    """Whether an interval is no gap and has fresh samples at both ends."""
     stale = repeats(log)
     return ~(gaps(log) | stale[:-1] | stale[1:])
 
 
 def segments(log: FlightLog) -> list[slice]:
-    """The longest runs of samples joined by sound intervals, two samples or more each."""
+    """Maximal runs of at least two samples joined by sound intervals."""
     edges = np.flatnonzero(np.diff(np.concatenate([[0], sound_intervals(log), [0]])))
     return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
+def even_segments(log: FlightLog) -> list[slice]:
+    """Return the segments after checking that the samples of each are evenly spaced.
+
+    Raises:
+        ValueError: the time of the first uneven interval.
+    """
+    for part in (found := segments(log)):
+        uneven = _uneven(log, part)
+        if uneven.any():
+            at = log.t[part][int(uneven.argmax())]
+            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return found
+
+
+def is_even(log: FlightLog) -> bool:
+    """Whether the samples of each segment are evenly spaced."""
+    return not any(_uneven(log, part).any() for part in segments(log))
+
+
+def _uneven(log: FlightLog, part: slice) -> Bool[np.ndarray, " n-1"]:
+    return np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
+
+
 def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Whether a sample is of half a second or more with hardly any thrust: on the ground, not in flight."""
+    """Whether a sample belongs to a period of half a second or more with hardly any thrust, on the ground."""
     power = (log.u**2).sum(axis=1)
     idle = power < IDLE * np.quantile(power, 0.9)
     edges = np.flatnonzero(np.diff(np.concatenate([[0], idle, [0]])))

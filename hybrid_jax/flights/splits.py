@@ -1,7 +1,7 @@
-"""Which flights a model learns from and which judge it: a flight, or a manoeuvre, is never on both sides.
+"""Split flights into training and test by flight or by manoeuvre.
 
-Windows of one flight overlap and share their wind, battery and payload, so windows drawn at random from all flights
-would be judged by their own neighbours.
+Windows of one flight overlap and share wind, battery and payload. Windows drawn at random from all flights would put
+neighbouring windows into training and test.
 """
 
 import re
@@ -13,8 +13,8 @@ from jaxtyping import Int
 
 from hybrid_jax.flights.log import FlightLog
 
-Split = tuple[list[FlightLog], list[FlightLog]]  # to learn from, and held out
-SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of files that are flights
+Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
+SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of log files
 _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
 
@@ -26,18 +26,18 @@ def flight_of(log: FlightLog) -> str:
 
 
 def manoeuvre_of(log: FlightLog) -> str:
-    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are a "chirp".
+    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are both "chirp".
 
-    A number is that of a run only behind a separator, or behind "run", "flight", "take" or "log": a "figure8" is none.
+    A number counts as that of a run after a separator or after "run", "flight", "take" or "log"; "figure8" has none.
     """
     return _RUN.sub("", flight_of(log)) or flight_of(log)
 
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
-    """The flights of other names, and those of these names.
+    """Split flights into those of other names and those of the given names.
 
     Raises:
-        ValueError: a name that no flight has, or none left on one side.
+        ValueError: an unknown name, or one side is empty.
     """
     known = sorted({of(log) for log in logs})
     for name in names:
@@ -46,7 +46,7 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
     split = [log for log in logs if of(log) not in names], [log for log in logs if of(log) in names]
     if not all(split):
         raise ValueError(
-            f"names: {len(split[0])} flights to learn from and {len(split[1])} held out; each side needs one"
+            f"names: {len(split[0])} flights for training and {len(split[1])} held out; each side needs one"
         )
     return split
 
@@ -54,15 +54,15 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
 def folds(
     logs: Sequence[FlightLog], count: int | None = None, of: Callable[[FlightLog], str] = flight_of, seed: int = 0
 ) -> list[Split]:
-    """Splits in which each flight is held out once, all of one name together.
+    """Make splits in which each flight is held out once, together with all flights of its name.
 
     Args:
-        count: how many splits; by default one for each name.
-        of: what must not be on both sides: `flight_of`, `manoeuvre_of` or one's own.
-        seed: of the order in which names are dealt out.
+        count: number of splits; by default one per name.
+        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
+        seed: of the assignment of names to splits.
 
     Raises:
-        ValueError: fewer than two splits, or more than there are names.
+        ValueError: count is less than 2 or more than the number of names.
     """
     names = sorted({of(log) for log in logs})
     count = len(names) if count is None else count
@@ -73,10 +73,10 @@ def folds(
 
 
 def contiguous(sizes: Sequence[int], count: int, seed: int) -> Int[np.ndarray, " count"]:
-    """Indices of `count` windows in a row, all of one flight: how little flight is needed shows in these.
+    """Pick `count` consecutive windows of one flight at random, as a recording of a few seconds would give.
 
     Args:
-        sizes: how many windows each flight has, in order; their windows follow each other, as in `concatenate`.
+        sizes: number of windows of each flight, in the order of the concatenated windows.
 
     Raises:
         ValueError: no flight has as many windows.

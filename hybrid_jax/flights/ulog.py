@@ -1,7 +1,7 @@
-"""PX4 ULog → FlightLog, through pyulog (extra `logs`).
+"""Read PX4 ULog files with pyulog (extra `logs`).
 
 PX4 states attitude as body FRD → world NED and vectors in these frames (msg/versioned/VehicleAttitude.msg,
-msg/versioned/VehicleLocalPosition.msg). Each topic runs on its own clock; all are brought to one.
+msg/versioned/VehicleLocalPosition.msg). Each topic has its own time stamps; all are resampled to one grid.
 """
 
 import contextlib
@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, interpolate, interpolate_attitude, mean_of_held, to_library
-from hybrid_jax.flights.flight_csv import MOST_ROWS
+from hybrid_jax.flights.flight_csv import MAX_ROWS
 from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
 
 FRAMES = Frames(world="NED", body="FRD", velocity="world")
@@ -23,7 +23,7 @@ STATES = {
 }
 RPM, COMMANDS = "esc_status", ("actuator_motors", "actuator_outputs")
 FIELDS = {RPM: "esc[{}].esc_rpm", "actuator_motors": "control[{}]", "actuator_outputs": "output[{}]"}
-LOST = 5  # an interval this many times a topic's median, or the clock's, is a gap: nothing is interpolated across it
+LOST = 5  # an interval above this multiple of a topic's median, or of dt, is a gap and is not interpolated across
 
 
 def read_ulog(
@@ -60,8 +60,8 @@ def read_ulog(
     if last - first < dt:
         raise ValueError(f"{path}: the topics share less than one interval of {dt} s; log them at the same time")
     count = int((last - first) / dt + 1e-6)
-    if count > MOST_ROWS:
-        raise ValueError(f"{path}: {last - first:.4g} s at dt = {dt} are more than {MOST_ROWS} samples; cut the log")
+    if count > MAX_ROWS:
+        raise ValueError(f"{path}: {last - first:.4g} s at dt = {dt} are more than {MAX_ROWS} samples; cut the log")
     t = np.minimum(first + dt * np.arange(count + 1), last)
     local = interpolate(t, tp, local)
     x = to_library(local[:, :3], interpolate_attitude(t, tq, q), local[:, 3:], interpolate(t, tw, omega), FRAMES)
@@ -76,12 +76,12 @@ def _load(path: str | Path):
     except ImportError as error:
         raise ImportError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     try:
-        # pyulog tells of damage on standard output only.
+        # pyulog reports damage on standard output only.
         with contextlib.redirect_stdout(io.StringIO()):
             log = pyulog.ULog(str(path), [*STATES, *FIELDS])
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-    except Exception as error:  # of a damaged file, pyulog raises whatever its parser met
+    except Exception as error:  # pyulog raises any exception for a damaged file
         raise ValueError(f"{path}: is not a ULog or is damaged; download it again ({type(error).__name__})") from error
     if log.file_corruption:
         raise ValueError(f"{path}: is damaged (pyulog found corrupt messages); download it again")
@@ -89,7 +89,7 @@ def _load(path: str | Path):
 
 
 def _samples(data, path, topic: str, fields: tuple[str, ...], clock: str = "timestamp_sample"):
-    """Time [s] and fields of a topic, in the order of time and without doubles."""
+    """Time [s] and fields of a topic, sorted by time and without duplicates."""
     if topic not in data:
         raise ValueError(f"{path}: has no topic {topic}; add it to the logged topics of the vehicle")
     table = data[topic]
@@ -139,7 +139,7 @@ def _fields(topic: str, order) -> tuple[str, ...]:
 
 
 def _is_known(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], dt: float):
-    """Whether t lies between two samples that are no gap apart; the interval that follows counts for its start."""
+    """Whether t lies between two samples without a gap; the start of a gap counts as known."""
     intervals = np.diff(at)
     lost = intervals > LOST * max(float(np.median(intervals)), dt)
     inside = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(intervals) - 1)

@@ -1,11 +1,11 @@
-"""A vehicle file says what may be learned, or is refused in one line that says what is wrong."""
+"""A whole vehicle file is read, or refused in one line that names what is wrong."""
 
 import pytest
 
 from hybrid_jax import rigid_body
 from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.dynamics.vehicle_file import VehicleDescription, load_description
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.vehicle import load_vehicle
 
 VEHICLE = """
@@ -30,31 +30,30 @@ def written(tmp_path):
     return write
 
 
-def test_a_vehicle_alone_is_the_paper_s_rigid_body(written):
+def test_vehicle_without_terms_is_the_rigid_body_of_the_paper(written):
     path = written()
-    found = load_description(path)
-    assert found == VehicleDescription(load_vehicle(path))
+    found = load_vehicle_model(path)
+    assert found == VehicleModel(load_vehicle(path))
     assert set(found.physics().deviations) == set(rigid_body(found.vehicle).log_ratios)
-    assert not found.learns_motor_lag
 
 
-def test_what_is_learned_and_known_is_read(written):
+def test_terms_and_learned_names_are_read(written):
     path = written(
         'learn = ["k_rotors", "drag", "motor_time_constant"]',
         "[vehicle.payload]\nmass = 2\n[terms]\ndrag = [0.1, 0.2, 0]\nmotor_time_constant = 0.02\n",
     )
-    found = load_description(path, "payload")
+    found = load_vehicle_model(path, "payload")
     assert found.terms == Terms(drag=(0.1, 0.2, 0.0), motor_time_constant=0.02)
     physics = found.physics()
     assert isinstance(physics, Multirotor)
     assert set(physics.deviations) == {"k_rotors", "drag"}
     assert physics.vehicle.mass == 2
-    assert found.learns_motor_lag
+    assert LAG in found.learn
     hash(found)
 
 
 @pytest.mark.parametrize(
-    ("above", "below", "said"),
+    ("above", "below", "message"),
     [
         ('learn = ["mass"]', "", "learn must be names of"),
         ('learn = ["k", "k"]', "", "learn"),
@@ -64,18 +63,18 @@ def test_what_is_learned_and_known_is_read(written):
         ("[learn]\nk = true", "", "learn must be a list"),
         ("", 'learn = ["k"]', "above all tables"),
         ('lern = ["k"]', "", "'lern'"),
-        ("", "[terms]\ndarg = [1, 2, 3]", "'darg'"),
+        ("", "[terms]\ndarg = [1, 2, 3]", "'darg': must be one of torque_gain,"),
         ("", "[terms]\ndrag = [1, 2]", "drag must be"),
         ("", "[terms]\nmotor_time_constant = -1", "motor_time_constant"),
         ("terms = 3", "", "table [terms]"),
         ("vehicle", "", "readable TOML"),
     ],
 )
-def test_a_file_that_makes_no_sense_is_refused_in_one_line(written, above, below, said):
+def test_invalid_files_are_refused_in_one_line(written, above, below, message):
     path = written(above + "\n", below)
     with pytest.raises(ValueError, match=r".") as error:
-        load_description(path)
-    message = str(error.value)
-    assert message.startswith(str(path))
-    assert said in message
-    assert "\n" not in message
+        load_vehicle_model(path)
+    text = str(error.value)
+    assert text.startswith(str(path))
+    assert message in text
+    assert "\n" not in text

@@ -1,4 +1,4 @@
-"""Learning from recorded flights: what is judged was never learned from."""
+"""Training on recorded flights: training, validation and test share no sample."""
 
 import os
 from dataclasses import replace
@@ -10,22 +10,26 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples
+from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
 from rich.console import Console
 
 import hybrid_jax
-from experiments.real_flight.claims import flight_claims
+from experiments.real_flight.claims import verdicts
+from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
-from experiments.real_flight.folds import apart, drawn, folds_of, lessons
-from experiments.real_flight.logs import Flown, Windows, count_windows, cut, fly_in, require_one_rate, stretch
-from experiments.real_flight.models import Craft, Lane, fresh
+from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
+from experiments.real_flight.logs import LogSet, load_logs
+from experiments.real_flight.models import thrust_baseline, untrained
 from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import QUANTITIES, FlightRow, pooled
+from experiments.real_flight.rows import QUANTITIES, TAGS, pooled
 from experiments.real_flight.scoring import parameters, scores
-from experiments.real_flight.study import in_turn, study
-from experiments.real_flight.train import Course
+from experiments.real_flight.study import each_fold, run_folds
+from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
+from experiments.reporting.results import Results
+from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.kinematics import Kinematics
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, longest_segment, require_common_interval
 from hybrid_jax.integrate import rollout
 from hybrid_jax.rotation import angle_between
 from hybrid_jax.state import QUATERNION
@@ -34,7 +38,7 @@ from hybrid_jax.vehicle import IRIS
 
 ROOT = Path(__file__).parents[2]
 REAL = Path(os.environ.get("HYBRID_JAX_FLIGHTS", ROOT.parent / "shared" / "flights"))
-CRAFT = Craft(IRIS, Terms())
+MODEL = VehicleModel(IRIS, learn=LEARN)
 
 needs_flights = pytest.mark.skipif(
     not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder"
@@ -50,36 +54,35 @@ CASES = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_nothing_that_judges_was_learned_from(case):
+def test_training_validation_and_test_share_no_sample(case):
     options, tested = CASES[case]
     config = replace(CONFIG, **options)
-    folds = folds_of(LOGS, tested, config)
+    folds = make_folds(LOGS, tested, config)
     held_out = [log.name for fold in folds for log in fold.test]
     assert sorted(held_out) == sorted(log.name for log in tested or LOGS)  # each is tested once
     for fold in folds:
-        found = lessons(fold, 5, 2, 10)
-        learned, stopping, judging = map(samples, (found.train.windows, found.validation, cut(fold.test, 5).windows))
-        assert not learned & judging
-        assert not stopping & judging
-        assert not learned & stopping
+        train, validation, test = map(samples, windows_of_fold(fold, 5, 2))
+        assert not train & test
+        assert not validation & test
+        assert not train & validation
 
 
-def test_a_manoeuvre_that_judges_is_in_no_flight_that_teaches():
-    for fold in folds_of(LOGS, OTHERS[:3], replace(CONFIG, folds_by="manoeuvre")):
-        taught = {log.name.split("_run")[0].split("/")[-1] for log in (*fold.train, *fold.validation)}
-        assert not taught & set(fold.name.split(", "))
+def test_test_manoeuvres_are_not_trained_on():
+    for fold in make_folds(LOGS, OTHERS[:3], replace(CONFIG, folds_by="manoeuvre")):
+        trained = {log.name.split("_run")[0].split("/")[-1] for log in (*fold.train, *fold.validation)}
+        assert not trained & set(fold.name.split(", "))
 
 
-def test_windows_are_counted_as_they_are_cut():
+def test_counted_windows_are_those_of_the_logs():
     gap = LOGS[1][[*range(20), *range(40, SAMPLES)]]
-    assert count_windows([LOGS[0], gap], 25) == len(cut([LOGS[0], gap], 25)) == 65 + 25
+    assert count_windows([LOGS[0], gap], 25) == len(cut_windows([LOGS[0], gap], 25)) == 65 + 25
 
 
 SHORT = [log[:30] for log in LOGS]
 
 
 @pytest.mark.parametrize(
-    ("options", "flights", "said"),
+    ("options", "flights", "message"),
     [
         ({"n": (100, 400)}, {"source": LOGS, "target": LOGS}, "--n 400: the training flights have only 325 windows"),
         ({"horizon": (40,)}, {"source": LOGS, "target": [*LOGS[:3], *SHORT[3:]]}, "no window of 40 intervals"),
@@ -93,45 +96,44 @@ SHORT = [log[:30] for log in LOGS]
         ),
     ],
 )
-def test_flights_too_short_are_refused_before_anything_is_trained(options, flights, said, monkeypatch, tmp_path):
-    monkeypatch.setattr(Course, "lesson", lambda *_: pytest.fail("training has begun"))
+def test_short_flights_are_refused_before_training(options, flights, message, monkeypatch, tmp_path):
+    monkeypatch.setattr(Stages, "run", lambda *_: pytest.fail("training has begun"))
     config = replace(CONFIG, cache=tmp_path, target=tmp_path if "target" in flights else None, **options)
-    flown = {name: Flown(name, logs, []) for name, logs in flights.items()}
-    with pytest.raises(ValueError, match=said):
-        study(CRAFT, CRAFT, flown, config, Console(quiet=True))
+    logs = {name: LogSet(name, each, []) for name, each in flights.items()}
+    with pytest.raises(ValueError, match=message):
+        run_folds(Experiment(config, MODEL, MODEL, logs, DT, Stages(tmp_path, Console(quiet=True))))
 
 
-def test_random_draws_are_nested_and_contiguous_ones_are_runs():
+def test_random_samples_are_nested_and_contiguous_ones_are_runs():
     sizes = [40, 60, 50]
-    few, many = (drawn(sizes, n, "random", 3) for n in (20, 100))
+    few, many = (sampled_indices(sizes, n, "random", 3) for n in (20, 100))
     np.testing.assert_array_equal(few, many[:20])
     starts = np.cumsum([0, *sizes])
     for seed in range(5):
         for n in (30, 60, 75, 150):
-            found = drawn(sizes, n, "contiguous", seed)
+            found = sampled_indices(sizes, n, "contiguous", seed)
             assert len(set(found.tolist())) == n
             runs = [found[(found >= a) & (found < b)] for a, b in pairwise(starts)]
             assert all((np.diff(run) == 1).all() for run in runs)
             assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
     with pytest.raises(ValueError, match="--n 151: the training flights have only 150 windows"):
-        drawn(sizes, 151, "contiguous", 0)
+        sampled_indices(sizes, 151, "contiguous", 0)
 
 
-def test_windows_apart_share_no_sample():
-    np.testing.assert_array_equal(apart(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
+def test_non_overlapping_windows_share_no_sample():
+    np.testing.assert_array_equal(non_overlapping(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
 
 
-def test_what_is_shown_of_a_flight_is_one_run_of_its_samples():
-    """The first flight that is long enough, and in it the longest run, whose times have no gap."""
+def test_longest_segment_is_of_the_first_long_flight():
     short, gap = LOGS[0][:4], LOGS[1][[*range(20), *range(40, SAMPLES)]]
-    shown = stretch([short, gap, LOGS[2]], 10)
-    assert shown.flight.name == LOGS[1].name
-    assert shown.begin == LOGS[1].t[40]
-    states = np.concatenate([shown.windows.x0[:1], *shown.windows.x])
+    log, begin, windows = longest_segment([short, gap, LOGS[2]], 10)
+    assert log.name == LOGS[1].name
+    assert begin == LOGS[1].t[40]
+    states = np.concatenate([windows.x0[:1], *windows.x])
     np.testing.assert_array_equal(states, LOGS[1].x[40:].astype(np.float32)[: len(states)])
     assert len(states) == 41
     with pytest.raises(ValueError, match="no window of 10 intervals without gaps in chirp_run1"):
-        stretch([short], 10)
+        longest_segment([short], 10)
 
 
 def test_kinematics_move_and_turn_at_constant_rates():
@@ -143,26 +145,30 @@ def test_kinematics_move_and_turn_at_constant_rates():
     np.testing.assert_allclose(angle, 0.5 * np.linalg.norm(x0[10:]), rtol=1e-4)
 
 
-def test_parameters_of_a_lane_have_intervals_around_them():
-    windows = cut(LOGS, 10, 5)
-    lanes = [Lane(seed, np.arange(len(windows)), 1.0) for seed in range(2)]
-    craft = replace(CRAFT, learn=("Ix", "k_rotors"))
-    noisy = windows.windows.x + np.random.default_rng(0).normal(0, 1e-3, windows.windows.x.shape).astype(np.float32)
-    noisy = Windows(eqx.tree_at(lambda w: w.x, windows.windows, noisy), windows.sizes, windows.stride)
-    objective = ChannelLoss(channels_from(CRAFT.thrust(), noisy.windows), 1.0)
-    for found in parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 2), lanes, noisy, objective):
-        assert set(found["theta"]) == {"Ix", *(f"k_rotors[{i}]" for i in range(4))}
-        for name, (low, high) in found["theta_interval"].items():
-            assert 0 < low < found["theta"][name] < high
+def test_parameters_have_intervals_around_them():
+    windows = cut_windows(LOGS, 10, 5)
+    noise = np.random.default_rng(0).normal(0, 1e-3, windows.windows.x.shape).astype(np.float32)
+    noisy = eqx.tree_at(lambda w: w.x, windows.windows, windows.windows.x + noise)
+    objective = ChannelLoss(channels_from(thrust_baseline(MODEL), noisy), 1.0)
+    data = TrainingData(LogWindows(noisy, windows.sizes, windows.stride), noisy, objective, len(noisy))
+
+    def found(seeds, indices):
+        fields = untrained("hybrid", replace(MODEL, learn=("Ix", "k_rotors")), RECIPES["staged"], 4, seeds)
+        model = TrainedModel("hybrid", "source_only", "staged", fields, range(seeds), [indices] * seeds)
+        return parameters(model, data)
+
+    for each in found(2, np.arange(len(windows))):
+        assert set(each["theta"]) == {"Ix", *(f"k_rotors[{i}]" for i in range(4))}
+        for name, (low, high) in each["theta_interval"].items():
+            assert 0 < low < each["theta"][name] < high
             # Positive: symmetric in the logarithm.
-            np.testing.assert_allclose(low * high, found["theta"][name] ** 2, rtol=1e-4)
-    few = [Lane(0, np.arange(3), 1.0)]
-    (found,) = parameters(fresh("hybrid", craft, RECIPES["staged"], 4, 1), few, noisy, objective)
-    assert found["theta"]["Ix"] == pytest.approx(IRIS.inertia[0])
-    assert found["theta_interval"] is None
+            np.testing.assert_allclose(low * high, each["theta"][name] ** 2, rtol=1e-4)
+    (few,) = found(1, np.arange(3))
+    assert few["theta"]["Ix"] == pytest.approx(IRIS.inertia[0])
+    assert few["theta_interval"] is None
 
 
-def test_the_nanodrone_score_is_the_mean_error_of_each_step_summed():
+def test_nanodrone_score_sums_the_mean_error_of_each_step():
     rms, mean = np.full((4, 60), 2.0), np.tile(np.arange(1.0, 61), (4, 1))
     found = scores(rms, mean, replace(CONFIG, protocol="nanodrone"))
     assert found["5"] == dict.fromkeys(QUANTITIES, 2.0)
@@ -171,29 +177,30 @@ def test_the_nanodrone_score_is_the_mean_error_of_each_step_summed():
 
 def row(mode, value, *, n=100, seed=0, fold="a", windows=1, model="hybrid"):
     errors = dict.fromkeys(QUANTITIES, value)
-    return FlightRow(fold, model, mode, n, seed, "staged", windows, {"10": errors, "sum": errors})
+    tags = dict(zip(TAGS, (fold, model, mode, n, seed), strict=True))
+    return tags | {"windows": windows, "scores": {"10": errors, "sum": errors}}
 
 
 def test_folds_are_pooled_by_their_windows():
-    rows = [row("scratch", 1.0), row("scratch", 3.0, fold="b", windows=3), row("scratch", 5.0, seed=1)]
+    rows = Results([row("scratch", 1.0), row("scratch", 3.0, fold="b", windows=3), row("scratch", 5.0, seed=1)], TAGS)
     np.testing.assert_allclose(pooled(rows, "10", "velocity"), [np.sqrt((1 + 3 * 9) / 4), 5])
     np.testing.assert_allclose(pooled(rows, "sum", "velocity"), [(1 + 9) / 4, 5])
 
 
-def test_claims_say_by_how_much():
+def test_verdicts_state_the_ratio_of_errors():
     rows = [row("fine_tuned", 1.0), row("scratch", 2.0), row("zero_shot", 0.5, n=0)]
     rows += [row("nominal", 4.0, n=0, model="hold"), row("fine_tuned", 0.9, model="no_physics")]
-    verdicts = {claim.id: claim.holds for claim in flight_claims(rows)}
-    assert verdicts == {"F1": True, "F2": False, "F3": True, "F4": False}
-    assert "step 10 velocity 0.250" in flight_claims(rows)[0].measured
+    found = verdicts(Results(rows, TAGS))
+    assert {each.id: each.holds for each in found} == {"F1": True, "F2": False, "F3": True, "F4": False}
+    assert "step 10 velocity 0.250" in found[0].measured
 
 
 @pytest.mark.parametrize("sizes", [(20,), (100, 1000)])
-def test_points_of_a_figure_stand_around_their_number_of_windows(sizes):
-    """Models that are drawn as lines take no place among them."""
+def test_points_are_centred_at_their_number_of_windows(sizes):
+    """Models drawn as lines are not counted."""
     rows = [row("zero_shot", 1.0, n=0), row("nominal", 1.0, n=0, model="hold")]
     rows += [row(mode, 1.0, n=n) for n in sizes for mode in ("fine_tuned", "scratch")]
-    rows = [replace(each, scores={"10": each.scores["10"]}) for each in rows]
+    rows = Results([each | {"scores": {"10": each["scores"]["10"]}} for each in rows], TAGS)
     for axes in errors_by_size(rows, DT, "").axes:
         places = np.array([bars.lines[0].get_xdata() for bars in axes.containers], float)
         assert places.shape == (2, len(sizes))
@@ -205,21 +212,21 @@ def test_points_of_a_figure_stand_around_their_number_of_windows(sizes):
 @pytest.mark.parametrize(
     ("name", "by", "count"), [("crazyflie_payload/payload", "flight", 3), ("nanodrone/train", "manoeuvre", 3)]
 )
-def test_real_flights_are_parted_without_leaks(name, by, count):
+def test_folds_of_real_flights_share_no_sample(name, by, count):
     vehicle = hybrid_jax.load_vehicle(REAL / name.split("/")[0] / "vehicle.toml")
-    flown = fly_in("source", REAL / name, vehicle, 0.0, CONFIG)
-    assert require_one_rate([flown]) == DT
-    folds = folds_of(flown.logs, None, replace(CONFIG, folds_by=by))
+    logs = load_logs("source", REAL / name, vehicle, 0.0, CONFIG).logs
+    assert require_common_interval(logs) == DT
+    folds = make_folds(logs, None, replace(CONFIG, folds_by=by))
     assert len(folds) == count
     for fold in folds:
-        found = lessons(fold, 25, 25, 10)
-        assert not (samples(found.train.windows) | samples(found.validation)) & samples(cut(fold.test, 50, 50).windows)
+        train, validation, test = map(samples, windows_of_fold(fold, 25, 25))
+        assert not (train | validation) & test
 
 
-def test_a_fold_does_not_keep_the_programs_of_the_one_before():
-    """Or many folds would need more memory maps than Linux gives a process."""
+def test_programs_of_the_previous_fold_are_freed():
+    """Otherwise many folds need more memory maps than Linux gives a process."""
     kept, twice = [], jax.jit(lambda x: 2 * x)
-    for number, _ in in_turn(folds_of(LOGS, None, CONFIG)):
+    for number, _ in each_fold(make_folds(LOGS, None, CONFIG)):
         twice(np.zeros(number + 3)).block_until_ready()  # another program for each shape
         kept.append(len(jax.devices()[0].client.live_executables()))
     assert len(kept) > 1

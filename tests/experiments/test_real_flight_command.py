@@ -1,6 +1,8 @@
-"""From folders of logs, sound but for one thing, to a report: what is read, what is refused, what is left behind."""
+"""From folders of logs to a report: what is read, what is refused and what is written."""
 
 import json
+import subprocess
+import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -8,43 +10,44 @@ import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
 from rich.console import Console
-from smoke import command, experiments, refused
+from smoke import ROOT, command, experiments, refused
 
-import hybrid_jax
-from experiments.real_flight import __main__
+from experiments.real_flight.__main__ import LISTS, main, split_lists
 from experiments.real_flight.config import PRESETS, Cleaning, RealFlightConfig
-from experiments.real_flight.folds import folds_of
-from experiments.real_flight.logs import cleaned, cut, fly_in, require_distinct, require_one_rate
+from experiments.real_flight.experiment import load_vehicle_models, prepare
+from experiments.real_flight.folds import make_folds
+from experiments.real_flight.logs import clean, load_logs, require_distinct
 from experiments.real_flight.rows import QUANTITIES
 from experiments.real_flight.simulated_logs import vehicle_toml
 from experiments.runner.command import read
 from hybrid_jax.dynamics.vehicle_file import LAG
+from hybrid_jax.flights.windows import cut_windows, require_common_interval
 from hybrid_jax.vehicle import IRIS
 
 
-def test_logs_are_read_checked_and_cleaned_as_asked(tmp_path):
+def test_logs_are_read_checked_and_cleaned(tmp_path):
     source = write(tmp_path / "source", LOGS[:2])
     cleaning = replace(CONFIG.cleaning, in_flight=True, resample=0.02, low_pass=20.0, delay=0.02)
-    found = fly_in("source", source, IRIS, 0.01, replace(CONFIG, cleaning=cleaning))
+    found = load_logs("source", source, IRIS, 0.01, replace(CONFIG, cleaning=cleaning))
     assert [record["flight"] for record in found.records] == ["chirp_run1", "chirp_run2"]
     for record in found.records:
         assert [line.split()[0] for line in record["done"]] == ["0", "resampled", "low-pass", "motors", "rotors"]
         assert record["samples"] == SAMPLES
         assert len(record["checks"]) == 12
-    assert require_one_rate([found]) == 0.02
+    assert require_common_interval(found.logs, "--cleaning.resample ") == 0.02
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"low_pass": 60.0}, r"low-pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
         ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
         ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
     ],
 )
-def test_what_cannot_be_done_to_a_log_is_refused_with_its_name_and_the_option(options, said):
-    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: --cleaning.{said}"):
-        cleaned(LOGS[0], Cleaning(**options), IRIS)
+def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
+    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: --cleaning.{message}"):
+        clean(LOGS[0], Cleaning(**options), IRIS)
 
 
 @pytest.mark.parametrize(
@@ -56,38 +59,38 @@ def test_what_cannot_be_done_to_a_log_is_refused_with_its_name_and_the_option(op
         ("delay", np.nan, "finite"),
     ],
 )
-def test_changes_that_cannot_be_are_refused_before_any_log_is_read(option, value, expected):
+def test_invalid_cleaning_options_are_refused(option, value, expected):
     with pytest.raises(ValueError, match=f"^--cleaning.{option.replace('_', '-')} must be a {expected}.*{value}$"):
         Cleaning(**{"resample": 0.01, option: value})
 
 
-def test_logs_of_two_rates_are_refused_with_what_to_do(tmp_path):
+def test_logs_of_different_intervals_are_refused(tmp_path):
     slow = [replace(LOGS[1], t=2 * LOGS[1].t)]
-    found = fly_in("source", write(tmp_path, [LOGS[0], *slow]), IRIS, 0.0, CONFIG)
+    found = load_logs("source", write(tmp_path, [LOGS[0], *slow]), IRIS, 0.0, CONFIG)
     with pytest.raises(ValueError, match=r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"):
-        require_one_rate([found])
+        require_common_interval(found.logs, "--cleaning.resample ")
 
 
-def test_uneven_samples_are_refused_before_anything_is_trained(tmp_path):
+def test_uneven_samples_are_refused(tmp_path):
     t = LOGS[0].t.copy()
     t[10] += DT / 3
-    found = fly_in("source", write(tmp_path, [LOGS[1], replace(LOGS[0], t=t)]), IRIS, 0.0, CONFIG)
+    found = load_logs("source", write(tmp_path, [LOGS[1], replace(LOGS[0], t=t)]), IRIS, 0.0, CONFIG)
     with pytest.raises(ValueError, match=r"chirp_run1.*resample the log first"):
-        require_one_rate([found])
+        require_common_interval(found.logs, "--cleaning.resample ")
 
 
-def test_hidden_files_and_folders_are_no_flights(tmp_path):
+def test_hidden_files_and_folders_are_ignored(tmp_path):
     source = write(tmp_path, LOGS[:1])
-    (source / "._chirp_run1.csv").write_bytes(b"\x00\x05\x16\x07")  # what macOS leaves beside a file on other disks
+    (source / "._chirp_run1.csv").write_bytes(b"\x00\x05\x16\x07")  # macOS writes such files on other disks
     (source / "old.csv").mkdir()
-    assert len(fly_in("source", source, IRIS, 0.0, CONFIG).logs) == 1
+    assert len(load_logs("source", source, IRIS, 0.0, CONFIG).logs) == 1
 
 
-def test_a_flight_is_there_once_whatever_it_is_called(tmp_path):
+def test_duplicate_flights_are_refused(tmp_path):
     same = replace(LOGS[0], name="/logs/chirp_run9.csv")
-    source = fly_in("source", write(tmp_path / "source", LOGS[:2]), IRIS, 0.0, CONFIG)
-    twice = fly_in("source", write(tmp_path / "twice", [LOGS[0], same]), IRIS, 0.0, CONFIG)
-    test = fly_in("test", write(tmp_path / "test", [same]), IRIS, 0.0, CONFIG)
+    source = load_logs("source", write(tmp_path / "source", LOGS[:2]), IRIS, 0.0, CONFIG)
+    twice = load_logs("source", write(tmp_path / "twice", [LOGS[0], same]), IRIS, 0.0, CONFIG)
+    test = load_logs("test", write(tmp_path / "test", [same]), IRIS, 0.0, CONFIG)
     turns = replace(CONFIG, folds_by="manoeuvre")
     require_distinct([source], CONFIG)
     require_distinct([source, test], turns)
@@ -100,22 +103,23 @@ def test_a_flight_is_there_once_whatever_it_is_called(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("options", "said"),
+    ("options", "message"),
     [
         ({"n": (50,)}, "--n must each be at least --batch-size 100"),
+        ({"n": (1_000_000_000,)}, "--n must be at most"),
         ({"horizon": (0,)}, "--horizon must be at least 1"),
         ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
         ({"learn": ("wings",)}, "learn must be names of"),
         ({"epochs": 0.0}, "--epochs must be a positive number"),
     ],
 )
-def test_options_that_do_not_fit_are_refused(options, said):
-    with pytest.raises(ValueError, match=said):
+def test_invalid_options_are_refused(options, message):
+    with pytest.raises(ValueError, match=message):
         replace(CONFIG, **options)
 
 
 @pytest.mark.parametrize("asked", [{"protocol": "nanodrone"}, {"folds_by": "manoeuvre"}], ids=str)
-def test_another_manoeuvre_is_learned_for_by_default_where_it_is_to_be_predicted(asked):
+def test_defaults_for_predicting_other_manoeuvres(asked):
     usual, config = PRESETS["paper"], replace(PRESETS["paper"], **asked)
     assert (config.tried, config.validated_by) == (("frozen_rates", "torque_off", "staged"), "manoeuvre")
     assert config.described()["recipes"] == config.tried  # so that a resumed run, and a reader, knows them
@@ -127,11 +131,11 @@ def test_another_manoeuvre_is_learned_for_by_default_where_it_is_to_be_predicted
 
 def test_too_few_flights_are_refused():
     with pytest.raises(ValueError, match="--folds-by flight: all flights are of one name"):
-        folds_of(LOGS[:1], None, CONFIG)
+        make_folds(LOGS[:1], None, CONFIG)
     with pytest.raises(ValueError, match="--validate-by flight: 1 flights of one name"):
-        folds_of(LOGS[:1], OTHERS, CONFIG)
+        make_folds(LOGS[:1], OTHERS, CONFIG)
     with pytest.raises(ValueError, match="no window of 200 intervals"):
-        cut(LOGS, 200)
+        cut_windows(LOGS, 200)
 
 
 def with_lag(folder):
@@ -144,61 +148,59 @@ def with_lag(folder):
 @pytest.mark.parametrize(
     "options", [{}, {"test": Path("test"), "folds_by": "manoeuvre"}, {"folds_by": "manoeuvre"}], ids=str
 )
-def test_the_lag_is_not_chosen_on_what_is_tested(options, tmp_path):
+def test_lag_is_not_chosen_on_test_flights(options, tmp_path):
     config = replace(CONFIG, vehicle=with_lag(tmp_path), source=tmp_path, **options)
     with pytest.raises(ValueError, match=f"learn: {LAG} is chosen on flights of --source.*give --target"):
-        __main__.experiment(config, Console(quiet=True))
+        prepare(config, Console(quiet=True))
 
 
 @pytest.mark.parametrize("learned", [True, False])
-def test_rotors_lag_once(learned, tmp_path, monkeypatch):
-    """A lag that is stated is a guess where it is to be learned."""
-    found = []
-    monkeypatch.setattr(__main__, "following_rotors", lambda flown, *_: flown)
-    monkeypatch.setattr(__main__, "study", lambda before, after, flown, *_: found.append(flown))
-    monkeypatch.setattr(__main__, "write_outcome", lambda *_: None)
+def test_rotor_lag_is_applied_once(learned, tmp_path):
+    """A stated lag is only an initial guess if the lag is to be chosen."""
     vehicle = with_lag(tmp_path)
     if not learned:
         vehicle.write_text(vehicle.read_text().replace(f', "{LAG}"', ""))
-    folders = {"source": write(tmp_path / "source", LOGS[:1]), "target": write(tmp_path / "target", OTHERS[:1])}
-    __main__.experiment(replace(CONFIG, vehicle=vehicle, **folders), Console(quiet=True))
-    done = [record["done"] for flown in found[0].values() for record in flown.records]
-    assert done == 2 * [[] if learned else ["rotors follow the log's motors with a time constant of 30.0 ms"]]
+    folders = {"source": write(tmp_path / "source", LOGS[:2]), "target": write(tmp_path / "target", OTHERS[:1])}
+    experiment = prepare(replace(CONFIG, vehicle=vehicle, cache=tmp_path, **folders), Console(quiet=True))
+    lines = [line for logs in experiment.logs.values() for record in logs.records for line in record["done"]]
+    assert len(lines) == 3
+    assert len(set(lines)) == 1
+    assert (lines[0] == "rotors follow the log's motors with a time constant of 30.0 ms") == (not learned)
 
 
-def test_without_flights_it_says_how_to_get_some(capsys):
+def test_guide_is_printed_without_flights(capsys):
     with pytest.raises(SystemExit) as stop:
-        __main__.main([])
+        main([])
     assert stop.value.code == 2
     assert "--simulated" in capsys.readouterr().err
 
 
-def test_values_may_be_joined_by_commas():
+def test_lists_may_be_comma_separated():
     given = ["--n", "100,300", "--horizon=10,50", "--source", "1,2", "--test=3,4", "--learn", "Ix,Iy", "k", "--refit"]
     given += ["--polynomial", "-150.5,9e2", "--models=hybrid", "--recipes", "staged,turning", "--epochs", "0.5"]
     expected = ["--n", "100", "300", "--horizon", "10", "50", "--source", "1,2", "--test=3,4"]
     expected += ["--learn", "Ix", "Iy", "k", "--refit", "--polynomial", "-150.5", "9e2", "--models", "hybrid"]
     expected += ["--recipes", "staged", "turning", "--epochs", "0.5"]
-    assert __main__.spaced(given) == expected
+    assert split_lists(given) == expected
     config = read("real_flight", "", expected, PRESETS)
     assert (config.polynomial, config.learn, config.test) == ((-150.5, 900.0), ("Ix", "Iy", "k"), Path("3,4"))
     several = {f"--{each.name}" for each in fields(RealFlightConfig) if "tuple" in str(each.type)}
-    assert several == set(__main__.LISTS)
+    assert several == set(LISTS)
 
 
-def test_the_lag_is_learned_where_an_option_says_so(tmp_path):
-    """As if it stood in the vehicle file, which the option stands in for."""
+def test_learn_option_overrides_the_vehicle_file(tmp_path):
     vehicle = tmp_path / "vehicle.toml"
     vehicle.write_text(vehicle_toml(IRIS))
-    config = replace(CONFIG, vehicle=vehicle, source=tmp_path, learn=("Ix", LAG))
-    assert __main__.learned(vehicle, config) == ("Ix", LAG)
-    assert [craft.learn for craft in __main__.crafts(vehicle, config)] == [("Ix",)] * 2
-    assert LAG not in __main__.learned(with_lag(tmp_path), replace(config, learn=("Ix",)))
+    config = replace(CONFIG, learn=("Ix", LAG))
+    *models, chooses_lag = load_vehicle_models(vehicle, config)
+    assert chooses_lag
+    assert [model.learn for model in models] == [("Ix",)] * 2
+    assert not load_vehicle_models(with_lag(tmp_path), replace(config, learn=("Ix",)))[2]
     with pytest.raises(ValueError, match="each once"):
         replace(config, learn=(LAG, LAG))
 
 
-def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
+def test_bad_log_is_refused_with_file_row_and_field(tmp_path):
     (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
     source = write(tmp_path / "source", LOGS[:3])
     text = (
@@ -211,7 +213,7 @@ def test_a_bad_log_ends_in_one_line_that_names_file_row_and_field(tmp_path):
     line = refused(command("real_flight", *options, folder=tmp_path), "real_flight")
     assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
     left = (tmp_path / "out" / "real_flight").iterdir()
-    assert [path.name for path in left] == [".lock"]  # nothing is written half
+    assert [path.name for path in left] == [".lock"]  # no partial results
 
 
 @pytest.fixture(scope="module")
@@ -222,13 +224,13 @@ def simulated(tmp_path_factory):
     return folder / "out" / "real_flight", run
 
 
-def test_simulated_logs_go_all_the_way(simulated):
+def test_simulated_run_writes_a_complete_report(simulated):
     out, run = simulated
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     assert report["config"]["preset"] == "smoke"
-    # Two folds: hold, thrust, two linear residuals; two models zero-shot and fine-tuned, the hybrid from scratch.
-    assert len(report["rows"]) == 2 * (4 + 2 * 2 + 1)
+    # Two folds: hold, thrust, two linear residuals; three models zero-shot and fine-tuned, the hybrid from scratch.
+    assert len(report["rows"]) == 2 * (4 + 3 * 2 + 1)
     for found in report["rows"]:
         assert set(found["scores"]) == {"5", "10"}
         assert all(set(errors) == set(QUANTITIES) for errors in found["scores"].values())
@@ -240,22 +242,29 @@ def test_simulated_logs_go_all_the_way(simulated):
     for figure in report["figures"]:
         assert (out / figure).read_bytes().startswith(b"\x89PNG")
         assert f"({figure})" in page
-    assert "Consistency of each log" in page
+    assert "Consistency of the raw logs" in page
     assert "Traceback" not in run.stderr
 
 
-def test_adaptation_moves_all_that_physics_learns_and_finds_what_the_change_brought(simulated):
+def test_adaptation_changes_all_parameters(simulated):
     rows = json.loads((simulated[0] / "report.json").read_text())["rows"]
     theta = {(row["fold"], row["model"], row["mode"]): row["theta"] for row in rows}
     for (fold, model, mode), adapted in theta.items():
-        if mode == "fine_tuned":
+        if mode == "fine_tuned" and adapted:
             source = theta[fold, model, "zero_shot"]
             assert not {name for name, value in adapted.items() if value == source[name]}
             assert {name for name, value in source.items() if value == 0.0} == {"cable_pull[0]", "cable_pull[1]"}
 
 
-def test_models_of_a_run_load_and_predict(simulated):
-    out, _ = simulated
-    model = hybrid_jax.load(out / "models" / "fold0-hybrid-fine_tuned-20-seed0.npz")
-    assert model.about["dt"] == DT
-    assert np.isfinite(model.predict(LOGS[0].x[0], LOGS[0].u[:5], DT)).all()
+@pytest.mark.parametrize("name", ["hybrid", "no_physics", "physics_only"])
+def test_saved_models_load_and_predict(simulated, name):
+    """In a process that imports nothing of the experiment."""
+    path = simulated[0] / "models" / f"fold0-{name}-fine_tuned-20-seed0.npz"
+    code = f"""
+import hybrid_jax, numpy as np
+model = hybrid_jax.load({str(path)!r})
+x0 = np.array([0, 0, 2, 1, *[0] * 9], np.float32)
+assert model.about["dt"] == {DT}
+assert np.isfinite(model.predict(x0, np.full((5, 4), 600, np.float32), {DT})).all()
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

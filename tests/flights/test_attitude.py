@@ -39,7 +39,7 @@ def test_yaw_to_east_in_ned_is_the_identity_in_enu():
     np.testing.assert_allclose(np.abs(x[0, 3:7]), [1, 0, 0, 0], atol=1e-12)
 
 
-def test_nose_up_in_frd_lifts_the_nose_and_roll_right_lowers_the_right_side():
+def test_pitch_and_roll_in_frd():
     forward, left, up = axes(to_library(NONE, from_euler(row(0, 30 * DEG, 90 * DEG)), NONE, NONE, NED))
     np.testing.assert_allclose(forward, [np.sqrt(0.75), 0, 0.5], atol=1e-12)  # east and up
     np.testing.assert_allclose(left, [0, 1, 0], atol=1e-12)
@@ -48,7 +48,7 @@ def test_nose_up_in_frd_lifts_the_nose_and_roll_right_lowers_the_right_side():
     assert left[2] == pytest.approx(np.sin(20 * DEG))
 
 
-def test_velocity_of_the_body_is_turned_into_the_world():
+def test_body_velocity_is_rotated_into_the_world():
     q = from_euler(row(0, 0, 90 * DEG))
     x = to_library(NONE, q, row(3, 1, -2), NONE, Frames("NED", "FRD", "body"))  # forward, right, up
     np.testing.assert_allclose(x[0, 7:10], [3, -1, 2], atol=1e-12)  # east, south, up
@@ -56,7 +56,7 @@ def test_velocity_of_the_body_is_turned_into_the_world():
     np.testing.assert_allclose(x[0, 7:10], [-1, 3, 2], atol=1e-12)
 
 
-def test_the_librarys_own_frames_change_nothing(flight):
+def test_library_frames_change_nothing(flight):
     parts = flight.x[:, :3], flight.x[:, 3:7], flight.x[:, 7:10], flight.x[:, 10:]
     np.testing.assert_allclose(to_library(*parts, Frames("ENU", "FLU", "world")), flight.x, atol=1e-12)
 

@@ -78,7 +78,7 @@ def mapped(tmp_path):
 @pytest.mark.parametrize(
     ("changes", "motors"), [((), "rpm"), (EULER, "rpm"), (AFFINE, "affine"), (QUADRATIC, "quadratic")]
 )
-def test_a_foreign_log_is_the_same_flight(flight, mapped, changes, motors):
+def test_mapped_log_is_the_same_flight(flight, mapped, changes, motors):
     log = mapped(foreign(flight), changes, motors)
     np.testing.assert_allclose(log.t - log.t[0], flight.t - flight.t[0], atol=1e-9)
     np.testing.assert_allclose(log.x, flight.x, atol=1e-9)
@@ -109,7 +109,7 @@ def test_a_wrong_map_is_refused(flight, mapped, refusal, tmp_path, changes, word
     refusal(lambda: mapped(foreign(flight[:3]), changes), tmp_path / "map.toml", *words)
 
 
-def test_wrong_data_are_refused_with_the_users_own_names(flight, mapped, refusal):
+def test_wrong_data_are_refused_with_names_of_the_file(flight, mapped, refusal):
     columns = foreign(flight)
     refusal(lambda: mapped(columns, [*EULER[:1], ('"xyzw"', '"rad"')]), "log.csv", "roll pitch yaw", "degrees")
     refusal(lambda: mapped(columns, [('"deg/s"', '"rad/s"')]), "log.csv", "row", "degrees per second")

@@ -104,7 +104,7 @@ MISTAKES = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_caught_and_its_correction_named(flight, mistake):
+def test_mistakes_are_found_and_corrections_suggested(flight, mistake):
     make, name, words = MISTAKES[mistake]
     check = table(make(noisy(flight, np.random.default_rng(1))))[name]
     assert check.verdict == FAILS, check
@@ -112,13 +112,13 @@ def test_a_mistake_is_caught_and_its_correction_named(flight, mistake):
 
 
 @pytest.mark.parametrize("order", ORDERS.tolist(), ids=str)
-def test_any_order_of_motors_is_told(flight, order):
+def test_order_of_motors_is_found(flight, order):
     check = table(with_parts(flight, u=flight.u[:, order]))[ORDER]
     back = " ".join(f"u{order.index(rotor)}" for rotor in range(4))
     assert check.suggestion == NOTHING if order == [0, 1, 2, 3] else back in check.suggestion
 
 
-def test_reversed_spin_is_told(flight):
+def test_reversed_spin_is_found(flight):
     arms, squares = np.array(IRIS.rotor_positions), flight.u**2
     mix = np.stack([np.ones(4), arms[:, 1], -arms[:, 0], np.array(IRIS.spin)])
     squares = np.linalg.solve(mix, mix @ squares.T * [[1], [1], [1], [-1]]).T
@@ -128,13 +128,13 @@ def test_reversed_spin_is_told(flight):
 
 
 @pytest.mark.parametrize("spin", [(1, 1, -1, 1), (1, 1, 1, 1)], ids=str)
-def test_spins_that_do_not_balance_are_told(flight, spin):
+def test_unbalanced_spins_are_found(flight, spin):
     checks = {check.name: check for check in check_log(flight, replace(IRIS, spin=spin))}
     assert (checks[YAW].verdict, "two of its rotors" in checks[YAW].suggestion) == (FAILS, True)
 
 
-def test_a_steady_wind_is_no_mistake_of_the_log(flight):
-    """A push that no rotor makes is most of what one axis does: that is not the log's fault."""
+def test_steady_wind_fails_no_check(flight):
+    """External forces may dominate one axis; the log is correct all the same."""
     x = flight.x.copy()
     still = [0, 1, 1]  # along x the rotors move it, but it does not move
     pushed = FlightLog(
@@ -144,7 +144,7 @@ def test_a_steady_wind_is_no_mistake_of_the_log(flight):
     assert (check.verdict, check.value > 0.3) == (OK, True)
 
 
-def test_time_on_the_ground_is_told_and_hides_no_thrust(flight):
+def test_time_on_the_ground_is_found_and_excluded_from_thrust(flight):
     x = np.tile(flight.x[:1], (600, 1))
     x[:, 7:] = 0
     t, u = np.arange(600 + len(flight)) * 0.01, np.concatenate([np.full((600, 4), 5.0), flight.u])
@@ -160,7 +160,7 @@ def test_the_suggested_shift_repairs_the_lag(flight):
     assert table(repaired)[LAG].verdict == OK
 
 
-def test_gaps_and_repeats_are_counted_and_hide_no_other_mistake(flight):
+def test_gaps_and_repeats_hide_no_other_mistake(flight):
     kept = np.ones(len(flight), bool)
     kept[101::50] = False
     x = flight.x.copy()
@@ -173,7 +173,7 @@ def test_gaps_and_repeats_are_counted_and_hide_no_other_mistake(flight):
     ] * 3
 
 
-def test_a_vehicle_at_rest_tells_nothing(flight):
+def test_vehicle_at_rest_decides_nothing(flight):
     x = np.tile(flight.x[:1], (300, 1))
     x[:, 3:] = [1.0, *np.zeros(9)]
     x[:, 0] += np.random.default_rng(0).normal(size=300) * 1e-4

@@ -38,7 +38,7 @@ def test_a_log_is_read_to_the_last_digit(flight, written, packed, end):
         np.testing.assert_allclose(getattr(log, name), getattr(flight, name), rtol=0, atol=1e-15)
 
 
-def test_columns_may_stand_in_any_order_among_others(flight, written):
+def test_columns_may_have_any_order(flight, written):
     rows = [",".join([*reversed(row.split(",")), "armed"]) for row in rows_of(flight)]
     header = ",".join([*reversed(COLUMNS), "mode"])
     np.testing.assert_allclose(read_csv(written("\n".join([header, *rows]) + "\n")).x, flight.x, rtol=0, atol=1e-15)
@@ -70,7 +70,7 @@ def changed(row, field, cell):
         (lambda rows: [HEADER, *rows[:5], "0.05,0,0,0,0,0,0,0,0,0,0,0,0,0,9,9,9,9"], ("row 7", "qw", "norm is 0")),
         (lambda rows: [HEADER], ("row 2", "no samples")),
         (lambda rows: [], ("row 1", "empty")),
-        (lambda rows: [HEADER, "1" * 5_000_000], ("row 2", "longer than any row")),
+        (lambda rows: [HEADER, "1" * 5_000_000], ("row 2", "too long for a row")),
     ],
 )
 def test_a_bad_log_is_refused_with_file_row_and_field(flight, written, refusal, lines, words):
@@ -95,10 +95,10 @@ def test_damaged_files_are_refused(flight, written, refusal, tmp_path):
     refusal(lambda: read_csv(tmp_path), "cannot be read")
 
 
-def test_more_rows_than_asked_for_are_refused_before_they_fill_memory(flight, written, refusal):
+def test_too_many_rows_are_refused(flight, written, refusal):
     path = written("\n".join([HEADER, *rows_of(flight)]))
-    assert len(read_csv(path, most_rows=len(flight))) == len(flight)
-    refusal(lambda: read_csv(path, most_rows=len(flight) - 1), path, f"row {len(flight) + 1}", "split the file")
+    assert len(read_csv(path, max_rows=len(flight))) == len(flight)
+    refusal(lambda: read_csv(path, max_rows=len(flight) - 1), path, f"row {len(flight) + 1}", "split the file")
 
 
 def read_or_refused(path):

@@ -8,7 +8,7 @@ import pytest
 from hybrid_jax import Trajectories, rigid_body, rotation
 from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.flights.scores import FlightErrors, errors_between, flight_errors, mean_by_step, rmse_at, summed_mean
+from hybrid_jax.flights.scores import FlightErrors, errors_between, flight_errors, mean_by_step
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -40,7 +40,7 @@ def test_errors_are_lengths_and_an_angle(angle):
         np.testing.assert_allclose(found, value, rtol=1e-3, atol=1e-6)  # float32; an arc cosine would err by 3e-4
 
 
-def test_exact_physics_scores_zero_and_chunks_do_not_matter():
+def test_exact_physics_has_no_error_and_chunks_do_not_matter():
     windows = flights()
     for error in flight_errors(rigid_body(IRIS), windows):
         assert error.shape == (7, 4)
@@ -49,23 +49,17 @@ def test_exact_physics_scores_zero_and_chunks_do_not_matter():
     np.testing.assert_array_equal(np.stack(whole), np.stack(parts))
 
 
-def test_scores_are_by_definition():
+def test_mean_by_step_averages_over_windows():
     errors = FlightErrors(*(scale * np.array([[3.0, 1.0], [4.0, 7.0]]) for scale in (1, 2, 3, 4)))
-    found = rmse_at(errors, [1, 2])
-    np.testing.assert_allclose(found[1], np.sqrt(12.5) * np.arange(1, 5))
-    np.testing.assert_allclose(found[2], 5 * np.arange(1, 5))
     np.testing.assert_allclose(mean_by_step(errors).position, [3.5, 4])
-    np.testing.assert_allclose(summed_mean(errors), 7.5 * np.arange(1, 5))
-    with pytest.raises(ValueError, match="horizons must be at most the 2"):
-        rmse_at(errors, [3])
 
 
-def test_windows_of_something_else_are_refused():
+def test_windows_of_other_states_are_refused():
     with pytest.raises(ValueError, match="states of 13"):
         flight_errors(HoldState(), Trajectories(np.zeros((2, 2)), np.zeros((2, 3, 1)), np.zeros((2, 3, 2)), 0.1))
 
 
-def test_baselines_do_what_they_are_called():
+def test_baselines_hold_the_state_or_freeze_rates():
     x, u = jnp.asarray(states(5).T), jnp.full((4, 5), 650.0)
     plain = rigid_body(IRIS)
     for evaluate in (train_batch, infer_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u)):

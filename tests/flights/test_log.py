@@ -38,13 +38,13 @@ def test_the_arrays_given_are_not_changed(flight):
         ("x", (9, 3), 1e200, ("sample 9", "qw", "norm is inf")),
     ],
 )
-def test_what_cannot_be_is_named(flight, refusal, array, at, value, words):
+def test_impossible_values_are_named(flight, refusal, array, at, value, words):
     broken = parts(flight)
     broken[array][at] = value
     refusal(lambda: FlightLog(**broken, name="mine"), "mine", *words)
 
 
-def test_a_repeated_time_is_told_from_one_that_goes_back(flight, refusal):
+def test_repeated_and_decreasing_times_are_distinguished(flight, refusal):
     broken = parts(flight)
     broken["t"][6] = broken["t"][5]
     refusal(lambda: FlightLog(**broken), "sample 6", "repeats")

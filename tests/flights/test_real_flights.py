@@ -1,4 +1,4 @@
-"""Flights of real vehicles, where they are at hand: they are read, and the checks agree with what is known of them."""
+"""Logs of real vehicles are read, and the checks agree with what is known of them."""
 
 import os
 import tomllib
@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.cleaning import windows
 from hybrid_jax.flights.consistency import OK, check_log
 from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.vehicle import Vehicle
 
 FOLDER = Path(os.environ.get("HYBRID_JAX_FLIGHTS", Path(__file__).parents[3] / "shared" / "flights"))
@@ -29,7 +29,7 @@ def vehicle_of(file):
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: f"{file.parent.name}/{file.name.split('.')[0]}")
-def test_a_real_flight_is_read_and_is_what_it_is_taken_for(file):
+def test_real_flights_pass_all_checks(file):
     log, vehicle = read_csv(file), vehicle_of(file)
     found = {check.name: check for check in check_log(log, vehicle)}
     lag = found.pop("lag of the gyro behind the motors")
@@ -37,13 +37,13 @@ def test_a_real_flight_is_read_and_is_what_it_is_taken_for(file):
         assert check.verdict == OK, check
     # The payload set is shifted to the gyro, the nanodrone set is only good to ±1.5 samples from run to run.
     assert abs(lag.value) < (2 if file.parent.name in ("bare", "payload") else 25)
-    cut = windows(log, 50)
+    cut = cut_windows([log], 50, 50).windows
     assert np.isfinite(cut.x).all()
     assert len(cut) == (len(log) - 1) // 50
 
 
 @pytest.mark.parametrize("file", [file for file in FILES if file.parent.name == "payload"], ids=lambda file: file.name)
-def test_a_load_shows_in_the_ratio_of_thrust(file):
-    """37 g were said and 44.4 g flown: 37 / 44.4 = 0.83, on guessed thrust coefficients."""
+def test_load_changes_the_ratio_of_thrust(file):
+    """Stated mass 37 g, actual mass 44.4 g: 37 / 44.4 = 0.83, with estimated thrust coefficients."""
     found = {check.name: check for check in check_log(read_csv(file), vehicle_of(file))}
     assert found["specific force over thrust per mass"].value == pytest.approx(37 / 44.4, rel=0.05)

@@ -1,4 +1,4 @@
-"""What is learned from never judges, and a run in a row is of one flight."""
+"""Training and held-out flights are disjoint, and contiguous windows are of one flight."""
 
 from dataclasses import replace
 
@@ -33,14 +33,14 @@ def logs(flight):
         ("hover", "hover", "hover"),
     ],
 )
-def test_names_tell_flights_and_manoeuvres(logs, name, own, manoeuvre):
+def test_names_of_flights_and_manoeuvres(logs, name, own, manoeuvre):
     log = replace(logs[0], name=name)
     assert (flight_of(log), manoeuvre_of(log)) == (own, manoeuvre)
 
 
 @pytest.mark.parametrize("of", [flight_of, manoeuvre_of])
 @pytest.mark.parametrize("count", [None, 2])
-def test_folds_are_disjoint_and_hold_every_flight_out_once(logs, of, count):
+def test_folds_hold_out_every_flight_once(logs, of, count):
     found = folds(logs, count, of)
     assert len(found) == (count or len({of(log) for log in logs}))
     held = [log.name for _, out in found for log in out]
@@ -56,14 +56,14 @@ def test_a_manoeuvre_is_held_out_whole(logs):
     assert len(kept) == 6
 
 
-def test_splits_that_cannot_be_are_refused(logs, refusal):
+def test_impossible_splits_are_refused(logs, refusal):
     refusal(lambda: hold_out(logs, ["melon"], manoeuvre_of), "'melon'", "chirp")
-    refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights to learn from")
+    refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights for training")
     refusal(lambda: folds(logs, 4, manoeuvre_of), "3 different names")
     refusal(lambda: contiguous([5, 7], 8, 0), "7 windows")
 
 
-def test_windows_in_a_row_are_of_one_flight_and_any_of_them():
+def test_contiguous_windows_are_of_one_flight():
     begins = set()
     for seed in range(200):
         found = contiguous([3, 6, 4], 4, seed)
@@ -73,7 +73,7 @@ def test_windows_in_a_row_are_of_one_flight_and_any_of_them():
     assert begins == {3, 4, 5, 9}
 
 
-def test_the_time_constant_is_the_candidate_of_least_error(flight):
+def test_chosen_time_constant_has_the_smallest_error(flight):
     lagging, _ = lag_motors(flight, 0.03)
 
     def error(logs):

@@ -111,7 +111,7 @@ def test_a_flight_with_esc_rpm_is_read(flight, topics, written):
     np.testing.assert_allclose(log.u[:-1], mean[: len(log) - 1], atol=0.1)
 
 
-def test_a_flight_with_commands_is_read_through_their_map(flight, topics, written, refusal):
+def test_commands_are_converted_by_the_polynomial(flight, topics, written, refusal):
     path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
     log = read_ulog(path, polynomial=(100.0, 1000.0), motor_order=(2, 0, 3, 1))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
@@ -120,7 +120,7 @@ def test_a_flight_with_commands_is_read_through_their_map(flight, topics, writte
     refusal(lambda: read_ulog(path, dt=0.0), "dt must be")
 
 
-def test_escs_that_report_nothing_leave_the_commands(flight, topics, written):
+def test_commands_are_used_if_escs_report_zero(flight, topics, written):
     t = flight.t - flight.t[0] + 0.003
     both = topics | {"esc_status": escs(t, 0 * flight.u), "actuator_motors": commands(t, flight.u)}
     log = read_ulog(written(both), polynomial=(100.0, 1000.0))
@@ -150,7 +150,7 @@ def test_a_dropout_becomes_a_gap(flight, topics, written):
     np.testing.assert_allclose(log.x[:, 3:7], truth[:, 3:7], atol=2e-4)
 
 
-def test_what_is_no_ulog_is_refused(flight, topics, written, refusal, tmp_path):
+def test_other_files_are_refused(flight, topics, written, refusal, tmp_path):
     topics = topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     whole = ulog(topics)
     for content in (b"", b"t,px,py\n", whole[:7]):
@@ -170,7 +170,7 @@ def short(flight, topics):
 
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
-def test_damage_is_refused_in_one_line_or_read_around(written, short, capfd, data):
+def test_damaged_logs_are_read_or_refused_in_one_line(written, short, capfd, data):
     at = data.draw(st.integers(0, len(short)))
     content = short[:at] + data.draw(st.binary(max_size=20)) + short[at + data.draw(st.integers(0, 100)) :]
     try:

@@ -1,0 +1,212 @@
+"""From recorded logs to training windows: `load_windows` takes a folder of logs there in one call."""
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from hybrid_jax import checks
+from hybrid_jax.flights.cleaning import lag_motors, resample
+from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
+from hybrid_jax.flights.consistency import FAILS, check_log
+from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.segments import even_segments, is_even, segments
+from hybrid_jax.flights.splits import SUFFIXES, flight_of
+from hybrid_jax.flights.ulog import read_ulog
+from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
+from hybrid_jax.vehicle import Vehicle
+
+
+@dataclass(frozen=True)
+class LogWindows:
+    """Windows of several flights in float32, and the number of windows of each flight.
+
+    Attributes:
+        windows: the windows of all flights, flight by flight.
+        sizes: the number of windows of each flight.
+        stride: samples between the starts of two windows.
+    """
+
+    windows: Trajectories
+    sizes: list[int]
+    stride: int
+
+    def __len__(self) -> int:
+        return len(self.windows)
+
+
+def load_windows(
+    folder: str | Path,
+    vehicle: Vehicle,
+    *,
+    dt: float | None = None,
+    steps: int = 10,
+    stride: int = 1,
+    columns: ColumnMap | str | Path | None = None,
+    polynomial: tuple[float, ...] = (),
+    motor_time_constant: float = 0.0,
+    strict: bool = False,
+) -> Trajectories:
+    """Read all logs of a folder, check them against the vehicle and cut them into windows.
+
+    Windows never cross a gap or a repeated sample. Each consistency check that fails is a one-line warning.
+
+    Args:
+        folder: holds one `.csv`, `.csv.gz` or `.ulg` file per flight.
+        vehicle: constants that the checks compare the logs with.
+        dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one.
+        steps: intervals per window.
+        stride: samples between the starts of two windows.
+        columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for ULog files without ESC telemetry.
+        motor_time_constant: first-order lag [s] of the rotors, for logs that record commands and not rotor speeds.
+        strict: raise at the first check that fails.
+
+    Returns:
+        Windows in float32: x0 (n, 13), u (n, steps, 4) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
+
+    Raises:
+        ValueError: the file or argument, and what was expected, in one line.
+    """
+    checks.count("steps", steps)
+    checks.count("stride", stride)
+    if dt is not None:
+        checks.positive("dt", dt, "a positive number of seconds")
+    logs = load_logs(folder, columns=columns, polynomial=polynomial)
+    for log in logs:
+        _report_failures(log, vehicle, strict)
+    if dt is not None:
+        logs = [log if log.dt == dt and is_even(log) else resample(log, dt)[0] for log in logs]
+    require_common_interval(logs)
+    if motor_time_constant:
+        logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
+    return cut_windows(logs, steps, stride).windows
+
+
+def load_logs(
+    folder: str | Path, *, columns: ColumnMap | str | Path | None = None, polynomial: tuple[float, ...] = ()
+) -> list[FlightLog]:
+    """Read all logs of a folder in the order of their names; see `load_windows` for the arguments.
+
+    Raises:
+        ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder")
+    files = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
+    logs = sorted(path for path in files if path.name.lower().endswith(SUFFIXES))
+    if not logs:
+        raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)})")
+    if isinstance(columns, str | Path):
+        columns = load_column_map(columns)
+    return [load_log(path, columns=columns, polynomial=polynomial) for path in logs]
+
+
+def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: tuple[float, ...] = ()) -> FlightLog:
+    """Read one log: a ULog file (`.ulg`), else a CSV file. See `load_windows` for the arguments.
+
+    Raises:
+        ValueError: the file, row, field and what to do, in one line.
+    """
+    if str(path).lower().endswith(".ulg"):
+        try:
+            return read_ulog(path, polynomial=polynomial)
+        except ImportError as error:
+            raise ValueError(f"{path}: {error}") from error
+    log = read_csv(path) if columns is None else read_mapped(path, columns)
+    if len(log) < 2:
+        raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
+    return log
+
+
+def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
+    """Return the interval [s] between samples, which all logs must share.
+
+    Args:
+        option: how the caller lets a user resample, for the error message.
+
+    Raises:
+        ValueError: a log with uneven samples, or two logs with different intervals.
+    """
+    for log in logs:
+        even_segments(log)
+        if log.dt != logs[0].dt:
+            raise ValueError(
+                f"{log.name}: samples are {log.dt:g} s apart, those of {logs[0].name} {logs[0].dt:g} s; "
+                f"resample all logs with {option}{max(log.dt, logs[0].dt):g}"
+            )
+    return logs[0].dt
+
+
+def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWindows:
+    """Cut logs into windows of `steps` intervals that cross no gap; logs shorter than a window are left out.
+
+    Raises:
+        ValueError: no log is as long as a window, or samples are not evenly spaced.
+    """
+    parts = []
+    for log in require_length(logs, steps):
+        long = [part for part in even_segments(log) if part.stop - part.start > steps]
+        cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
+        parts.append(concatenate(cut))
+    return LogWindows(_float32(concatenate(parts)), [len(part) for part in parts], stride)
+
+
+def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
+    """Return the logs that hold a window of `steps` intervals.
+
+    Raises:
+        ValueError: no log does.
+    """
+    long = [log for log in logs if max(_intervals(log), default=0) >= steps]
+    if not long:
+        names = ", ".join(flight_of(log) for log in logs)
+        longest = max((length for log in logs for length in _intervals(log)), default=0)
+        raise ValueError(
+            f"no window of {steps} intervals without gaps in {names}; the longest segment has {longest}: "
+            "bridge gaps or use shorter windows"
+        )
+    return long
+
+
+def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
+    """Count the windows that `cut_windows` finds with a stride of 1."""
+    return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
+
+
+def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, float, Trajectories]:
+    """Cut the longest segment of the first log that holds a window of `steps` intervals into adjacent windows.
+
+    Returns:
+        The log, the start of the segment [s] after the log's first sample, and the windows.
+
+    Raises:
+        ValueError: no log holds one.
+    """
+    log = require_length(logs, steps)[0]
+    part = max(segments(log), key=lambda part: part.stop - part.start)
+    windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
+    return log, float(log.t[part.start] - log.t[0]), _float32(windows)
+
+
+def _report_failures(log: FlightLog, vehicle: Vehicle, strict: bool) -> None:
+    for check in check_log(log, vehicle):
+        if check.verdict == FAILS:
+            message = f"{log.name}: {check.name}: {check.suggestion}"
+            if strict:
+                raise ValueError(message)
+            warnings.warn(message, stacklevel=3)
+
+
+def _float32(windows: Trajectories) -> Trajectories:
+    return jax.tree.map(lambda leaf: leaf.astype(np.float32), windows)
+
+
+def _intervals(log: FlightLog) -> list[int]:
+    """Count the intervals of each segment."""
+    return [part.stop - part.start - 1 for part in segments(log)]

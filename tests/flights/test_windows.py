@@ -1,0 +1,52 @@
+"""A folder of logs becomes windows in one call, or is refused in one line."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded import DT, LOGS, SAMPLES, write
+
+import hybrid_jax as hj
+from hybrid_jax.flights import FlightLog, cut_windows, load_logs
+from hybrid_jax.vehicle import IRIS
+
+
+def test_windows_are_those_of_all_logs(tmp_path, recwarn):
+    write(tmp_path, LOGS[:2])
+    windows = hj.load_windows(tmp_path, IRIS, steps=20, stride=5)
+    assert (windows.dt, windows.horizon, len(windows)) == (DT, 20, 2 * len(range(0, SAMPLES - 20, 5)))
+    assert windows.x.dtype == np.float32
+    np.testing.assert_allclose(windows.x[0], LOGS[0].x[1:21], atol=1e-5)
+    assert all("\n" not in str(each.message) for each in recwarn)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path, refusal):
+    write(tmp_path, [LOGS[0], replace(LOGS[1], t=2 * LOGS[1].t)])
+    refusal(lambda: hj.load_windows(tmp_path, IRIS), "0.02 s apart", "dt=0.02")
+    windows = hj.load_windows(tmp_path, IRIS, dt=0.02, motor_time_constant=0.05)
+    assert windows.dt == 0.02
+    assert windows.u.std() < hj.load_windows(tmp_path, IRIS, dt=0.02).u.std()
+
+
+def test_failed_checks_are_reported(tmp_path, refusal):
+    still = FlightLog(LOGS[0].t, LOGS[0].x, LOGS[0].u * [1, 1, 1, 0], "still.csv")
+    write(tmp_path, [still])
+    with pytest.warns(UserWarning, match=r"still.csv.gz: columns: u3 never changes"):
+        hj.load_windows(tmp_path, IRIS)
+    refusal(lambda: hj.load_windows(tmp_path, IRIS, strict=True), "still.csv.gz")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [({"steps": 0}, "steps"), ({"dt": -1.0}, "dt must be"), ({"steps": 500}, "no window of 500")],
+)
+def test_invalid_arguments_are_refused(tmp_path, refusal, options, message):
+    write(tmp_path, LOGS[:1])
+    refusal(lambda: hj.load_windows(tmp_path, IRIS, **options), message)
+
+
+def test_a_folder_without_logs_is_refused(tmp_path, refusal):
+    refusal(lambda: load_logs(tmp_path), tmp_path, "holds no flights")
+    refusal(lambda: load_logs(tmp_path / "none"), "no such folder")
+    assert len(cut_windows([*LOGS[:2], LOGS[2][:5]], 10)) == 2 * (SAMPLES - 10)
