@@ -1,4 +1,4 @@
-"""One row per closed-loop flight: who flew, where, how well, and what was promised."""
+"""One row per closed-loop flight: the agent, the reference, and the tracking performance."""
 
 import csv
 import io
@@ -8,39 +8,40 @@ from dataclasses import asdict, dataclass, fields
 
 from experiments.paper import rows as shifts
 
-UNCHANGED = "source"  # the domain of the vehicle as it was before the change
+UNCHANGED = "source"  # the domain of the vehicle before the change
 DOMAINS = (UNCHANGED, *shifts.DOMAINS)
-NAMES = {UNCHANGED: "unchanged vehicle"} | {domain: shifts.NAMES[domain] for domain in shifts.DOMAINS}  # for people
-REFERENCES = {  # name → for people
+NAMES = {UNCHANGED: "unchanged vehicle"} | {domain: shifts.NAMES[domain] for domain in shifts.DOMAINS}
+REFERENCES = {  # id → name in tables and figures
     "hover": "hover",
     "figure_eight": "figure-8, 3.5 m/s",
     "fast_figure_eight": "figure-8, 6 m/s",
     "step": "step",
     "low_pass": "low pass",
-    "upset": "upset, 6 rad/s",
+    "upset": "hover from 6 rad/s",
 }
 LEARNED = {
     "physics": "physics",
     "hybrid": "hybrid",
     "no_physics": "no-physics",
-    "safe": "safe hybrid",
-    "nine": "safe, nine numbers",
+    "invariant": "invariant hybrid",
+    "least_squares": "invariant, least squares",
 }
-SOURCES = {"hybrid": "hybrid", "safe": "safe", "nine": "safe"}  # hybrids → what each was before it was adapted
+SOURCES = {"hybrid": "hybrid", "invariant": "invariant", "least_squares": "invariant"}  # adapted → source model
 KNOWN = {"nominal": "nominal physics", "oracle": "true vehicle, mean wind"}
 MODELS = (*KNOWN, *LEARNED)
+NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised", "realised", "excess")
 
 
 @dataclass(frozen=True, order=True)
-class Flyer:
-    """What the controller believes in.
+class Agent:
+    """A controller with its prediction model.
 
     Attributes:
-        model: one of MODELS; "safe" is a hybrid whose network reads and writes less, "nine" the same of which θ_p and
-            a constant disturbance alone are adapted.
-        n_train: target trajectories that it was adapted to; 0 for none.
-        observer: whether a disturbance observer corrects it in flight.
-        variant: what was changed of the model or the controller, in an ablation; empty for nothing.
+        model: one of MODELS. "invariant" has a translation- and yaw-invariant residual; "least_squares" is its source
+            model with θ_p and a constant disturbance refitted.
+        n_train: target trajectories for adaptation; 0 for a source model.
+        observer: with a disturbance observer.
+        variant: of the model or the controller, in an ablation; else empty.
     """
 
     model: str
@@ -50,34 +51,31 @@ class Flyer:
 
     @property
     def name(self) -> str:
-        """For people."""
-        if self.model in KNOWN:
-            name = KNOWN[self.model]
-        else:
-            name = f"{LEARNED[self.model]}, {f'N = {self.n_train}' if self.n_train else 'source'}"
+        """In tables and figures."""
+        size = f"N = {self.n_train}" if self.n_train else "source"
+        name = KNOWN[self.model] if self.model in KNOWN else f"{LEARNED[self.model]}, {size}"
         return (f"{self.variant}, {name}" if self.variant else name) + (" + observer" if self.observer else "")
 
 
 @dataclass(frozen=True)
 class FlightRow:
-    """The outcome of one flight. A number that is not finite is None, as it will be in JSON.
+    """The result of one flight. A number that is not finite is None, as in JSON.
 
     Attributes:
-        domain: what was flown, one of DOMAINS.
-        model, n_train, observer, variant: see `Flyer`.
+        domain: one of DOMAINS.
+        model, n_train, observer, variant: see `Agent`.
         reference: one of REFERENCES.
         distance: of the flight from home [m].
         seed: of the model's training; 0 for a model that was not trained.
-        position_rmse: [m], over the flight after its start.
+        position_rmse: after the initial state [m].
         yaw_rmse: [rad].
         largest_error: of position [m].
-        crashed: see `hybrid_jax.control.Performance`.
-        saturation: share of the rotor speeds at a limit.
-        promised, realised: mean cost of the plans of some calls, by the model and rolled open loop in the truth.
-        excess: see `hybrid_jax.control.promises.excess`.
+        crashed, saturation: see `hybrid_jax.control.Performance`.
+        promised, realised: predicted and actual open-loop cost, mean over the plans of some calls.
+        excess: see `hybrid_jax.control.relative_cost_error`.
 
     Raises:
-        ValueError: a domain, a model or a reference that is none of these.
+        ValueError: an unknown domain, model or reference.
     """
 
     domain: str
@@ -98,8 +96,7 @@ class FlightRow:
     excess: float | None
 
     def __post_init__(self):
-        named = (("domain", DOMAINS), ("model", MODELS), ("reference", tuple(REFERENCES)))
-        for name, choices in named:
+        for name, choices in (("domain", DOMAINS), ("model", MODELS), ("reference", tuple(REFERENCES))):
             if getattr(self, name) not in choices:
                 raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
         for name in NUMBERS:
@@ -108,52 +105,52 @@ class FlightRow:
             object.__setattr__(self, name, finite)
 
     @property
-    def flyer(self) -> Flyer:
-        """Who flew."""
-        return Flyer(self.model, self.n_train, self.observer, self.variant)
+    def agent(self) -> Agent:
+        """The agent that flew."""
+        return Agent(self.model, self.n_train, self.observer, self.variant)
 
     @property
     def error(self) -> float:
-        """The position RMSE [m] with which the flight counts: infinite if it crashed."""
-        return math.inf if self.crashed or self.position_rmse is None else self.position_rmse
+        """Position RMSE [m]; infinite for a crash."""
+        return self.number("position_rmse")
 
     def number(self, name: str) -> float:
-        """One of NUMBERS as it counts: infinite where it was not finite, and of a crash."""
+        """One of NUMBERS; infinite for a crash or where it was not finite."""
         value = getattr(self, name)
         return math.inf if self.crashed or value is None else value
 
 
-NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised", "realised", "excess")
 Cell = tuple[str, str, float]  # domain, reference, distance
-Cells = dict[Cell, dict[Flyer, list[FlightRow]]]
+Group = dict[Agent, list[FlightRow]]
+Cells = dict[Cell, Group]
 
 
 def cells(rows: Iterable[FlightRow]) -> Cells:
-    """The rows of each domain, reference and distance by who flew, in the order in which they come, by seed.
+    """Rows by (domain, reference, distance) and agent, in the order of the rows, sorted by seed.
 
     Raises:
-        ValueError: a flight stands twice.
+        ValueError: two rows of the same flight.
     """
     found: Cells = {}
     for row in rows:
-        group = found.setdefault((row.domain, row.reference, row.distance), {}).setdefault(row.flyer, [])
+        group = found.setdefault((row.domain, row.reference, row.distance), {}).setdefault(row.agent, [])
         if any(other.seed == row.seed for other in group):
-            raise ValueError(f"{row.domain}, {row.reference}, {row.flyer.name}: seed {row.seed} stands twice")
+            raise ValueError(f"{row.domain}, {row.reference}, {row.agent.name}: two rows of seed {row.seed}")
         group.append(row)
-    for flyers in found.values():
-        for group in flyers.values():
+    for agents in found.values():
+        for group in agents.values():
             group.sort(key=lambda row: row.seed)
     return found
 
 
 def paired(group: Sequence[FlightRow], like: Sequence[FlightRow]) -> list[float]:
-    """The errors [m] of a group for the seeds of another one: a model that was not trained is the same for all."""
+    """Errors [m] of a group for the seeds of another; a model that was not trained has the same error for each."""
     by_seed = {row.seed: row.error for row in group}
     return [by_seed[0] if len(group) == 1 else by_seed[row.seed] for row in like]
 
 
 def to_csv(rows: Sequence[FlightRow]) -> str:
-    """The rows as CSV; a number that was not finite is `null`."""
+    """The rows as CSV, with `null` for a number that was not finite."""
     text = io.StringIO()
     writer = csv.DictWriter(text, [field.name for field in fields(FlightRow)], lineterminator="\n")
     writer.writeheader()

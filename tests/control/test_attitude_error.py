@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.control.attitude import attitude_error, heading, one_sheet, rotation_vector
+from hybrid_jax.control.attitude import attitude_error, heading, canonicalize_quaternion, rotation_vector
 from hybrid_jax.rotation import from_axis_angle, multiply
 
 AXES = np.random.default_rng(0).normal(size=(20, 3))
@@ -41,8 +41,8 @@ def test_half_a_turn_is_the_largest_error_and_has_a_slope():
 def test_both_quaternions_of_a_rotation_become_one():
     quaternions = np.concatenate([np.random.default_rng(1).normal(size=(20, 4)), np.eye(4)]).astype(np.float32)
     for q in quaternions:
-        one = one_sheet(jnp.array(q))
-        np.testing.assert_array_equal(one, one_sheet(jnp.array(-q)))
+        one = canonicalize_quaternion(jnp.array(q))
+        np.testing.assert_array_equal(one, canonicalize_quaternion(jnp.array(-q)))
         np.testing.assert_array_equal(np.abs(one), np.abs(q))
         assert one[0] >= 0
 

@@ -16,9 +16,9 @@ from hybrid_jax.control import (
     hover,
     low_pass,
     performance,
-    realised,
+    actual_cost,
     sample,
-    upset,
+    add_body_rates,
 )
 from hybrid_jax.dynamics.disturbance import disturbed
 
@@ -53,7 +53,7 @@ def test_the_true_model_keeps_to_its_path(i, allowed):
 
 def test_an_upset_of_6_rad_per_s_is_recovered_from():
     reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, SECONDS)
-    flight, found = alone(jnp.zeros(6), reference, upset(reference[0]), 0.0)
+    flight, found = alone(jnp.zeros(6), reference, add_body_rates(reference[0]), 0.0)
     assert found.largest_error < 0.3
     assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
@@ -69,7 +69,7 @@ def test_a_kick_after_a_second_of_quiet_is_answered_as_one_at_the_start():
     def furthest(at):
         def kicked(x, u, t):
             x = plant(BODY)(x, u, t)
-            return jnp.where(jnp.abs(t - at) < 0.5 * CONTROLLER.period, upset(x), x)
+            return jnp.where(jnp.abs(t - at) < 0.5 * CONTROLLER.period, add_body_rates(x), x)
 
         flight = fly(kicked, BODY, reference, reference[0], CONTROLLER)
         return performance(flight, reference, CONTROLLER).largest_error
@@ -99,14 +99,14 @@ def test_a_lane_is_the_lone_loop():
 
 
 def test_a_true_model_keeps_its_promise_and_a_wrong_one_does_not():
-    """What is promised is for steps of 0.05 s, what is realised for the plant's of 0.01 s."""
+    """What is promised is for steps of 0.05 s, what is actual_cost for the plant's of 0.01 s."""
     reference = REFERENCES[1]
 
     @jax.jit
     def kept(wind):
         flight = judged(wind, reference, reference[0], 0.0)[0]
         calls = jnp.arange(50, 200, 25)
-        costs = jax.vmap(lambda i: realised(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
+        costs = jax.vmap(lambda i: actual_cost(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
         return costs / flight.plans.cost[calls]
 
     np.testing.assert_allclose(kept(jnp.zeros(6)), 1.0, rtol=0.01)

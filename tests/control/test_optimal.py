@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, advance, figure_eight, hover, sample, upset
+from hybrid_jax.control import Controller, advance, figure_eight, hover, sample, add_body_rates
 from hybrid_jax.rotation import from_axis_angle
 
 pytest.importorskip("casadi")
@@ -55,8 +55,8 @@ def test_without_an_earlier_plan_it_is_found_in_some_iterations(name):
 
 
 def test_in_flight_one_iteration_a_call_is_enough():
-    """A fifth of a second after an upset of 6 rad/s, from the plan of the call before."""
-    x, plan = upset(STILL[0]), CONTROLLER.begin()
+    """A fifth of a second after an add_body_rates of 6 rad/s, from the plan of the call before."""
+    x, plan = add_body_rates(STILL[0]), CONTROLLER.begin()
     for _ in range(20):
         u, plan = plan_of(x, STILL[:20], plan, jnp.asarray(1))
         x = advance(BODY, x, u, CONTROLLER.period)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, figure_eight, hover, low_pass, sample, step, upset
+from hybrid_jax.control import Controller, figure_eight, hover, low_pass, sample, step, add_body_rates
 from hybrid_jax.control.attitude import heading
 from hybrid_jax.rotation import body_z, normalise
 
@@ -75,7 +75,7 @@ def test_the_low_pass_is_low_for_two_fifths_of_the_time():
 
 def test_an_upset_adds_rates():
     state = sample(hover(), CONTROLLER, 1.0)[0]
-    np.testing.assert_array_equal(upset(state) - state, 6.0 * np.eye(13)[10])
+    np.testing.assert_array_equal(add_body_rates(state) - state, 6.0 * np.eye(13)[10])
 
 
 def test_what_makes_no_sense_is_refused():
@@ -98,8 +98,8 @@ def test_what_makes_no_sense_is_refused():
         (lambda: step(to=(1.0, 2.0)), "to must be three numbers"),
         (lambda: step(to=(1.0, 2.0, 3.0), at=np.nan), "at must be a finite number"),
         (lambda: low_pass(speed=np.inf), "speed must be a finite number"),
-        (lambda: upset(jnp.zeros(4)), r"state \(13,\) expected"),
-        (lambda: upset(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
+        (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
+        (lambda: add_body_rates(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
         (lambda: sample(None, CONTROLLER, 1.0), "path must be a function of time"),
     ],
 )

@@ -7,7 +7,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.sensitivities import advanced
+from hybrid_jax.control.sensitivities import advance_with_jacobian
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import ForcedBody
@@ -65,7 +65,7 @@ def test_the_jacobian_of_a_step_is_that_of_autodiff(name, unit_quaternion):
     def both(field, x, u):
         expected = jax.jacfwd(lambda x, u: advance(field, x, u, DT, unit_quaternion), argnums=(0, 1))(x, u)
         state = advance(field, x, u, DT, unit_quaternion)
-        return advanced(field, x, u, DT, unit_quaternion), (state, jnp.concatenate(expected, axis=1))
+        return advance_with_jacobian(field, x, u, DT, unit_quaternion), (state, jnp.concatenate(expected, axis=1))
 
     with jax.enable_x64(True):
         field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), FIELDS[name])
