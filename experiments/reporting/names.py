@@ -1,0 +1,30 @@
+"""The keys of models, modes and target domains in results and caches, and their labels for readers."""
+
+HYBRID, NO_PHYSICS, PHYSICS_ONLY = "hybrid", "no_physics", "physics_only"
+EXPERT_AUGMENTATION, LAST_LAYER, LINEAR_RESIDUAL = "expert_augmentation", "last_layer", "linear_residual"
+THETA_P_ONLY, THETA_D_ONLY = "theta_p_only", "theta_d_only"
+LEAST_SQUARES, CONSTANT_DISTURBANCE = "least_squares", "constant_disturbance"
+FINE_TUNED, TARGET_ONLY, SOURCE_ONLY = "fine_tuned", "target_only", "source_only"
+PARAMETER_SHIFT, EXTERNAL_FORCE = "parameter_shift", "external_force"
+LABELS = {
+    HYBRID: "hybrid",
+    NO_PHYSICS: "no-physics",
+    PHYSICS_ONLY: "physics-only",
+    EXPERT_AUGMENTATION: "Expert Augmentation",
+    THETA_P_ONLY: "θ_p only",
+    THETA_D_ONLY: "θ_d only",
+    LAST_LAYER: "last layer (ridge)",
+    LEAST_SQUARES: "least squares on θ_p",
+    CONSTANT_DISTURBANCE: "least squares on θ_p + disturbance",
+    LINEAR_RESIDUAL: "source + linear residual",
+    FINE_TUNED: "fine-tuned",
+    TARGET_ONLY: "target-only",
+    SOURCE_ONLY: "source-only",
+    PARAMETER_SHIFT: "parameter shift",
+    EXTERNAL_FORCE: "external force",
+}
+
+
+def label(*keys: str) -> str:
+    """The labels of keys, separated by commas; a key without a label stands for itself."""
+    return ", ".join(LABELS.get(key, key) for key in keys)

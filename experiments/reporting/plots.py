@@ -1,0 +1,194 @@
+"""The style of all figures, their legend and their files, and panels of test errors: a dot per seed, a bar per mean."""
+
+import io
+import math
+from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.artist import Artist
+from matplotlib.axes import Axes
+from matplotlib.axis import Axis
+from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
+
+from experiments.reporting import names
+from hybrid_jax.io.files import write_whole
+
+STYLE: dict[Any, Any] = {
+    "font.size": 10,
+    "axes.titlesize": 10,
+    "axes.grid": True,
+    "grid.alpha": 0.25,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "legend.frameon": False,
+    "legend.fontsize": 9,
+    "svg.hashsalt": "hybrid_jax",  # otherwise names inside an SVG are random
+}
+# Okabe and Ito's palette, which the colour-blind can tell apart.
+COLOURS = {
+    names.HYBRID: "#0072B2",
+    names.NO_PHYSICS: "#D55E00",
+    names.PHYSICS_ONLY: "#009E73",
+    names.CONSTANT_DISTURBANCE: "#CC79A7",
+}
+OTHERS = "0.4"  # the colour of models that no figure of the paper shows
+DRAWABLE = 1e30  # a number beyond it overflows inside matplotlib and is drawn like one that is not finite
+LARGEST_RATIO = 100.0  # an axis of errors ends at this many times the smallest mean; errors beyond are marked there
+PADDING = 1.15  # factor of room at either end of an axis of errors
+LONG_NUMBER = 0.05  # numbers up to this need room on an axis
+HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
+FLOOR_LABEL = "floor: error that no model here can see"
+
+_Limits = tuple[float, float]
+
+
+class Line(NamedTuple):
+    """A line of an error panel.
+
+    Attributes:
+        name: label.
+        errors: of each seed, not finite where it failed.
+        colour: of dots and bar.
+        marked: legend label of a vertical line through the mean, or empty for none.
+    """
+
+    name: str
+    errors: np.ndarray
+    colour: str
+    marked: str = ""
+
+
+def colour(model: str) -> str:
+    """The colour that a model has in every figure."""
+    return COLOURS.get(model, OTHERS)
+
+
+def save_figure(figure: Figure, path: str | Path) -> list[Path]:
+    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths.
+
+    Raises:
+        OSError: the folder cannot be written.
+    """
+    paths = []
+    for suffix, metadata in (("png", {}), ("svg", {"Date": None})):
+        content = io.BytesIO()
+        with mpl.rc_context(STYLE):
+            figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
+            figure.set_layout_engine("none")  # the second file keeps the layout of the first, which saves half the time
+        paths.append(Path(f"{path}.{suffix}"))
+        write_whole(paths[-1], content.getvalue())
+    return paths
+
+
+def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[str, str]:
+    """Write figures, given with their captions by name; returns the captions by file, as a report takes them."""
+    for name, (figure, _) in figures.items():
+        save_figure(figure, out / name)
+    return {f"{name}.png": caption for name, (_, caption) in figures.items()}
+
+
+def legend_below(
+    figure: Figure, title: str = "", meaning: str = "", columns: int = 3, entries: Mapping[str, Artist] | None = None
+) -> Figure:
+    """Title above all panels, and below them one legend for what any of them labels, each label once.
+
+    Args:
+        meaning: heading of the legend.
+        entries: label → handle of further entries, which stand first.
+    """
+    shown = dict(entries or {})
+    for axes in figure.axes:
+        shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
+    if title:
+        figure.suptitle(title, fontsize=12)
+    figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, title=meaning or None)
+    return figure
+
+
+def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0) -> None:
+    """Draw a line for each way to do a thing, the first on top.
+
+    Args:
+        floor: an error that no model at hand can get below; 0 if there is none.
+    """
+    limits = _limits([line.errors for line in lines], floor)
+    axes.set(xscale="log", xlim=limits, ylim=(len(lines) - 0.4, -0.6), title=title)
+    axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
+    axes.set_yticks(range(len(lines)), [line.name for line in lines])
+    tick_errors(axes.xaxis, *limits)
+    for y, line in enumerate(lines):
+        mean = _draw_line(axes, y, line.errors, line.colour, limits)
+        if line.marked and limits[0] < mean < limits[1]:
+            axes.axvline(mean, color=line.colour, linestyle=":", linewidth=1, label=line.marked)
+    if limits[0] < floor < limits[1]:
+        axes.axvline(floor, color="0.4", linestyle="-.", label=FLOOR_LABEL)
+
+
+def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
+    """The title and legend of error panels.
+
+    Args:
+        failed: whether an error that is not finite is left out of a mean.
+    """
+    bar = {"color": "0.3", "marker": "|", "markersize": 12, "markeredgewidth": 2.2, "linestyle": ""}
+    entries = {
+        "a seed": Line2D([], [], color="0.3", alpha=0.55, marker="o", markersize=4, linestyle=""),
+        "mean over seeds (broken: over the finite ones)" if failed else "mean over seeds": Line2D([], [], **bar),
+    }
+    return legend_below(figure, title, columns=2, entries=entries)
+
+
+def tick_errors(axis: Axis, low: float, high: float) -> None:
+    """Ticks of a log axis: at decades if it is long, at 1, 2, 5 or at round steps if it is short."""
+    decades = math.log10(high / low)
+    room = 2.2 if low > LONG_NUMBER else 1.5  # decades
+    subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
+    axis.set_major_locator(MaxNLocator(5) if decades < 0.5 else LogLocator(subs=subs))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def _limits(errors: Iterable[np.ndarray], floor: float) -> _Limits:
+    """Around all errors within LARGEST_RATIO of the smallest mean, so that one failed run does not flatten the rest."""
+    drawn = [values[(values > 1 / DRAWABLE) & (values < DRAWABLE)] for values in errors]
+    means = [values.mean() for values in drawn if len(values)]
+    if not means:
+        return 0.1, 10.0
+    near = np.concatenate([*drawn, [floor]])
+    near = near[(near >= min(means) / LARGEST_RATIO) & (near <= min(means) * LARGEST_RATIO)]
+    return near.min() / PADDING, near.max() * PADDING
+
+
+def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: _Limits) -> float:
+    """A dot for each seed and a bar for the mean of the finite ones, which is returned; errors outside are marked."""
+    low, high = limits
+    finite = values < DRAWABLE
+    inside = finite & (values >= low) & (values <= high)
+    # Spread over the line's height, or seeds of one error would hide each other.
+    heights = y + np.linspace(-HALF_LINE, HALF_LINE, len(values) + 2)[1:-1]
+    axes.plot(values[inside], heights[inside], "o", color=tint, alpha=0.55, markersize=4, markeredgewidth=0)
+    mean = float(values[finite].mean()) if finite.any() else math.nan
+    if low <= mean <= high:
+        style = {"linewidth": 2.2, "linestyle": "-" if finite.all() else (0, (1.2, 0.6))}
+        axes.plot([mean] * 2, [y - HALF_LINE, y + HALF_LINE], color=tint, **style)
+    above, below, failed = (int(np.sum(which)) for which in (finite & (values > high), values < low, ~finite))
+    shown = f"{mean:.0f}" if 100 <= mean < 10_000 else f"{mean:.2g}"
+    words = [f"{above} of {len(values)} beyond, mean {shown}"] if above else []
+    words += [f"{failed} of {len(values)} not finite"] if failed else []
+    if words:
+        _mark_edge(axes, "x" if failed == len(values) else ">", (high, y), ";\n".join(words), tint)
+    if below:
+        _mark_edge(axes, "<", (low, y), f"{below} of {len(values)} below", tint)
+    return mean
+
+
+def _mark_edge(axes: Axes, marker: str, at: tuple[float, float], words: str, tint: str) -> None:
+    """The words stand right of the marker: outside the panel at its right edge, where they hide no seed."""
+    axes.plot(*at, marker, color=tint, markersize=7, clip_on=False, zorder=5)
+    style = {"va": "center", "fontsize": 8, "color": tint, "annotation_clip": False}
+    axes.annotate(words, at, (8, 0), textcoords="offset points", **style)

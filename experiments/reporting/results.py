@@ -1,0 +1,204 @@
+"""A table of results: each row has tags, which say what was run, and the numbers that it gave."""
+
+import csv
+import io
+import math
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+
+from experiments.reporting.stats import Spread, spread
+from hybrid_jax.io.files import json_value
+
+Row = Mapping[str, Any]  # JSON values by column; a nested column, such as theta, is a mapping
+Column = str | Callable[[Row], float]
+_NOT_FINITE = "null"  # in CSV, where an empty cell means that the row has no such number
+
+
+@dataclass(frozen=True)
+class Results:
+    """Rows of JSON values. A number that is not finite is stored as None, as in JSON.
+
+    Attributes:
+        rows: one mapping per run: column → value.
+        tags: columns that identify a row.
+
+    Raises:
+        ValueError: a row lacks a tag, two rows have the same tags, or a value has no JSON form.
+    """
+
+    rows: Sequence[Row] = ()
+    tags: Sequence[str] = ()
+
+    def __post_init__(self):
+        object.__setattr__(self, "rows", tuple(json_value(row) for row in self.rows))
+        object.__setattr__(self, "tags", tuple(self.tags))
+        for index, row in enumerate(self.rows):
+            if not isinstance(row, dict) or not set(self.tags) <= row.keys():
+                raise ValueError(f"rows[{index}] must be an object with {', '.join(self.tags)}")
+        keys = Counter(tuple(row[tag] for tag in self.tags) for row in self.rows) if self.tags else {}
+        for key, times in keys.items():
+            if times > 1:
+                shown = ", ".join(f"{tag} {value}" for tag, value in zip(self.tags, key, strict=True))
+                raise ValueError(f"rows must be different in {', '.join(self.tags)}; {times} rows have {shown}")
+
+    def __iter__(self) -> Iterator[Row]:
+        return iter(self.rows)
+
+    def __len__(self) -> int:
+        return len(self.rows)
+
+    @overload
+    def __getitem__(self, item: int) -> Row: ...
+    @overload
+    def __getitem__(self, item: str) -> list[Any]: ...
+    def __getitem__(self, item):
+        """One row by its index, or all values of a column by its name."""
+        return self.rows[item] if isinstance(item, int) else [row.get(item) for row in self.rows]
+
+    def __add__(self, other: "Results") -> "Results":
+        return Results((*self.rows, *other.rows), self.tags or other.tags)
+
+    def where(self, keep: Callable[[Row], bool] | None = None, **tags: Any) -> "Results":
+        """The rows with these values; a tuple, list or set allows any of its values.
+
+        Args:
+            keep: a further condition on a row.
+        """
+
+        def kept(row: Row) -> bool:
+            same = (row.get(t) in v if isinstance(v, tuple | list | set) else row.get(t) == v for t, v in tags.items())
+            return all(same) and (keep is None or keep(row))
+
+        return self._with(row for row in self.rows if kept(row))
+
+    def group(self, *columns: str) -> dict[Any, "Results"]:
+        """The rows of each value of a column, or of each tuple of values of several, in order of appearance."""
+        found: dict[Any, list[Row]] = {}
+        for row in self.rows:
+            key = tuple(row[column] for column in columns)
+            found.setdefault(key if len(columns) > 1 else key[0], []).append(row)
+        return {key: self._with(rows) for key, rows in found.items()}
+
+    def sort(self, **orders: Sequence[Any] | None) -> "Results":
+        """Sort by columns, the first one most: in the order of a list of values, or ascending for None."""
+
+        def key(row: Row) -> list[Any]:
+            return [row[name] if order is None else order.index(row[name]) for name, order in orders.items()]
+
+        return self._with(sorted(self.rows, key=key))
+
+    def unique(self, column: str) -> list[Any]:
+        """The different values of a column, in order of appearance."""
+        return list(dict.fromkeys(self[column]))
+
+    def tagged(self, **tags: Any) -> "Results":
+        """The rows with further tags, or other values of these."""
+        rows = tuple({**tags, **{name: row[name] for name in row if name not in tags}} for row in self.rows)
+        return Results(rows, (*tags, *(tag for tag in self.tags if tag not in tags)))
+
+    def numbers(self, column: Column, missing: float = math.inf) -> np.ndarray:
+        """The numbers of a column, or of a function of a row.
+
+        Args:
+            column: a name, a dotted path into nested columns ("theta.Ix"), or a function.
+            missing: what a number that was not finite counts as.
+        """
+        read = column if callable(column) else lambda row: _at(row, column)
+        return np.array([missing if (value := read(row)) is None else value for row in self.rows], float)
+
+    def spread(self, column: Column, missing: float = math.inf) -> Spread:
+        """Mean, standard deviation and more of a column; see `numbers`."""
+        return spread(self.numbers(column, missing))
+
+    def paired(self, other: "Results", column: Column, over: str = "seed") -> tuple[np.ndarray, np.ndarray]:
+        """The numbers of a column here, and of the rows with the same seeds in another table.
+
+        A table of one row, such as that of a model that was not trained, is paired with every seed.
+
+        Raises:
+            ValueError: a seed that the other table lacks.
+        """
+        theirs = dict(zip(other[over], other.numbers(column), strict=True))
+        if len(other) == 1:
+            return self.numbers(column), np.full(len(self), *theirs.values())
+        lacking = [seed for seed in self[over] if seed not in theirs]
+        if lacking:
+            raise ValueError(f"other must hold the same {over}s, {lacking[0]} is missing")
+        return self.numbers(column), np.array([theirs[seed] for seed in self[over]])
+
+    def to_csv(self) -> str:
+        """CSV. Nested columns become one column per entry: theta.Ix is `Ix`, an interval of it `Ix_low` and `Ix_high`.
+
+        A number that is not finite is `null`; a cell is empty where a row has no such number.
+        """
+        flat = [_flat(row) for row in self.rows]
+        nested = {name for row in self.rows for name, value in row.items() if isinstance(value, dict)}
+        names = list(dict.fromkeys(name for row in flat for name in row if name not in nested))
+        text = io.StringIO()
+        writer = csv.writer(text, lineterminator="\n")
+        writer.writerow(names)
+        writer.writerows([_cell(row[name]) if name in row else "" for name in names] for row in flat)
+        return text.getvalue()
+
+    def _with(self, rows: Iterable[Row]) -> "Results":
+        """Some of these rows, which need no check."""
+        found = object.__new__(Results)
+        object.__setattr__(found, "rows", tuple(rows))
+        object.__setattr__(found, "tags", self.tags)
+        return found
+
+
+def from_csv(text: str, tags: Sequence[str] = ()) -> Results:
+    """Read what `to_csv` wrote; nested columns stay flat. Its `to_csv` is the same text.
+
+    Raises:
+        ValueError: a line has too many or too few cells, or as `Results`.
+    """
+    header, *lines = csv.reader(io.StringIO(text))
+    if any(len(line) != len(header) for line in lines):
+        raise ValueError(f"each line of the CSV must have {len(header)} cells")
+    return Results([{n: _value(c) for n, c in zip(header, line, strict=True) if c} for line in lines], tags)
+
+
+def _at(row: Row, path: str) -> Any:
+    value: Any = row
+    for name in path.split("."):
+        value = None if value is None else value.get(name)
+    return value
+
+
+def _flat(row: Row) -> dict[str, Any]:
+    """Column → value; nested columns by the names of their entries."""
+    found: dict[str, Any] = {}
+    for name, value in row.items():
+        found |= _entries("", value) if isinstance(value, dict) else {name: value}
+    return found
+
+
+def _entries(name: str, value: Any) -> dict[str, Any]:
+    if isinstance(value, dict):
+        parts = [_entries(f"{name} {inner}".strip(), each) for inner, each in value.items()]
+        return {key: each for part in parts for key, each in part.items()}
+    if isinstance(value, list) and len(value) == 2:
+        return {f"{name}_low": value[0], f"{name}_high": value[1]}
+    return {name: value}
+
+
+def _cell(value: Any) -> str:
+    return _NOT_FINITE if value is None else repr(value) if isinstance(value, float) else str(value)
+
+
+def _value(cell: str) -> Any:
+    if cell in (_NOT_FINITE, "True", "False"):
+        return {_NOT_FINITE: None, "True": True, "False": False}[cell]
+    for kind in (int, float):
+        try:
+            if _cell(number := kind(cell)) == cell:
+                return number
+        except ValueError:
+            continue
+    return cell
