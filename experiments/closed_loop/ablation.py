@@ -10,6 +10,7 @@ from experiments.closed_loop.models import Trained, fused, train, with_statistic
 from experiments.closed_loop.rows import Agent
 from experiments.closed_loop.scenarios import ModelSet
 from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.vehicle import Vehicle
 
@@ -59,7 +60,7 @@ def variants(options: Sequence[Option], domain: Domain, trained: dict[str, Train
     """
     (few,) = config.sizes
 
-    def models() -> Iterator[tuple[Agent, object]]:
+    def models() -> Iterator[tuple[Agent, AbstractVectorField]]:
         for name, found in trained.items():
             yield _agent(name, few), found.adapted[domain.name, few]
         if "statistics" in options and config.norm == "batch":

@@ -1,17 +1,16 @@
-"""One row per closed-loop flight: the agent, the reference, and the tracking performance."""
+"""The tags of closed-loop results, their labels, and the agents that flew."""
 
-import csv
-import io
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
+from typing import Any
 
-from experiments.paper import rows as shifts
+from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
+from experiments.reporting.results import Results, Row
 
 UNCHANGED = "source"  # the domain of the vehicle before the change
-DOMAINS = (UNCHANGED, *shifts.DOMAINS)
-NAMES = {UNCHANGED: "unchanged vehicle"} | {domain: shifts.NAMES[domain] for domain in shifts.DOMAINS}
-REFERENCES = {  # id → name in tables and figures
+DOMAINS = {UNCHANGED: "unchanged vehicle"} | {name: LABELS[name] for name in (PARAMETER_SHIFT, EXTERNAL_FORCE)}
+REFERENCES = {
     "hover": "hover",
     "figure_eight": "figure-8, 3.5 m/s",
     "fast_figure_eight": "figure-8, 6 m/s",
@@ -28,8 +27,6 @@ LEARNED = {
 }
 SOURCES = {"hybrid": "hybrid", "invariant": "invariant", "least_squares": "invariant"}  # adapted → source model
 KNOWN = {"nominal": "nominal physics", "oracle": "true vehicle, mean wind"}
-MODELS = (*KNOWN, *LEARNED)
-NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised", "realised", "excess")
 
 
 @dataclass(frozen=True, order=True)
@@ -37,8 +34,8 @@ class Agent:
     """A controller with its prediction model.
 
     Attributes:
-        model: one of MODELS. "invariant" has a translation- and yaw-invariant residual; "least_squares" is its source
-            model with θ_p and a constant disturbance refitted.
+        model: a key of KNOWN or LEARNED. "invariant" has a translation- and yaw-invariant residual; "least_squares" is
+            its source model with θ_p and a constant disturbance refitted.
         n_train: target trajectories for adaptation; 0 for a source model.
         observer: with a disturbance observer.
         variant: of the model or the controller, in an ablation; else empty.
@@ -51,109 +48,42 @@ class Agent:
 
     @property
     def name(self) -> str:
-        """In tables and figures."""
+        """Label in tables and figures."""
         size = f"N = {self.n_train}" if self.n_train else "source"
         name = KNOWN[self.model] if self.model in KNOWN else f"{LEARNED[self.model]}, {size}"
         return (f"{self.variant}, {name}" if self.variant else name) + (" + observer" if self.observer else "")
 
 
-@dataclass(frozen=True)
-class FlightRow:
-    """The result of one flight. A number that is not finite is None, as in JSON.
-
-    Attributes:
-        domain: one of DOMAINS.
-        model, n_train, observer, variant: see `Agent`.
-        reference: one of REFERENCES.
-        distance: of the flight from home [m].
-        seed: of the model's training; 0 for a model that was not trained.
-        position_rmse: after the initial state [m].
-        yaw_rmse: [rad].
-        largest_error: of position [m].
-        crashed, saturation: see `hybrid_jax.control.Performance`.
-        promised, realised: predicted and actual open-loop cost, mean over the plans of some calls.
-        excess: see `hybrid_jax.control.relative_cost_error`.
-
-    Raises:
-        ValueError: an unknown domain, model or reference.
-    """
-
-    domain: str
-    model: str
-    n_train: int
-    observer: bool
-    variant: str
-    reference: str
-    distance: float
-    seed: int
-    position_rmse: float | None
-    yaw_rmse: float | None
-    largest_error: float | None
-    crashed: bool
-    saturation: float | None
-    promised: float | None
-    realised: float | None
-    excess: float | None
-
-    def __post_init__(self):
-        for name, choices in (("domain", DOMAINS), ("model", MODELS), ("reference", tuple(REFERENCES))):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"{name} must be one of {', '.join(choices)}, got {getattr(self, name)!r}")
-        for name in NUMBERS:
-            value = getattr(self, name)
-            finite = None if value is None or not math.isfinite(value) else float(value)
-            object.__setattr__(self, name, finite)
-
-    @property
-    def agent(self) -> Agent:
-        """The agent that flew."""
-        return Agent(self.model, self.n_train, self.observer, self.variant)
-
-    @property
-    def error(self) -> float:
-        """Position RMSE [m]; infinite for a crash."""
-        return self.number("position_rmse")
-
-    def number(self, name: str) -> float:
-        """One of NUMBERS; infinite for a crash or where it was not finite."""
-        value = getattr(self, name)
-        return math.inf if self.crashed or value is None else value
+ORACLE = Agent("oracle")
+TAGS = ("domain", *(field.name for field in fields(Agent)), "reference", "distance", "seed")
+# Tracking performance in m, rad, m and as a share; the mean predicted and actual open-loop cost of plans, and their
+# relative error. The last three keep their names of earlier reports.
+NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised", "realised", "excess")
 
 
-Cell = tuple[str, str, float]  # domain, reference, distance
-Group = dict[Agent, list[FlightRow]]
-Cells = dict[Cell, Group]
+def uncrashed(column: str, factor: float = 1.0) -> Callable[[Row], float]:
+    """One of NUMBERS times a factor; infinite for a crash or where it was not finite."""
+    return lambda row: math.inf if row["crashed"] or row[column] is None else factor * row[column]
 
 
-def cells(rows: Iterable[FlightRow]) -> Cells:
-    """Rows by (domain, reference, distance) and agent, in the order of the rows, sorted by seed.
-
-    Raises:
-        ValueError: two rows of the same flight.
-    """
-    found: Cells = {}
-    for row in rows:
-        group = found.setdefault((row.domain, row.reference, row.distance), {}).setdefault(row.agent, [])
-        if any(other.seed == row.seed for other in group):
-            raise ValueError(f"{row.domain}, {row.reference}, {row.agent.name}: two rows of seed {row.seed}")
-        group.append(row)
-    for agents in found.values():
-        for group in agents.values():
-            group.sort(key=lambda row: row.seed)
-    return found
+ERROR = uncrashed("position_rmse")
 
 
-def paired(group: Sequence[FlightRow], like: Sequence[FlightRow]) -> list[float]:
-    """Errors [m] of a group for the seeds of another; a model that was not trained has the same error for each."""
-    by_seed = {row.seed: row.error for row in group}
-    return [by_seed[0] if len(group) == 1 else by_seed[row.seed] for row in like]
+def by_agent(rows: Results) -> dict[Agent, Results]:
+    """The rows of each agent, in order of appearance."""
+    return {Agent(*key): group for key, group in rows.group(*asdict(ORACLE)).items()}
 
 
-def to_csv(rows: Sequence[FlightRow]) -> str:
-    """The rows as CSV, with `null` for a number that was not finite."""
-    text = io.StringIO()
-    writer = csv.DictWriter(text, [field.name for field in fields(FlightRow)], lineterminator="\n")
-    writer.writeheader()
-    for row in rows:
-        writer.writerow({name: "null" if value is None else value for name, value in asdict(row).items()})
-    return text.getvalue()
+def of(agent: Agent) -> dict[str, Any]:
+    """The tags of an agent, for `Results.where`."""
+    return asdict(agent)
+
+
+def references(rows: Results) -> dict[str, Mapping[str, str]]:
+    """Label → tags of each reference that was flown, as the columns of a table."""
+    return {label: {"reference": name} for name, label in REFERENCES.items() if name in rows["reference"]}
+
+
+def centimetres(rows: Results) -> float:
+    """Mean position RMSE [cm] over seeds; infinite if one crashed."""
+    return 100 * rows.spread(ERROR).mean

@@ -4,9 +4,8 @@ import time
 from collections import Counter, defaultdict
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -34,14 +33,6 @@ CALL_EVERY = 50  # calls between two whose open-loop cost is computed
 DRAW_EVERY = 5  # states between two that are kept for figures
 
 
-class Timed(NamedTuple):
-    """Arrays over flights, and how long they took, without compiling."""
-
-    arrays: Arrays
-    seconds: float
-    processor_seconds: float
-
-
 class ClosedLoopRunner:
     """Flies scenarios with one controller.
 
@@ -62,8 +53,8 @@ class ClosedLoopRunner:
             self._capacity |= Counter(structure(flight) for flight in scenario.flights())
         self._programs: dict[tuple, LaneMap] = {}
 
-    def fly(self, scenario: Scenario) -> Timed:
-        """Fly all flights of a scenario, compiling first."""
+    def fly(self, scenario: Scenario) -> tuple[Arrays, dict[str, Any]]:
+        """Results of all flights of a scenario, one per row, and the time they took without compiling [s]."""
         groups = defaultdict(list)
         flights = list(scenario.flights())
         for i, flight in enumerate(flights):
@@ -76,8 +67,8 @@ class ClosedLoopRunner:
         for key, chosen in groups.items():
             found = self._run(key, lanes[key], len(chosen))
             results |= {i: lane(found, place) for place, i in enumerate(chosen)}
-        seconds, processor = time.perf_counter() - began, time.process_time() - worked
-        return Timed(stack([results[i] for i in range(len(flights))]), seconds, processor)
+        spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
+        return stack([results[i] for i in range(len(flights))]), spent
 
     def _run(self, key: tuple, lanes: Flight, active: int) -> Arrays:
         """Fly the first `active` lanes. They are padded to the capacity, so that all scenarios share a program."""

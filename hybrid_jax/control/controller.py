@@ -164,7 +164,8 @@ class Controller:
         x, reference, plan = promote(x, reference, plan)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
-        point = _Point(*self._initial_guess(model, reference, x, plan), plan.damping)
+        variables, states, cost = self._initial_guess(model, reference, x, plan)
+        point = _Point(variables, states, cost, plan.damping)
 
         def iteration(_, point):
             return self._improve(model, reference, x, point)

@@ -1,5 +1,6 @@
 """Results of flown scenarios, kept in the cache so that no flight is simulated twice."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -8,9 +9,10 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments.closed_loop.rows import NUMBERS, Agent, FlightRow
+from experiments.closed_loop.rows import NUMBERS, TAGS, Agent, of
 from experiments.closed_loop.runner import CALL_EVERY, DRAW_EVERY, ClosedLoopRunner
 from experiments.closed_loop.scenarios import Scenario
+from experiments.reporting.results import Results
 from experiments.runner.progress import clock
 from hybrid_jax.control import Controller
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive
@@ -41,25 +43,24 @@ class Flown:
     processor_seconds: float
     devices: int
 
-    def rows(self) -> list[FlightRow]:
-        """One row per flight."""
-        return [self._row(i, *key) for i, key in enumerate(self.scenario.keys())]
+    def rows(self) -> list[dict[str, Any]]:
+        """One row per flight: its tags, NUMBERS, and whether it crashed."""
+        place = {"domain": self.scenario.domain.name}
+        where = {"reference": self.scenario.reference, "distance": self.scenario.distance}
+        return [
+            {**place, **of(agent), **where, "seed": seed, "crashed": bool(self.arrays["crashed"][i])}
+            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS}
+            for i, (agent, seed) in enumerate(self.scenario.keys())
+        ]
 
     def states(self, agent: Agent, seed: int = 0) -> np.ndarray:
         """The states of one flight, every `DRAW_EVERY` periods."""
         return self.arrays["states"][self.scenario.keys().index((agent, seed))]
 
-    def _row(self, i: int, agent: Agent, seed: int) -> FlightRow:
-        numbers: dict[str, Any] = {name: float(self.arrays[name][i].mean()) for name in NUMBERS}
-        return FlightRow(
-            domain=self.scenario.domain.name,
-            reference=self.scenario.reference,
-            distance=self.scenario.distance,
-            seed=seed,
-            crashed=bool(self.arrays["crashed"][i]),
-            **asdict(agent),
-            **numbers,
-        )
+
+def results_of(scenarios: Sequence[Flown]) -> Results:
+    """The rows of all flights."""
+    return Results([row for each in scenarios for row in each.rows()], TAGS)
 
 
 def flown(
@@ -82,9 +83,8 @@ def flown(
         about, arrays = hosts.from_first(lambda path=path: _cached(path, console, fresh))
         origin = "as found in the cache"
         if about is None:
-            arrays, *spent = runner.fly(scenario)
-            about = dict(zip(("seconds", "processor_seconds"), spent, strict=True))
-            about |= {"devices": jax.device_count(), "versions": versions(*MADE_BY)}
+            arrays, spent = runner.fly(scenario)
+            about = spent | {"devices": jax.device_count(), "versions": versions(*MADE_BY)}
             origin = clock(about["seconds"])
             if hosts.is_main_process():
                 save_archive(path, FORMAT, about, arrays)
