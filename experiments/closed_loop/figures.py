@@ -198,7 +198,7 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], away: Mapping[Agent, R
         axes.plot(end, y, "x" if crashed else ">", color=colour, markersize=7, clip_on=False)
         number = f"{there:.2g}" if there >= SMALLEST_ERROR else f"{there:.2f}"
         words = f"{crashed} of {len(away[agent])} crash" if crashed else number
-        side = {"va": "bottom", "ha": "right"} if crashed else {"va": "center", "ha": "left"}
+        side: Any = {"va": "bottom", "ha": "right"} if crashed else {"va": "center", "ha": "left"}
         offset = (-8, 4) if crashed else (7, 0)
         at: Any = {"textcoords": "offset points", "fontsize": 7, "annotation_clip": False}
         axes.annotate(words, (end, y), offset, **at, **side)

@@ -21,7 +21,6 @@ from hybrid_jax.control import (
     relative_cost_error,
     sample,
 )
-from hybrid_jax.control.open_loop import cost_of_offset
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.sim.forces import Wrench
 from hybrid_jax.sim.quadrotor import Quadrotor
@@ -103,7 +102,7 @@ def simulate(
         **vars(performance(flown, reference, controller)),
         "promised": costs.predicted,
         "realised": costs.actual,
-        "excess": relative_cost_error(costs, cost_of_offset(controller)),
+        "excess": relative_cost_error(costs, controller),
         "states": flown.x[::DRAW_EVERY],
     }
 

@@ -158,7 +158,10 @@ class Controller:
         x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
-        self._check_plan(plan)
+        if not isinstance(plan, Plan):
+            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
+        if plan.variables.shape != (self.steps, INPUT_SIZE):
+            raise ValueError(f"plan must have variables of shape ({self.steps}, 4), got {plan.variables.shape}")
         checks.unit_quaternions("x", x)
         checks.unit_quaternions("reference", reference)
         x, reference, plan = promote(x, reference, plan)
@@ -173,13 +176,6 @@ class Controller:
         point = jax.lax.fori_loop(0, self.iterations, iteration, point)
         plan = Plan(point.variables, point.cost, point.damping)
         return self.speeds(plan)[0], plan
-
-    def _check_plan(self, plan: Plan) -> None:
-        if not isinstance(plan, Plan):
-            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
-        expected = (self.steps, INPUT_SIZE)
-        if plan.variables.shape != expected:
-            raise ValueError(f"plan must have variables of shape {expected}, got {plan.variables.shape}")
 
     def _range(self) -> tuple[float, float]:
         return (self.vehicle.max_rotor_speed + self.min_speed) / 2, (self.vehicle.max_rotor_speed - self.min_speed) / 2

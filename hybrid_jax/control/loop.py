@@ -82,7 +82,14 @@ def fly(
     """
     checks.not_negative("bandwidth", bandwidth)
     x0, reference = checks.floating("x0", x0), checks.floating("reference", reference)
-    periods = _periods(reference, x0, controller)
+    if x0.shape != (STATE_SIZE,) or reference.ndim != 2 or reference.shape[1] != STATE_SIZE:
+        raise ValueError(f"x0 (13,) and reference (n, 13) expected, got {x0.shape} and {reference.shape}")
+    periods = len(reference) - 1 - controller.steps * controller.stride
+    if periods < 1:
+        raise ValueError(f"reference must be longer than the horizon, got {len(reference)} samples")
+    checks.unit_quaternions("x0", x0)
+    checks.unit_quaternions("reference", reference)
+    x0, reference, plan = promote(x0, reference, controller.begin())
 
     def tick(carry, i):
         x, plan, estimate = carry
@@ -93,9 +100,6 @@ def fly(
         x = plant(x, u, i * controller.period).astype(x.dtype)
         return (x, plan, estimate), (x, u, plan, estimate.disturbance)
 
-    checks.unit_quaternions("x0", x0)
-    checks.unit_quaternions("reference", reference)
-    x0, reference, plan = promote(x0, reference, controller.begin())
     start = (x0, plan, observer.begin(x0))
     _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))
     return Flight(jnp.concatenate([x0[None], x]), u, plans, disturbance)
@@ -129,12 +133,3 @@ def performance(
         ~sound.all(),
         at_limit.mean(),
     )
-
-
-def _periods(reference: Float[Array, "n 13"], x0: State, controller: Controller) -> int:
-    if x0.shape != (STATE_SIZE,) or reference.ndim != 2 or reference.shape[1] != STATE_SIZE:
-        raise ValueError(f"x0 (13,) and reference (n, 13) expected, got {x0.shape} and {reference.shape}")
-    periods = len(reference) - 1 - controller.steps * controller.stride
-    if periods < 1:
-        raise ValueError(f"reference must be longer than the horizon, got {len(reference)} samples")
-    return periods

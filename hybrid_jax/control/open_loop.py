@@ -54,22 +54,18 @@ def open_loop_costs(
     return OpenLoopCosts(flight.plans.cost[chosen], actual(chosen))
 
 
-def cost_of_offset(controller: Controller, distance: float = 0.005) -> float:
-    """Cost of a plan whose every state is `distance` [m] from the reference.
+def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: float = 0.005) -> Float[Array, ""]:
+    """(actual − predicted) / predicted, each summed over the calls.
+
+    Args:
+        distance: the denominator is at least the cost of plans that stay so far [m] from the reference, because near
+            zero the ratio means nothing.
 
     Raises:
         ValueError: `distance` is not positive.
     """
     checks.positive("distance", distance)
     weights = controller.weights
-    return (controller.steps - 1 + weights.terminal**2) * (weights.position * distance) ** 2
-
-
-def relative_cost_error(costs: OpenLoopCosts, floor: float) -> Float[Array, ""]:
-    """(actual − predicted) / predicted, each summed over the calls.
-
-    Args:
-        floor: least predicted cost per call in the denominator; near zero the ratio means nothing.
-    """
+    floor = (controller.steps - 1 + weights.terminal**2) * (weights.position * distance) ** 2
     error = jnp.sum(costs.actual) - jnp.sum(costs.predicted)
     return error / jnp.maximum(jnp.sum(costs.predicted), floor * len(costs.predicted))
