@@ -29,13 +29,14 @@ from experiments.runner import command
 from experiments.runner.renamed import renamed_options
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": needed_disturbance, "always": constant_disturbance}
 
@@ -73,9 +74,9 @@ def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict
 def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console, outcome: Outcome) -> None:
     """Fly every model along every reference, before and after the changes; after them also away from home."""
     sets = {domain.name: model_set(domain, IRIS, trained, *config.ends) for domain in DOMAINS}
-    sets[SOURCE.name] = unchanged_model_set(IRIS, trained)
-    home = scenarios(config, (SOURCE, *DOMAINS), sets, [(name, 0.0) for name in config.references])
-    away = scenarios(config, DOMAINS, sets, [(name, config.away) for name in config.flown_away])
+    away = scenarios(config, sets, [(name, config.away) for name in config.flown_away])
+    sets = {SOURCE.name: unchanged_model_set(IRIS, trained), **sets}
+    home = scenarios(config, sets, [(name, 0.0) for name in config.references])
     found = fly_all(config, Controller(IRIS), [*home, *away], console)
     outcome.home, outcome.away = found[: len(home)], found[len(home) :]
 
@@ -88,21 +89,17 @@ def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -
     outcome.notes += made.notes
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
     sets = {domain.name: variants(config.ablation, domain, made.trained, own) for domain in DOMAINS}
-    outcome.ablation = fly_all(config, Controller(IRIS), scenarios(config, DOMAINS, sets, places), console)
+    outcome.ablation = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
     if "quaternion" in config.ablation:
         sets = {domain.name: unnormalised(domain, made.trained, own) for domain in DOMAINS}
         controller = Controller(IRIS, unit_quaternion=False)
-        outcome.ablation += fly_all(config, controller, scenarios(config, DOMAINS, sets, places), console)
+        outcome.ablation += fly_all(config, controller, scenarios(config, sets, places), console)
 
 
-def scenarios(
-    config: ClosedLoopConfig,
-    domains: Sequence[Domain],
-    sets: Mapping[str, ModelSet],
-    places: Sequence[tuple[str, float]],
-) -> list[Scenario]:
+def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:
     """The models of each domain along each reference at each distance from home [m]."""
-    return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in domains for place in places]
+    own = [domain for domain in (SOURCE, *DOMAINS) if domain.name in sets]
+    return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in own for place in places]
 
 
 def fly_all(

@@ -5,21 +5,11 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.rows import (
-    ERROR,
-    LEARNED,
-    ORACLE,
-    REFERENCES,
-    SOURCES,
-    UNCHANGED,
-    Agent,
-    centimetres,
-    of,
-    uncrashed,
-)
+from experiments.closed_loop.rows import LEARNED, ORACLE, REFERENCES, SOURCES, UNCHANGED, Agent, of, uncrashed
 from experiments.closed_loop.tables import gaps
 from experiments.reporting.claims import Claim, Inconclusive
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
@@ -33,24 +23,14 @@ RESOLUTION = float(np.spacing(np.float32(1.0)))  # m; of positions between 1 and
 CALL_MS, FLIGHT_MINUTES, FLIGHTS, FLIGHT_SECONDS = 1.5, 3.0, 360, 10.0
 
 
-@dataclass(frozen=True)
-class Speed:
-    """Speed of the controller and of the simulation.
+class Speed(NamedTuple):
+    """Speed of the controller with the adapted hybrid, and of the simulation."""
 
-    Attributes:
-        call_ms: processor time of one call of the controller with the adapted hybrid [ms].
-        median_ms: wall-clock time of one [ms].
-        flown_seconds: simulated, of all flights together.
-        seconds: wall-clock time of these.
-        processor_seconds: on all cores.
-        devices: number of them.
-    """
-
-    call_ms: float
-    median_ms: float
-    flown_seconds: float
-    seconds: float
-    processor_seconds: float
+    call_ms: float  # processor time of one call
+    median_ms: float  # wall-clock time of one call
+    flown_seconds: float  # simulated, of all flights together
+    seconds: float  # wall-clock time of all flights
+    processor_seconds: float  # of all flights, on all cores
     devices: int
 
 
@@ -69,9 +49,9 @@ class Evidence:
             raise Inconclusive(f"there are no flights of {agent.name}, {domain}, {REFERENCES[reference]}{away}")
         return rows
 
-    def mean(self, domain: str, reference: str, agent: Agent, distance: float = 0.0) -> float:
-        """Mean position RMSE [cm] of a `group`; infinite if a seed crashed."""
-        return centimetres(self.group(domain, reference, agent, distance))
+    def errors(self, domain: str, reference: str, agent: Agent, distance: float = 0.0) -> np.ndarray:
+        """Position RMSE [cm] of each seed; infinite for a crash."""
+        return self.group(domain, reference, agent, distance).numbers(uncrashed("position_rmse", 100.0))
 
     def references(self, agent: Agent) -> list[str]:
         """What an agent flew at home under the parameter shift."""
@@ -98,30 +78,31 @@ def claims(few: int) -> list[Claim[Evidence]]:
 
 
 def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    means = {name: [e.mean(EXTERNAL_FORCE, name, agent) for agent in (source, adapted)] for name in THREE}
-    words = [f"{REFERENCES[r]}: {' → '.join(_cm(*pair))} ({pair[0] / pair[1]:.2f} ×)" for r, pair in means.items()]
-    return all(before >= WIND_FACTOR * after for before, after in means.values()), "; ".join(words)
+    words, holds = [], []
+    for reference in THREE:
+        before, after = (e.errors(EXTERNAL_FORCE, reference, agent).mean() for agent in (source, adapted))
+        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))} ({before / after:.2f} ×)")
+        holds.append(before >= WIND_FACTOR * after)
+    return all(holds), "; ".join(words)
 
 
 def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    for reference, agent in product(THREE, (source, adapted, ORACLE)):
-        e.group(EXTERNAL_FORCE, reference, agent)
+    errors = {pair: e.errors(EXTERNAL_FORCE, *pair) for pair in product(THREE, (source, adapted, ORACLE))}
     shares = {reference: gaps(e.rows, EXTERNAL_FORCE)[adapted][reference] for reference in THREE}
     words = [
         f"{REFERENCES[r]}: {100 * s.value:.1f} % ({100 * s.low:.1f} … {100 * s.high:.1f})" for r, s in shares.items()
     ]
-    sound = all(math.isfinite(e.mean(EXTERNAL_FORCE, reference, adapted)) for reference in THREE)
+    sound = all(np.isfinite(errors[reference, adapted]).all() for reference in THREE)
     return sound and all(share.value >= GAP_SHARE for share in shares.values()), "; ".join(words)
 
 
 def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
     words, holds = [], []
     for reference in e.references(adapted):
-        before, after = (e.mean(PARAMETER_SHIFT, reference, agent) for agent in (source, adapted))
-        rows = (e.group(PARAMETER_SHIFT, reference, agent) for agent in (source, adapted))
-        errors = [list(group.numbers(ERROR)) for group in rows]
-        interval = mean_difference(errors[1], errors[0])
-        significant = not math.isnan(interval.low) and not interval.low <= 0 <= interval.high
+        errors = [e.errors(PARAMETER_SHIFT, reference, agent) for agent in (adapted, source)]
+        after, before = (values.mean() for values in errors)
+        interval = mean_difference(list(errors[0]), list(errors[1]))
+        significant = interval.low > 0 or interval.high < 0
         remark = ", equal" if _equal(before, after) else ", significant" if significant else ""
         words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))}{remark}")
         holds.append(after <= before or _equal(before, after))
@@ -151,7 +132,7 @@ def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
     agents = adapted, replace(source, observer=True), replace(adapted, observer=True)
     words, holds = [], []
     for domain, reference in product((PARAMETER_SHIFT, EXTERNAL_FORCE), THREE):
-        *single, both = (e.mean(domain, reference, agent) for agent in agents)
+        *single, both = (e.errors(domain, reference, agent).mean() for agent in agents)
         texts, equal = _cm(*single, both), _equal(both, min(single))
         where = f"{LABELS[domain]}, {REFERENCES[reference]}"
         words.append(f"{where}: {texts[0]}, {texts[1]} → {texts[2]}{', equal' if equal else ''}")
@@ -165,7 +146,7 @@ def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
         raise Inconclusive("nothing was flown away from home")
     words, holds = [], []
     for domain, reference, distance in places:
-        home, away = (e.mean(domain, reference, adapted, d) for d in (0.0, distance))
+        home, away = (e.errors(domain, reference, adapted, d).mean() for d in (0.0, distance))
         words.append(f"{LABELS[domain]}, {REFERENCES[reference]}: {' → '.join(_cm(home, away))}")
         holds.append(away <= AWAY_FACTOR * home)
     return all(holds), "; ".join(words)

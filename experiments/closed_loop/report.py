@@ -164,7 +164,7 @@ def _figures(
             drawn = partial(figures.ablation, ablated, domain)
             yield f"ablation_{domain}", f"Ablation of the invariant residual, {name}", drawn
     costs = partial(figures.open_loop_costs, rows, (Agent("nominal"), *sources, *adapted, ORACLE))
-    yield "promises", "Predicted and actual open-loop cost of plans", costs
+    yield "open_loop_costs", "Predicted and actual open-loop cost of plans", costs
     yield "away", "The same flights away from home", partial(figures.away_from_home, rows)
     yield "strip", "Hover in the wind; the red mark is the reference", partial(rendered, outcome.home, few)
 

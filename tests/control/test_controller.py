@@ -117,7 +117,7 @@ def test_plan_cost_equals_its_rollout_and_is_stationary(still):
 
     value, slope = cost(plan.variables)
     np.testing.assert_allclose(value, plan.cost, rtol=1e-5)
-    begin = np.abs(cost(CONTROLLER.begin().free)[1]).max()
+    begin = np.abs(cost(CONTROLLER.begin().variables)[1]).max()
     assert np.abs(slope).max() < 1e-4 * begin
 
 

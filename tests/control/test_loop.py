@@ -44,7 +44,7 @@ REFERENCES = [sample(path, CONTROLLER, SECONDS) for path in (hover(), figure_eig
 
 @pytest.mark.parametrize(("i", "allowed"), [(0, 0.001), (1, 0.001), (2, 0.005), (3, 0.002)])
 def test_true_model_tracks_the_reference(i, allowed):
-    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans have steps of 50 ms, the plant 10 ms."""
+    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
     _, found = alone(jnp.zeros(6), REFERENCES[i], REFERENCES[i][0], 0.0)
     assert found.position_rmse < allowed
     assert found.yaw_rmse < 0.002
