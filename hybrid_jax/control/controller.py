@@ -34,17 +34,11 @@ INITIAL_DAMPING, MAX_DAMPING = 10.0, 1e8
 
 
 class Plan(eqx.Module):
-    """State of the controller between calls.
+    """State of the controller between calls."""
 
-    Attributes:
-        variables: decision variables; tanh maps them to shares of the rotor speeds' range, held over each interval.
-        cost: predicted by the controller's model.
-        damping: of the best Gauss–Newton step.
-    """
-
-    variables: Float[Array, "t 4"]
-    cost: Scalar
-    damping: Scalar
+    variables: Float[Array, "t 4"]  # tanh maps them to shares of the rotor speeds' range, held over each interval
+    cost: Scalar  # predicted by the controller's model
+    damping: Scalar  # of the best Gauss–Newton step
 
 
 class _Point(eqx.Module):
@@ -66,30 +60,19 @@ def promote(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[Stat
 class Controller:
     """Model predictive controller. It holds hyper-parameters only; the plan is passed in and returned.
 
-    Attributes:
-        vehicle: gives the limits and the initial guess, hover; the dynamics are those of the model passed to a call.
-        weights: of the cost.
-        steps: intervals of the horizon.
-        interval: length of one [s]; one step of RK4.
-        period: time between two calls [s].
-        iterations: Gauss–Newton steps per call.
-        damping: lower bound of the damping.
-        min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
-        unit_quaternion: normalise the quaternion after each step of the prediction.
-
     Raises:
         ValueError: an argument is of another type or out of range, or `interval` is no multiple of `period`.
     """
 
-    vehicle: Vehicle
-    weights: Weights = field(default_factory=Weights)
-    steps: int = 20
-    interval: float = 0.05
-    period: float = 0.01
-    iterations: int = 1
-    damping: float = 1e-3
-    min_speed: float = 0.0
-    unit_quaternion: bool = True
+    vehicle: Vehicle  # gives the limits and the initial guess, hover; the model passed to a call gives the dynamics
+    weights: Weights = field(default_factory=Weights)  # of the cost
+    steps: int = 20  # intervals of the horizon
+    interval: float = 0.05  # length of one [s]; one step of RK4
+    period: float = 0.01  # time between two calls [s]
+    iterations: int = 1  # Gauss–Newton steps per call
+    damping: float = 1e-3  # lower bound of the damping
+    min_speed: float = 0.0  # lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's
+    unit_quaternion: bool = True  # normalise the quaternion after each step of the prediction
 
     def __post_init__(self):
         for name, kind in (("vehicle", Vehicle), ("weights", Weights)):

@@ -23,37 +23,22 @@ SATURATION_MARGIN = 0.01
 
 
 class Flight(eqx.Module):
-    """A closed-loop flight of t periods.
+    """A closed-loop flight of t periods."""
 
-    Attributes:
-        x: states, the initial one first.
-        u: rotor speeds held over each period [rad/s].
-        plans: the controller's plan at each call.
-        disturbance: the observer's estimate at each call, see `observer.Estimate`.
-    """
-
-    x: Float[Array, "*n t+1 13"]
-    u: Float[Array, "*n t 4"]
-    plans: Plan
-    disturbance: Float[Array, "*n t 6"]
+    x: Float[Array, "*n t+1 13"]  # states, the initial one first
+    u: Float[Array, "*n t 4"]  # rotor speeds held over each period, rad/s
+    plans: Plan  # of the controller at each call
+    disturbance: Float[Array, "*n t 6"]  # of the observer at each call, see `observer.Estimate`
 
 
 class Performance(eqx.Module):
-    """Tracking performance of a flight.
+    """Tracking performance of a flight."""
 
-    Attributes:
-        position_rmse: [m].
-        yaw_rmse: [rad].
-        largest_error: of position [m].
-        crashed: it went below the ground or too far from the reference, or became not finite.
-        saturation: share of the rotor speeds at a limit.
-    """
-
-    position_rmse: Scalar
-    yaw_rmse: Scalar
-    largest_error: Scalar
-    crashed: Bool[Array, ""]
-    saturation: Scalar
+    position_rmse: Scalar  # m
+    yaw_rmse: Scalar  # rad
+    largest_error: Scalar  # of position, m
+    crashed: Bool[Array, ""]  # below the ground, too far from the reference, or not finite
+    saturation: Scalar  # share of the rotor speeds at a limit
 
 
 def fly(

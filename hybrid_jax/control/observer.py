@@ -17,15 +17,10 @@ from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY, Input, State
 
 
 class Estimate(eqx.Module):
-    """State of the observer.
+    """State of the observer."""
 
-    Attributes:
-        disturbance: d, acceleration [m/s², world] and angular acceleration [rad/s², body].
-        expected: predicted v [m/s] and ω [rad/s] at the next sample.
-    """
-
-    disturbance: Float[Array, "6"]
-    expected: Float[Array, "6"]
+    disturbance: Float[Array, "6"]  # d: acceleration [m/s², world] and angular acceleration [rad/s², body]
+    expected: Float[Array, "6"]  # v [m/s] and ω [rad/s] predicted for the next sample
 
 
 def begin(x: State) -> Estimate:

@@ -18,15 +18,10 @@ from hybrid_jax.control.loop import Flight, Plant
 
 
 class OpenLoopCosts(NamedTuple):
-    """Costs of the plans of some calls of a flight.
+    """Costs of the plans of some calls of a flight."""
 
-    Attributes:
-        predicted: by the controller's model.
-        actual: of the same inputs in the plant.
-    """
-
-    predicted: Float[Array, " c"]
-    actual: Float[Array, " c"]
+    predicted: Float[Array, " c"]  # by the controller's model
+    actual: Float[Array, " c"]  # of the same inputs in the plant
 
 
 def actual_cost(
@@ -57,9 +52,8 @@ def open_loop_costs(
 def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: float = 0.005) -> Float[Array, ""]:
     """(actual − predicted) / predicted, each summed over the calls.
 
-    Args:
-        distance: the denominator is at least the cost of plans that stay so far [m] from the reference, because near
-            zero the ratio means nothing.
+    The denominator is at least the cost of plans that stay `distance` [m] from the reference, because near zero the
+    ratio means nothing.
 
     Raises:
         ValueError: `distance` is not positive.

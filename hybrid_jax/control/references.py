@@ -82,8 +82,8 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
     """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
-    checks.number("altitude", altitude)
-    checks.number("yaw", yaw)
+    for name, value in (("altitude", altitude), ("yaw", yaw)):
+        checks.number(name, value)
     rate = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):
