@@ -28,20 +28,13 @@ MADE_BY = ("jax", "hybrid_jax")
 
 @dataclass(frozen=True)
 class Flown:
-    """The results of a scenario.
-
-    Attributes:
-        arrays: name of each quantity → its values, one per flight; see `runner.simulate`.
-        seconds: wall-clock time of the simulation, without compiling.
-        processor_seconds: on all cores.
-        devices: number of them.
-    """
+    """The results of a scenario."""
 
     scenario: Scenario
-    arrays: Arrays
-    seconds: float
-    processor_seconds: float
-    devices: int
+    arrays: Arrays  # by name, one value per flight; see `runner.simulate`
+    seconds: float  # wall-clock time of the simulation, without compiling
+    processor_seconds: float  # on all cores
+    devices: int  # number of them
 
     def rows(self) -> list[dict[str, Any]]:
         """One row per flight: its tags, NUMBERS, and whether it crashed."""

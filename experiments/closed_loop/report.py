@@ -63,14 +63,7 @@ unchanged vehicle, on which the source networks were trained.
 
 @dataclass
 class Outcome:
-    """All results of the experiment.
-
-    Attributes:
-        home, away, ablation: flown scenarios.
-        speeds: by model, see `timing.on_one_core`.
-        seconds: of the stages of training.
-        notes: on these.
-    """
+    """All results: flown scenarios, times of a call by model, seconds of the stages of training, and notes on these."""
 
     home: list[Flown] = field(default_factory=list)
     away: list[Flown] = field(default_factory=list)

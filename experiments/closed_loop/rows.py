@@ -33,18 +33,14 @@ KNOWN = {"nominal": "nominal physics", "oracle": "true vehicle, mean wind"}
 class Agent:
     """A controller with its prediction model.
 
-    Attributes:
-        model: a key of KNOWN or LEARNED. "invariant" has a translation- and yaw-invariant residual; "least_squares" is
-            its source model with θ_p and a constant disturbance refitted.
-        n_train: target trajectories for adaptation; 0 for a source model.
-        observer: with a disturbance observer.
-        variant: of the model or the controller, in an ablation; else empty.
+    "invariant" has a translation- and yaw-invariant residual; "least_squares" is its source model with θ_p and a
+    constant disturbance refitted.
     """
 
-    model: str
-    n_train: int = 0
-    observer: bool = False
-    variant: str = ""
+    model: str  # a key of KNOWN or LEARNED
+    n_train: int = 0  # target trajectories for adaptation; 0 for a source model
+    observer: bool = False  # with a disturbance observer
+    variant: str = ""  # of the model or the controller, in an ablation
 
     @property
     def name(self) -> str:

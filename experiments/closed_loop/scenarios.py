@@ -39,39 +39,25 @@ PATHS: Mapping[str, Path] = {
 
 
 class Flight(NamedTuple):
-    """The arrays that define one flight.
+    """The arrays that define one flight."""
 
-    Attributes:
-        model: prediction model.
-        vehicle: the true one.
-        shares: of each of FORCES, 1 where it acts.
-        path: index into PATHS.
-        home: offset of the reference [m, world].
-        bandwidth: of the disturbance observer [rad/s]; 0 for none.
-    """
-
-    model: AbstractVectorField
-    vehicle: Parameters
-    shares: Float[Any, " f"]
-    path: Int[Any, ""]
-    home: Float[Any, "3"]
-    bandwidth: Float[Any, ""]
+    model: AbstractVectorField  # of the controller
+    vehicle: Parameters  # the true one
+    shares: Float[Any, " f"]  # of each of FORCES, 1 where it acts
+    path: Int[Any, ""]  # index into PATHS
+    home: Float[Any, "3"]  # offset of the reference [m, world]
+    bandwidth: Float[Any, ""]  # of the disturbance observer [rad/s]; 0 for none
 
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flights of a set of models in one domain along one of PATHS.
-
-    Attributes:
-        distance: from home [m], equally far in x and y.
-        bandwidth: of the disturbance observers [rad/s].
-    """
+    """Flights of a set of models in one domain along one of PATHS."""
 
     domain: Domain
     reference: str
-    distance: float
+    distance: float  # from home [m], equally far in x and y
     models: ModelSet
-    bandwidth: float
+    bandwidth: float  # of the disturbance observers [rad/s]
 
     @property
     def name(self) -> str:
