@@ -1,7 +1,6 @@
 """Tables, hypotheses and figures of closed-loop flight, on rows with known numbers."""
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -151,7 +150,7 @@ def test_errors_that_differ_by_rounding_are_equal():
 
 
 def test_speed_hypotheses_compare_measured_times():
-    slow = holds(ROWS, replace(SPEED, call_ms=1.6, seconds=200.0))
+    slow = holds(ROWS, SPEED._replace(call_ms=1.6, seconds=200.0))
     assert (slow["R7"], slow["R8"]) == (False, False)
     assert holds(ROWS, None)["R7"] is None
 
