@@ -41,8 +41,10 @@ class Flown:
         place = {"domain": self.scenario.domain.name}
         where = {"reference": self.scenario.reference, "distance": self.scenario.distance}
         return [
-            {**place, **of(agent), **where, "seed": seed, "crashed": bool(self.arrays["crashed"][i])}
-            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS}
+            {**place, **of(agent), **where, "seed": seed}
+            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS[:3]}
+            | {"crashed": bool(self.arrays["crashed"][i])}
+            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS[3:]}
             for i, (agent, seed) in enumerate(self.scenario.keys())
         ]
 
