@@ -1,86 +1,89 @@
-"""What makes a network safe for control, one option at a time: what it reads and writes, and how it is flown."""
+"""Ablation of the invariant residual: its inputs and outputs, its adaptation, and the normalised quaternion."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
-from typing import Any, Literal
+from typing import Literal, NamedTuple
 
 from rich.console import Console
 
-from experiments.closed_loop.common_field import CommonField
-from experiments.closed_loop.models import Trained, in_common, train, with_statistics_of
-from experiments.closed_loop.rows import Flyer
+from experiments.closed_loop.models import Trained, fused, train, with_statistics_of
+from experiments.closed_loop.rows import Agent
+from experiments.closed_loop.scenarios import ModelSet
 from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.vehicle import Vehicle
 
 Option = Literal["networks", "offset", "statistics", "quaternion"]
-PAPER, SAFE = "paper: all of x → all 13", "safe: no p_x, p_y, yaw → v̇, ω̇"
+PAPER, INVARIANT = "paper: all of x → all 13", "invariant: no p_x, p_y, yaw → v̇, ω̇"
 NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
     PAPER: ("all", "all"),
     "no p_x, p_y → all 13": ("no_xy", "all"),
     "all of x → v̇, ω̇": ("all", "accelerations"),
     "no p_x, p_y → v̇, ω̇": ("no_xy", "accelerations"),
-    SAFE: ("no_xy_yaw", "accelerations"),
+    INVARIANT: ("no_xy_yaw", "accelerations"),
 }
-COMPARED = (PAPER, SAFE)  # of what more is undone than what they read and write
-SLOW = "safe, its output bias as slow as the rest"
+COMPARED = (PAPER, INVARIANT)  # the networks to which the other options apply
+SLOW = "invariant, output bias at the common rate"
 
 
-def networks(
+class Ablation(NamedTuple):
+    """Trained networks by name, the seconds of their stages, and notes on these."""
+
+    trained: dict[str, Trained]
+    seconds: dict[str, float]
+    notes: list[str]
+
+
+def train_networks(
     options: Sequence[Option], vehicle: Vehicle, config: Config, console: Console, domains: Sequence[Domain]
-) -> tuple[dict[str, Trained], dict[str, float], list[str]]:
-    """The trained networks by name, the seconds of their stages, and notes on these."""
-    asked = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
+) -> Ablation:
+    """Train the networks that these options compare."""
+    wanted = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
     if "offset" in options:
-        asked[SLOW] = NETWORKS[SAFE]
-    trained, seconds, notes = {}, {}, []
-    for name, (inputs, outputs) in asked.items():
-        # What writes all derivatives is adapted as the paper does it.
+        wanted[SLOW] = NETWORKS[INVARIANT]
+    made = Ablation({}, {}, [])
+    for name, (inputs, outputs) in wanted.items():
+        # A network that writes all derivatives is adapted as in the paper.
         fast = outputs == "accelerations" and name != SLOW
         rates = replace(config.rates, offset=config.rates.offset if fast else None)
-        other = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
-        trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, other, console, domains)
-        seconds |= {f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()}
-        notes += [f"{name}: {note}" for note in stages.notes()]
-    return trained, seconds, notes
+        own = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
+        made.trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, own, console, domains)
+        made.seconds.update({f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()})
+        made.notes.extend(f"{name}: {note}" for note in stages.notes())
+    return made
 
 
-def variants(
-    options: Sequence[Option], domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], config: Config
-) -> dict[Flyer, CommonField]:
-    """What flies with the usual controller: each network, with the statistics of the source, and not adapted at all,
-    but with an observer.
+def variants(options: Sequence[Option], domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:
+    """Models for the usual controller: each network adapted, with the statistics of the source, and unadapted with an
+    observer.
     """
     (few,) = config.sizes
-    fields: dict[Flyer, Any] = {flyer(name, few): found.adapted[domain.name, few] for name, found in trained.items()}
-    if "statistics" in options and config.norm == "batch":
+
+    def models() -> Iterator[tuple[Agent, AbstractVectorField]]:
+        for name, found in trained.items():
+            yield _agent(name, few), found.adapted[domain.name, few]
+        if "statistics" in options and config.norm == "batch":
+            for name in COMPARED:
+                wrong = with_statistics_of(trained[name].source, trained[name].adapted[domain.name, few])
+                yield _agent(f"{_short(name)}, batch statistics of the source", few), wrong
         for name in COMPARED:
-            field = trained[name].adapted[domain.name, few]
-            wrong = with_statistics_of(trained[name].source, field)
-            fields[flyer(with_change(name, "batch statistics of the source"), few)] = wrong
-    for name in COMPARED:
-        unadapted = flyer(with_change(name, "not adapted, + observer"), 0)
-        fields[replace(unadapted, observer=True)] = trained[name].source
-    return {who: in_common(field, vehicle, config) for who, field in fields.items()}
+            agent = _agent(f"{_short(name)}, not adapted, + observer", 0)
+            yield replace(agent, observer=True), trained[name].source
+
+    return {agent: fused(field) for agent, field in models()}
 
 
-def unnormalised(
-    domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], config: Config
-) -> dict[Flyer, CommonField]:
-    """What flies with a controller whose predictions let the quaternion's length drift."""
+def unnormalised(domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:
+    """Models for a controller that does not renormalise the quaternion in its predictions."""
     (few,) = config.sizes
     fields = {name: trained[name].adapted[domain.name, few] for name in COMPARED}
-    return {
-        flyer(with_change(name, "|q| not renormalised"), few): in_common(field, vehicle, config)
-        for name, field in fields.items()
-    }
+    return {_agent(f"{_short(name)}, |q| not renormalised", few): fused(field) for name, field in fields.items()}
 
 
-def with_change(name: str, change: str) -> str:
-    """The name of a network of which something else was changed."""
-    return f"{name.partition(':')[0]}, {change}"
+def _short(name: str) -> str:
+    return name.partition(":")[0]
 
 
-def flyer(name: str, few: int) -> Flyer:
-    """A network under its name."""
-    return Flyer("safe" if name.startswith("safe") else "hybrid", few, variant=name)
+def _agent(variant: str, n_train: int) -> Agent:
+    return Agent("invariant" if variant.startswith("invariant") else "hybrid", n_train, variant=variant)

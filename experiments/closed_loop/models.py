@@ -1,4 +1,4 @@
-"""What flies: every model of the closed loop, trained or known, by who it is; all stages come from the shared cache."""
+"""Train or load every prediction model of the closed loop; all stages come from the shared cache."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -9,16 +9,15 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments.closed_loop.common_field import Believed, CommonField, common, true_field
-from experiments.closed_loop.rows import SOURCES, Flyer
-from experiments.paper.conditions import input_scaling
+from experiments.closed_loop.rows import SOURCES, Agent
+from experiments.closed_loop.scenarios import ModelSet
+from experiments.closed_loop.true_model import true_field
 from experiments.paper.config import Config
 from experiments.paper.solved import Solve, solved
 from experiments.paper.study import adapted, flown, places, pretrained, source_splits, target_splits
 from experiments.runner.stages import Stages, stages_of
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep.lanes import lane
@@ -27,7 +26,7 @@ from hybrid_jax.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class Trained:
-    """A model before and after adaptation, one lane a seed; `adapted` by domain and N."""
+    """A model before and after adaptation, stacked over seeds; `adapted` by domain and N."""
 
     source: AbstractVectorField
     adapted: dict[tuple[str, int], AbstractVectorField]
@@ -39,8 +38,8 @@ def train(
     """Pre-train a model and adapt it to each domain.
 
     Args:
-        name: of the stages, for people.
-        model: what `experiments.paper.conditions` calls it.
+        name: printed above the stages.
+        model: id in `experiments.paper.conditions`.
     """
     console.print(name, style="bold", highlight=False)
     stages = stages_of(config, console)
@@ -55,96 +54,82 @@ def train(
     return Trained(start, found), stages
 
 
-def nine_numbers(
-    source: AbstractVectorField, few: int, solve: Solve, config: Config, console: Console, domains: Sequence[Domain]
+def least_squares(
+    source: AbstractVectorField, size: int, solve: Solve, config: Config, console: Console, domains: Sequence[Domain]
 ) -> tuple[Trained, Stages]:
-    """Hybrids of the source, of which θ_p and a constant disturbance are fitted to each domain by least squares.
+    """Fit θ_p and a constant disturbance of the source models to each domain by least squares.
 
     Args:
         solve: `needed_disturbance` or `constant_disturbance`.
     """
-    stages, own = stages_of(config, console), replace(config, sizes=(few,))
+    stages, own = stages_of(config, console), replace(config, sizes=(size,))
 
-    def of(domain: Domain) -> AbstractVectorField:
+    def fit(domain: Domain) -> AbstractVectorField:
         target = flown(domain, target_splits(config), config, stages)
         return solved(f"least squares {domain.name}", solve, source, own, stages, target).fields
 
-    return Trained(source, {(domain.name, few): of(domain) for domain in domains}), stages
+    return Trained(source, {(domain.name, size): fit(domain) for domain in domains}), stages
 
 
-def disturbed_seeds(nine: Trained) -> list[str]:
-    """How many seeds of each domain have a constant disturbance, in words."""
-    fields: dict[tuple[str, int], Any] = {**nine.adapted}
-    pushes = {domain: field.physics.residual.value for (domain, _), field in fields.items()}
-    counts = {domain: np.any(np.asarray(push) != 0, axis=1) for domain, push in pushes.items()}
+def disturbance_counts(fitted: Trained) -> list[str]:
+    """For each domain a sentence on how many seeds have a constant disturbance."""
+    fields: dict[tuple[str, int], Any] = {**fitted.adapted}
+    values = {domain: np.asarray(field.physics.residual.value) for (domain, _), field in fields.items()}
+    counts = {domain: np.any(value != 0, axis=1) for domain, value in values.items()}
     return [f"{domain}: {found.sum()} of {len(found)} seeds have a disturbance." for domain, found in counts.items()]
 
 
-def fleet(
-    domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], few: int, many: int, config: Config
-) -> dict[Flyer, Believed]:
-    """All that flies in a domain: a lane for each seed, or one of a model that was not trained.
+def model_set(domain: Domain, vehicle: Vehicle, trained: dict[str, Trained], few: int, many: int) -> ModelSet:
+    """All models that fly in a target domain, by agent.
 
     Args:
-        trained: "physics", "hybrid", "no_physics", "safe", "nine".
+        trained: by id in `rows.LEARNED`.
+        few, many: numbers of target trajectories.
     """
-    fields: dict[Flyer, Any] = {Flyer("nominal"): single(rigid_body(vehicle))}
+    fields: dict[Agent, Any] = {Agent("nominal"): as_stack(rigid_body(vehicle))}
     for model, found in trained.items():
-        if model in ("hybrid", "safe"):
-            fields[Flyer(model)] = found.source
-        sizes = (few,) if model in ("physics", "nine") else dict.fromkeys((few, many))
-        fields |= {Flyer(model, size): found.adapted[domain.name, size] for size in sizes}
-    adapted = [Flyer(model, few) for model in SOURCES]
-    return _crew(domain, vehicle, fields, [Flyer("nominal"), *_sources(), *adapted], config)
+        if model in SOURCES.values():
+            fields[Agent(model)] = found.source
+        sizes = (few,) if model in ("physics", "least_squares") else dict.fromkeys((few, many))
+        fields |= {Agent(model, size): found.adapted[domain.name, size] for size in sizes}
+    observed = [Agent("nominal"), *_sources(), *(Agent(model, few) for model in SOURCES)]
+    return _complete(domain, vehicle, fields, observed)
 
 
-def unchanged_fleet(vehicle: Vehicle, trained: dict[str, Trained], config: Config) -> dict[Flyer, Believed]:
-    """All that flies the vehicle of the source, which has not changed: what was not adapted.
-
-    Args:
-        trained: as of `fleet`.
-    """
-    fields = {Flyer("nominal"): single(rigid_body(vehicle))}
-    fields |= {flyer: trained[flyer.model].source for flyer in _sources()}
-    return _crew(SOURCE, vehicle, fields, list(fields), config)
+def unchanged_model_set(vehicle: Vehicle, trained: dict[str, Trained]) -> ModelSet:
+    """All models that fly the vehicle before the change: those that were not adapted."""
+    fields = {Agent("nominal"): as_stack(rigid_body(vehicle))}
+    fields |= {agent: trained[agent.model].source for agent in _sources()}
+    return _complete(SOURCE, vehicle, fields, list(fields))
 
 
-def _sources() -> list[Flyer]:
+def _sources() -> list[Agent]:
     """The hybrids before adaptation."""
-    return [Flyer(model) for model in dict.fromkeys(SOURCES.values())]
+    return [Agent(model) for model in dict.fromkeys(SOURCES.values())]
 
 
-def _crew(
-    domain: Domain, vehicle: Vehicle, fields: dict[Flyer, Any], observed: Sequence[Flyer], config: Config
-) -> dict[Flyer, Believed]:
-    """These fields, those `observed` with an observer as well, and the true one."""
-    models = {flyer: in_common(field, vehicle, config) for flyer, field in fields.items()}
-    models |= {replace(flyer, observer=True): models[flyer] for flyer in observed}
-    return models | {Flyer("oracle"): single(true_field(domain, vehicle))}
+def _complete(domain: Domain, vehicle: Vehicle, fields: dict[Agent, Any], observed: Sequence[Agent]) -> ModelSet:
+    """These models, those `observed` also with an observer, and the true one."""
+    models = {agent: fused(field) for agent, field in fields.items()}
+    models |= {replace(agent, observer=True): models[agent] for agent in observed}
+    return models | {Agent("oracle"): as_stack(true_field(domain, vehicle))}
 
 
-def in_common(fields: AbstractVectorField, vehicle: Vehicle, config: Config) -> CommonField:
-    """Stacked fields as stacked lanes of the common form."""
-    return jax.device_get(_in_common(fields, vehicle, config.hidden, input_scaling(vehicle, config)))
+def fused(fields: AbstractVectorField) -> AbstractVectorField:
+    """Stacked fields in their inference layout, on the host."""
+    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(fuse_for_inference))(fields))
 
 
-@eqx.filter_jit
-def _in_common(fields, vehicle: Vehicle, hidden: int, scaling: InputScaling) -> CommonField:
-    return eqx.filter_vmap(lambda field: common(field, vehicle, hidden, scaling))(fields)
-
-
-def single(field: Any) -> Any:
+def as_stack(field: Any) -> Any:
     """One field as a stack of one."""
     return jax.tree.map(lambda leaf: np.asarray(leaf)[None], field)
 
 
 def with_statistics_of(source: AbstractVectorField, field: AbstractVectorField) -> AbstractVectorField:
-    """The field with the running statistics of batch normalisation of another one: the trap of the wrong domain."""
+    """The field with the running batch-norm statistics of `source`."""
 
-    def norms(tree) -> list[BatchNorm]:
+    def running(tree) -> list:
         nodes = jax.tree.leaves(tree, is_leaf=lambda node: isinstance(node, BatchNorm))
-        return [node for node in nodes if isinstance(node, BatchNorm)]
+        return [node.running for node in nodes if isinstance(node, BatchNorm)]
 
-    return eqx.tree_at(
-        lambda tree: [norm.running for norm in norms(tree)], field, [norm.running for norm in norms(source)]
-    )
+    return eqx.tree_at(running, field, running(source))

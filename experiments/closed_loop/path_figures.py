@@ -1,4 +1,4 @@
-"""Flights beside their reference: the path over the ground and the distance from it over time."""
+"""Figures of single flights: the path, the distance from the reference over time, and rendered images."""
 
 import math
 from collections.abc import Mapping, Sequence
@@ -6,30 +6,30 @@ from collections.abc import Mapping, Sequence
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from experiments.closed_loop.figures import TINTS, floored
-from experiments.closed_loop.rows import REFERENCES, Flyer
-from experiments.paper.figures import STYLE
-from experiments.reporting.error_panels import tick_errors
+from experiments.closed_loop.figures import COLOURS_OF, floor_note
+from experiments.closed_loop.rows import KNOWN, REFERENCES, Agent
+from experiments.reporting.plots import STYLE, tick_errors
 from hybrid_jax.state import POSITION
 
 States = Float[np.ndarray, "t 13"]
-FURTHEST = 300.0  # cm: a flight that is lost is cut there
-NEAREST = 0.02  # cm
-ABOVE = [0, 1]  # x, y
-VIEWS = {"low_pass": [0, 2]}  # x, z: its height is what matters
+Images = UInt8[np.ndarray, "k h w 3"]
+LARGEST_ERROR, SMALLEST_ERROR = 300.0, 0.02  # cm: errors are clipped to these
+TOP_VIEW = [0, 1]  # x, y
+VIEWS = {"low_pass": [0, 2]}  # x, z: the altitude matters
 
 
 @mpl.rc_context(STYLE)
 def paths(
-    flights: Mapping[str, Mapping[Flyer, States]], references: Mapping[str, States], dt: float, title: str
+    flights: Mapping[str, Mapping[Agent, States]], references: Mapping[str, States], dt: float, title: str
 ) -> Figure:
-    """A row for each reference: left from above, right the distance from the reference.
+    """A row per reference: left the path, right the distance from the reference.
 
     Args:
-        flights: reference → who flew → states every dt [s].
-        references: the states wanted, at the same times.
+        flights: reference → agent → states every dt [s].
+        references: reference states at the same times.
 
     Raises:
         ValueError: no flights.
@@ -38,60 +38,58 @@ def paths(
         raise ValueError("flights must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 0.9 + 2.9 * len(flights)), layout="constrained")
     panels = figure.subplots(len(flights), 2, squeeze=False, width_ratios=(1, 1.25))
-    nearest = math.inf
-    for (above, beside), (reference, flown) in zip(panels, flights.items(), strict=True):
+    smallest = math.inf
+    for (left, right), (reference, flown) in zip(panels, flights.items(), strict=True):
         wanted = references[reference][:, POSITION]
-        seen = VIEWS.get(reference, ABOVE)
-        above.plot(*wanted[:, seen].T, color="0.6", linestyle="--", linewidth=2.5, label="reference")
-        for flyer, states in flown.items():
-            place = states[:, POSITION]
-            style = {"color": TINTS[flyer.model], "linestyle": _dash(flyer), "label": flyer.name}
-            above.plot(*place[:, seen].T, linewidth=1.2, **style)
-            error = 100 * np.linalg.norm(place - wanted, axis=1)
-            nearest = np.fmin(nearest, np.nanmin(error))
-            error = np.clip(error, NEAREST, FURTHEST)
-            beside.plot(dt * np.arange(len(error)), error, linewidth=1.2, **style)
-        _frame(above, wanted[:, seen], level=seen == ABOVE)
-        side = "from above" if seen == ABOVE else "from the side"
-        above.set(xlabel="x [m]", ylabel=f"{'xyz'[seen[1]]} [m]", title=f"{REFERENCES[reference]}: {side}")
-        beside.set(yscale="log", xlabel="time [s]", ylabel="[cm]", title="distance from the reference (log scale)")
-        tick_errors(beside.yaxis, *beside.get_ylim())
+        view = VIEWS.get(reference, TOP_VIEW)
+        left.plot(*wanted[:, view].T, color="0.6", linestyle="--", linewidth=2.5, label="reference")
+        for agent, states in flown.items():
+            style = {"color": COLOURS_OF[agent.model], "linestyle": _dash(agent), "label": agent.name}
+            left.plot(*states[:, POSITION][:, view].T, linewidth=1.2, **style)
+            error = 100 * np.linalg.norm(states[:, POSITION] - wanted, axis=1)
+            smallest = np.fmin(smallest, np.nanmin(error))
+            error = np.clip(error, SMALLEST_ERROR, LARGEST_ERROR)
+            right.plot(dt * np.arange(len(error)), error, linewidth=1.2, **style)
+        _frame(left, wanted[:, view], top=view == TOP_VIEW)
+        side = "from above" if view == TOP_VIEW else "from the side"
+        left.set(xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]", title=f"{REFERENCES[reference]}: {side}")
+        right.set(yscale="log", xlabel="time [s]", ylabel="[cm]", title="distance from the reference (log scale)")
+        tick_errors(right.yaxis, *right.get_ylim())
     handles, labels = panels[0, 0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    words = floored(nearest, NEAREST, " (")
-    figure.suptitle(title + (f"{words})" if words else ""), fontsize=12)
+    figure.suptitle(title + floor_note(smallest, SMALLEST_ERROR, " (", ")"), fontsize=12)
     return figure
 
 
 @mpl.rc_context(STYLE)
-def strip(
-    frames: Mapping[str, UInt8[np.ndarray, "k h w 3"]], times: Sequence[float], errors: Mapping[str, Sequence[float]],
-    title: str,
-) -> Figure:  # fmt: skip
-    """Rendered frames, a row for each flight, a column for each time [s], under each its distance from the mark [m].
+def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence[float], title: str) -> Figure:
+    """Rendered images: a row per flight, a column per time [s].
+
+    Args:
+        flights: name → images, and the distance from the mark [m] in each.
 
     Raises:
         ValueError: no flights.
     """
-    if not frames:
-        raise ValueError("frames must not be empty: there is nothing to draw")
-    figure = Figure(figsize=(1.75 * len(times) + 0.6, 1.75 * len(frames) + 0.5), layout="constrained")
-    panels = figure.subplots(len(frames), len(times), squeeze=False)
-    for i, (row, (name, images)) in enumerate(zip(panels, frames.items(), strict=True)):
-        for axes, image, t, error in zip(row, images, times, errors[name], strict=True):
+    if not flights:
+        raise ValueError("flights must not be empty: there is nothing to draw")
+    figure = Figure(figsize=(1.75 * len(times) + 0.6, 1.75 * len(flights) + 0.5), layout="constrained")
+    panels = figure.subplots(len(flights), len(times), squeeze=False)
+    for row, (name, (images, errors)) in zip(panels, flights.items(), strict=True):
+        for axes, image, error in zip(row, images, errors, strict=True):
             axes.imshow(image)
             axes.set(xticks=[], yticks=[], xlabel=f"{100 * error:.0f} cm off")
             axes.spines[:].set_visible(False)
-            if i == 0:
-                axes.set_title(f"{t:g} s")
         row[0].set_ylabel(name)
+    for axes, t in zip(panels[0], times, strict=True):
+        axes.set_title(f"{t:g} s")
     figure.suptitle(title, fontsize=12)
     return figure
 
 
-def _frame(axes, wanted: Float[np.ndarray, "t 2"], level: bool) -> None:
-    """The view is the reference's, so that a lost flight does not shrink the others."""
-    if not level:
+def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:
+    """Limits from the reference, so that a flight that diverges does not shrink the others."""
+    if not top:
         axes.set(xlim=(wanted[:, 0].min() - 0.5, wanted[:, 0].max() + 0.5), ylim=(0.0, 1.25 * wanted[:, 1].max()))
         return
     centre = (wanted.max(axis=0) + wanted.min(axis=0)) / 2
@@ -100,5 +98,5 @@ def _frame(axes, wanted: Float[np.ndarray, "t 2"], level: bool) -> None:
     axes.set_aspect("equal")
 
 
-def _dash(flyer: Flyer) -> str:
-    return ":" if flyer.observer else "-" if flyer.n_train or flyer.model in ("nominal", "oracle") else "--"
+def _dash(agent: Agent) -> str:
+    return ":" if agent.observer else "-" if agent.n_train or agent.model in KNOWN else "--"

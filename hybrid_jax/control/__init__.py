@@ -1,6 +1,6 @@
-"""Closed-loop flight with any vector field: a predictive controller, references, a disturbance observer, the loop.
+"""Closed-loop flight with any vector field: model predictive controller, references, disturbance observer, simulation.
 
-Your own vehicle, with a model of it and whatever turns rotor speeds into the next state, a simulator or a radio:
+An example with your own vehicle, a model of it, and a simulator or a radio link that applies the rotor speeds:
 
     import equinox as eqx
     import hybrid_jax as hj
@@ -10,7 +10,7 @@ Your own vehicle, with a model of it and whatever turns rotor speeds into the ne
         mass=0.8, inertia=(4e-3, 4e-3, 7e-3), thrust_coefficient=3e-6, torque_coefficient=5e-8, max_rotor_speed=1600.0,
         rotor_positions=((0.1, -0.1), (-0.1, 0.1), (0.1, 0.1), (-0.1, -0.1)), spin=(-1.0, -1.0, 1.0, 1.0),
     )
-    model = hj.rigid_body(vehicle)  # or what was adapted to its flight: hj.load("adapted.npz").field
+    model = hj.rigid_body(vehicle)  # or an adapted model: hj.load("adapted.npz").field
     controller = Controller(vehicle)
     reference = sample(figure_eight(top_speed=3.0), controller, duration=2.0)
 
@@ -21,29 +21,34 @@ Your own vehicle, with a model of it and whatever turns rotor speeds into the ne
         x = simulate(model, x, u, controller.period)  # or: send u, wait, estimate x
     print("after 2 s", abs(x - reference[200])[:3].max(), "m off")
 
-`loop.fly` does that in one compiled program, with the observer, for many lanes at once.
+`fly` does the same in one compiled program, with the observer. `open_loop_costs` compares the predicted cost of plans
+with the actual one.
 """
 
 from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
-from hybrid_jax.control.loop import Flight, Performance, fly, performance, realised
-from hybrid_jax.control.references import figure_eight, hover, low_pass, sample, step, upset
+from hybrid_jax.control.loop import Flight, Performance, fly, performance
+from hybrid_jax.control.open_loop import OpenLoopCosts, actual_cost, open_loop_costs, relative_cost_error
+from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_pass, sample, step
 from hybrid_jax.control.sensitivities import advance
 
 __all__ = [
     "Controller",
     "Flight",
+    "OpenLoopCosts",
     "Performance",
     "Plan",
     "Weights",
+    "actual_cost",
+    "add_body_rates",
     "advance",
     "figure_eight",
     "fly",
     "hover",
     "low_pass",
+    "open_loop_costs",
     "performance",
-    "realised",
+    "relative_cost_error",
     "sample",
     "step",
-    "upset",
 ]

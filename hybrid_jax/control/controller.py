@@ -1,12 +1,12 @@
 """A model predictive controller for a multirotor: real-time Gauss–Newton on any vector field of the library.
 
 It follows the real-time iteration (Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in
-optimal feedback control", 2005): one Gauss–Newton step a call, from the last plan shifted by one period. Rotor speeds
-are a smooth function of free numbers and so never leave their limits; the states are eliminated (condensing: Bock and
-Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984).
+optimal feedback control", 2005): one Gauss–Newton step per call, from the last plan shifted by one period. Rotor speeds
+are a smooth function of unbounded decision variables and so stay within their limits. The states are eliminated
+(condensing: Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984).
 
-The search for a step that lowers the cost goes along the damping, as Levenberg's and Marquardt's, and not along the
-length of one step: after an upset a long Gauss–Newton step, cut to any of three lengths, is mostly no descent.
+The line search varies the damping (Levenberg–Marquardt), not the length of one step: after a large initial rate a long
+Gauss–Newton step is mostly no descent direction, at any length.
 """
 
 import math
@@ -18,79 +18,61 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.control.attitude import one_sheet
-from hybrid_jax.control.cost import Scalar, Weights, deviations, plan_cost, stage_factors, unrest
-from hybrid_jax.control.sensitivities import advance, advanced
-from hybrid_jax.control.steadying import steadying_speeds
+from hybrid_jax.control.attitude import canonicalize_quaternion
+from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
+from hybrid_jax.control.recovery import recovery_speeds
+from hybrid_jax.control.sensitivities import advance, advance_with_jacobian
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vehicle import Vehicle
 
-FREE = 3.0  # bound of the free numbers: tanh is within 0.5 % of its limit there, and its slope is still 1 %
-FACTORS = (0.1, 1.0, 10.0)  # on the damping, that the line search tries
-FAILED = 100.0  # factor on the damping when none of them lowered the cost
-FIRST, MOST = 10.0, 1e8  # damping at the first call, and at most
+VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
+DAMPING_FACTORS = (0.1, 1.0, 10.0)  # tried by the line search
+FAILURE_FACTOR = 100.0  # on the damping, when none of them lowered the cost
+INITIAL_DAMPING, MAX_DAMPING = 10.0, 1e8
 
 
 class Plan(eqx.Module):
-    """What the controller carries from one call to the next.
+    """State of the controller between calls."""
 
-    Attributes:
-        free: numbers whose tanh is the share of the rotor speeds' range, held over each interval of the horizon.
-        cost: what the plan costs by the controller's model.
-        damping: on the diagonal of the Gauss–Newton matrix, that did best.
-    """
-
-    free: Float[Array, "t 4"]
-    cost: Scalar
-    damping: Scalar
+    variables: Float[Array, "t 4"]  # tanh maps them to shares of the rotor speeds' range, held over each interval
+    cost: Scalar  # predicted by the controller's model
+    damping: Scalar  # of the best Gauss–Newton step
 
 
 class _Point(eqx.Module):
-    """A plan, the states that it leads to and what they cost."""
+    """A plan, its predicted states and their cost."""
 
-    free: Float[Array, "t 4"]
+    variables: Float[Array, "t 4"]
     states: Float[Array, "t 13"]
     cost: Scalar
     damping: Scalar
 
 
-def in_common(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[State, Float[Array, "n 13"], Plan]:
-    """The three in the type that holds the numbers of all: what is carried through a loop must not change its own."""
+def promote(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[State, Float[Array, "n 13"], Plan]:
+    """All three in one dtype: the carry of a loop must not change its own."""
     dtype = jnp.result_type(*jax.tree.leaves((x, reference, plan)))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), (x, reference, plan))
 
 
 @dataclass(frozen=True)
 class Controller:
-    """Rotor speeds that let a model follow a reference; hyper-parameters only, the plan is passed in and returned.
-
-    Attributes:
-        vehicle: for the limits and the first guess, hover; the dynamics are those of the model that a call is given.
-        weights: of the cost.
-        steps: intervals of the horizon.
-        interval: length of one [s]; one step of RK4.
-        period: time between two calls [s].
-        iterations: Gauss–Newton steps a call.
-        damping: the least; the line search goes along it, from the Gauss–Newton step to a short one downhill.
-        min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
-        unit_quaternion: normalise the quaternion after each step of the prediction.
+    """Model predictive controller. It holds hyper-parameters only; the plan is passed in and returned.
 
     Raises:
-        ValueError: no vehicle or no weights, a number out of its range, or an interval that is no multiple of the
-            period.
+        ValueError: an argument is of another type or out of range, or `interval` is no multiple of `period`.
     """
 
-    vehicle: Vehicle
-    weights: Weights = field(default_factory=Weights)
-    steps: int = 20
-    interval: float = 0.05
-    period: float = 0.01
-    iterations: int = 1
-    damping: float = 1e-3
-    min_speed: float = 0.0
-    unit_quaternion: bool = True
+    vehicle: Vehicle  # gives the limits and the initial guess, hover; the model passed to a call gives the dynamics
+    weights: Weights = field(default_factory=Weights)  # of the cost
+    steps: int = 20  # intervals of the horizon
+    interval: float = 0.05  # length of one [s]; one step of RK4
+    period: float = 0.01  # time between two calls [s]
+    iterations: int = 1  # Gauss–Newton steps per call
+    damping: float = 1e-3  # lower bound of the damping
+    min_speed: float = 0.0  # lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's
+    unit_quaternion: bool = True  # normalise the quaternion after each step of the prediction
 
     def __post_init__(self):
         for name, kind in (("vehicle", Vehicle), ("weights", Weights)):
@@ -111,30 +93,28 @@ class Controller:
 
     @property
     def stride(self) -> int:
-        """Periods in an interval."""
+        """Periods per interval."""
         return max(round(self.interval / self.period), 1)
 
     def begin(self) -> Plan:
-        """The plan before the first call: hover throughout."""
+        """The plan for the first call: hover throughout."""
         middle, half = self._range()
-        free = math.atanh((self.vehicle.hover_speed - middle) / half)
-        # Of the type that later plans have, or a compiled call would be compiled twice.
-        return Plan(
-            jnp.full((self.steps, INPUT_SIZE), free, float), jnp.asarray(jnp.inf, float), jnp.asarray(FIRST, float)
-        )
+        hover = math.atanh((self.vehicle.hover_speed - middle) / half)
+        # With the dtype of later plans, or the second call would compile again.
+        variables = jnp.full((self.steps, INPUT_SIZE), hover, float)
+        return Plan(variables, jnp.asarray(jnp.inf, float), jnp.asarray(INITIAL_DAMPING, float))
 
     def speeds(self, plan: Plan) -> Float[Array, "t 4"]:
-        """The rotor speeds [rad/s] of a plan, between the limits."""
-        return self._speeds(jnp.tanh(plan.free))
+        """The rotor speeds [rad/s] of a plan, within the limits."""
+        return self._speeds(jnp.tanh(plan.variables))
 
     def horizon(self, reference: Float[Array, "n 13"], i: int | Scalar) -> Float[Array, "t 13"]:
-        """The reference at the end of each interval of a call at sample i, from one sampled every period.
+        """The reference at the end of each interval of a call at sample i, from one sample per period.
 
-        A compiled program cannot refuse an i whose horizon goes on beyond the reference: there the last sample stands
-        for all that is missing, with the velocity that it has.
+        For a traced i the last sample, with its velocity, stands for all beyond the end.
 
         Raises:
-            ValueError: where i is known, one that is negative or whose horizon goes on beyond the reference.
+            ValueError: a concrete i is negative, or its horizon ends after the reference.
         """
         checks.count("i", i, least=0)
         last = len(reference) - 1 - self.steps * self.stride
@@ -145,42 +125,40 @@ class Controller:
     def __call__(
         self, model: AbstractVectorField, reference: Float[Array, "t 13"], x: State, plan: Plan
     ) -> tuple[Input, Plan]:
-        """Rotor speeds [rad/s] to be held for one period from state x, and the plan behind them.
+        """Rotor speeds [rad/s] to hold for one period from state x, and the new plan.
 
         Args:
-            reference: the state wanted at the end of each interval (see `horizon`).
+            model: prediction model.
+            reference: reference state at the end of each interval (see `horizon`).
             plan: that of the last call, or `begin()`.
 
         Raises:
-            ValueError: no model, no plan of this horizon, shapes that do not fit, or, where it is known, a number that
-                is not finite or a quaternion that is none of a rotation. A compiled call normalises that of x.
+            ValueError: `model` is not callable, or `plan` or a shape does not fit; for concrete values also if one is
+                not finite or a quaternion is not of length 1. A compiled call normalises that of x.
         """
         if not callable(model):
             raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
         x, reference = checks.floating("x", x), checks.floating("reference", reference)
         if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
             raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
-        self._check_plan(plan)
+        if not isinstance(plan, Plan):
+            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
+        if plan.variables.shape != (self.steps, INPUT_SIZE):
+            raise ValueError(f"plan must have variables of shape ({self.steps}, 4), got {plan.variables.shape}")
         checks.unit_quaternions("x", x)
         checks.unit_quaternions("reference", reference)
-        x, reference, plan = in_common(x, reference, plan)
-        x = x.at[QUATERNION].set(one_sheet(normalise(x[QUATERNION])))
+        x, reference, plan = promote(x, reference, plan)
+        x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
-        free, states, cost = self._first(model, reference, x, plan)
+        variables, states, cost = self._initial_guess(model, reference, x, plan)
+        point = _Point(variables, states, cost, plan.damping)
 
         def iteration(_, point):
             return self._improve(model, reference, x, point)
 
-        point = jax.lax.fori_loop(0, self.iterations, iteration, _Point(free, states, cost, plan.damping))
-        plan = Plan(point.free, point.cost, point.damping)
+        point = jax.lax.fori_loop(0, self.iterations, iteration, point)
+        plan = Plan(point.variables, point.cost, point.damping)
         return self.speeds(plan)[0], plan
-
-    def _check_plan(self, plan: Plan) -> None:
-        if not isinstance(plan, Plan):
-            raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
-        if plan.free.shape != (self.steps, INPUT_SIZE):
-            expected = f"{self.steps} intervals, as begin() has"
-            raise ValueError(f"plan must be one of {expected}, got free numbers of shape {plan.free.shape}")
 
     def _range(self) -> tuple[float, float]:
         return (self.vehicle.max_rotor_speed + self.min_speed) / 2, (self.vehicle.max_rotor_speed - self.min_speed) / 2
@@ -189,88 +167,91 @@ class Controller:
         middle, half = self._range()
         return middle + half * share
 
-    def _shifted(self, free: Float[Array, "t 4"]) -> Float[Array, "t 4"]:
-        """The plan one period on, between its values of now; the last one stays."""
-        following = jnp.concatenate([free[1:], free[-1:]])
-        return free + (following - free) / self.stride
+    def _shifted(self, variables: Float[Array, "t 4"]) -> Float[Array, "t 4"]:
+        """The plan one period later, interpolated; the last interval stays."""
+        following = jnp.concatenate([variables[1:], variables[-1:]])
+        return variables + (following - variables) / self.stride
 
-    def _first(self, model, reference, x: State, plan: Plan):
-        """What to improve on, its states and cost: the last plan shifted, or one that only steadies the vehicle."""
+    def _initial_guess(self, model, reference, x: State, plan: Plan):
+        """Variables, states and cost of the shifted plan or of the attitude recovery, whichever costs less."""
 
-        def interval(x, given):
-            wanted, shifted = given
-            free = jnp.stack([shifted, self._steadying(wanted, x[1])])
-            x = jax.vmap(lambda x, free: self._step(model, x, free))(x, free)
-            return x, (x, free)
+        def interval(x, inputs):
+            wanted, shifted = inputs
+            variables = jnp.stack([shifted, self._recovery(wanted, x[1])])
+            x = jax.vmap(lambda x, variables: self._step(model, x, variables))(x, variables)
+            return x, (x, variables)
 
-        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, self._shifted(plan.free)))[1]
-        states, free = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
-        costs = jax.vmap(lambda states, free: self._cost(reference, states, free))(states, free)
-        return jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (free, states, costs))
+        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, self._shifted(plan.variables)))[1]
+        states, variables = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
+        costs = jax.vmap(lambda states, variables: self._cost(reference, states, variables))(states, variables)
+        return jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, states, costs))
 
-    def _steadying(self, wanted: State, x: State) -> Float[Array, "4"]:
-        """The free numbers that turn the vehicle to the attitude wanted."""
+    def _recovery(self, wanted: State, x: State) -> Float[Array, "4"]:
+        """Decision variables that turn the vehicle to the reference attitude."""
         middle, half = self._range()
-        share = (steadying_speeds(self.vehicle, wanted, x) - middle) / half
-        return jnp.arctanh(jnp.clip(share, -math.tanh(FREE), math.tanh(FREE)))
+        share = (recovery_speeds(self.vehicle, wanted, x) - middle) / half
+        return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 
-    def _step(self, model: AbstractVectorField, x: State, free: Float[Array, "4"]) -> State:
-        return advance(model, x, self._speeds(jnp.tanh(free)), self.interval, self.unit_quaternion)
+    def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, "4"]) -> State:
+        return advance(model, x, self._speeds(jnp.tanh(variables)), self.interval, self.unit_quaternion)
 
-    def _predict(self, model, reference, x: State, free: Float[Array, "t 4"]) -> tuple[Float[Array, "t 13"], Scalar]:
+    def _predict(self, model, reference, x: State, variables: Float[Array, "t 4"]):
+        """States (t, 13) and cost of a plan."""
+
         def interval(x, held):
             x = self._step(model, x, held)
             return x, x
 
-        states = jax.lax.scan(interval, x, free)[1]
-        return states, self._cost(reference, states, free)
+        states = jax.lax.scan(interval, x, variables)[1]
+        return states, self._cost(reference, states, variables)
 
-    def _cost(self, reference, states: Float[Array, "t 13"], free: Float[Array, "t 4"]) -> Scalar:
-        return plan_cost(self.weights, reference, states, jnp.tanh(free))
+    def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t 4"]) -> Scalar:
+        return plan_cost(self.weights, reference, states, jnp.tanh(variables))
 
-    def _improve(self, model, reference, x: State, point: "_Point") -> "_Point":
-        """The best of the damped Gauss–Newton steps, if it lowers the cost; its damping is tried around next time."""
-        matrix, gradient = self._quadratic(model, reference, jnp.concatenate([x[None], point.states]), point.free)
-        dampings = jnp.clip(point.damping * jnp.array(FACTORS, gradient.dtype), self.damping, MOST)
+    def _improve(self, model, reference, x: State, point: _Point) -> _Point:
+        """Take the best of the damped Gauss–Newton steps, if it lowers the cost, and keep its damping."""
+        states = jnp.concatenate([x[None], point.states])
+        matrix, gradient = self._quadratic(model, reference, states, point.variables)
+        dampings = jnp.clip(point.damping * jnp.array(DAMPING_FACTORS, gradient.dtype), self.damping, MAX_DAMPING)
 
         def attempt(damping):
-            step = _solved(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
-            gain = step @ gradient + damping * step @ step  # what it lowers the quadratic model by
-            free = jnp.clip(point.free - step.reshape(point.free.shape), -FREE, FREE)
-            states, cost = self._predict(model, reference, x, free)
-            return _Point(free, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), gain
+            step = _solve(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
+            gain = step @ gradient + damping * step @ step  # decrease of the quadratic model
+            variables = point.variables - step.reshape(point.variables.shape)
+            variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
+            states, cost = self._predict(model, reference, x, variables)
+            return _Point(variables, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), gain
 
         tried, gains = jax.vmap(attempt)(dampings)
         best = jax.tree.map(lambda leaf: leaf[jnp.argmin(tried.cost)], tried)
-        kept = eqx.tree_at(lambda p: p.damping, point, jnp.minimum(point.damping * FAILED, MOST))
+        kept = eqx.tree_at(lambda p: p.damping, point, jnp.minimum(point.damping * FAILURE_FACTOR, MAX_DAMPING))
         best = jax.tree.map(lambda new, old: jnp.where(best.cost < point.cost, new, old), best, kept)
-        # At the best plan chance decides what lowers the cost: no damping did well there, and none is to be blamed.
-        nothing = gains[0] < jnp.finfo(gains.dtype).eps * (1 + point.cost)
-        return eqx.tree_at(lambda p: p.damping, best, jnp.where(nothing, FIRST, best.damping))
+        # At the optimum rounding decides which step lowers the cost, so its damping says nothing.
+        converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + point.cost)
+        return eqx.tree_at(lambda p: p.damping, best, jnp.where(converged, INITIAL_DAMPING, best.damping))
 
-    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], free: Float[Array, "t 4"]):
-        """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the free numbers."""
+    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], variables: Float[Array, "t 4"]):
+        """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the decision variables."""
         factor = stage_factors(self.weights, self.steps)
         residual, jacobian = jax.vmap(
             lambda wanted, found: _with_jacobian(lambda state: deviations(self.weights, wanted, state), found)
         )(reference, x[1:])
-        size = free.size
-        slopes = ((factor[:, None, None] * jacobian) @ self._sensitivities(model, x[:-1], free)).reshape(-1, size)
-        share = jnp.tanh(free)
+        sensitivities = self._sensitivities(model, x[:-1], variables)
+        slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
+        share = jnp.tanh(variables)
         slope = 1 - jnp.square(share)  # of the tanh
-        changes = unrest(self.weights, self.steps)
+        changes = input_rate_penalty(self.weights, self.steps)
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)
         between = changes[:, None, :, None] * jnp.eye(INPUT_SIZE)[:, None, :] * slope[:, :, None, None] * slope
-        return slopes.T @ slopes + between.reshape(size, size), gradient
+        return slopes.T @ slopes + between.reshape(variables.size, variables.size), gradient
 
-    def _sensitivities(self, model, x: Float[Array, "t 13"], free: Float[Array, "t 4"]) -> Float[Array, "t 13 4*t"]:
-        """∂(state at the end of each interval) / ∂(all free numbers)."""
-
-        share = jnp.tanh(free)
-        slope = self._range()[1] * (1 - jnp.square(share))  # of the rotor speeds in the free numbers
+    def _sensitivities(self, model, x: Float[Array, "t 13"], variables: Float[Array, "t 4"]) -> Float[Array, "t 13 n"]:
+        """∂(state at the end of each interval) / ∂(all decision variables), n = 4 t."""
+        share = jnp.tanh(variables)
+        slope = self._range()[1] * (1 - jnp.square(share))  # d speed / d variable
 
         def stage(x, u, slope):
-            jacobian = advanced(model, x, u, self.interval, self.unit_quaternion)[1]
+            jacobian = advance_with_jacobian(model, x, u, self.interval, self.unit_quaternion)[1]
             return jnp.concatenate([jacobian[:, :STATE_SIZE], jacobian[:, STATE_SIZE:] * slope], axis=1)
 
         stages = jax.vmap(stage)(x, self._speeds(share), slope)
@@ -286,11 +267,11 @@ class Controller:
 
 
 @jax.custom_batching.sequential_vmap
-def _solved(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
+def _solve(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
     """matrix⁻¹ vector by Cholesky, one matrix after the other.
 
-    On a CPU a batch of factorisations is shared out to the threads on which devices run as well; two devices that do so
-    at once wait for each other for ever.
+    On a CPU a batch of factorisations uses the thread pool that also runs the devices; two devices that do so at once
+    deadlock.
     """
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)
 

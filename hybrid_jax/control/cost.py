@@ -1,4 +1,4 @@
-"""What a plan of inputs costs: weighted deviations from a reference, and the input's unrest."""
+"""Cost of a plan: weighted deviations from a reference, and a penalty on the rate of the inputs."""
 
 from dataclasses import dataclass, fields
 
@@ -16,31 +16,22 @@ Scalar = Float[Array, ""]
 
 @dataclass(frozen=True)
 class Weights:
-    """A deviation of 1 / weight costs 1; cost = Σ (weight × deviation)².
+    """Weights of cost = Σ (weight × deviation)²; a deviation of 1 / weight costs 1.
 
-    What must differ from its reference in a steady wind or with a wrong k, tilt and rotor speed, costs little or only
-    by its changes; else position would pay for it.
-
-    Attributes:
-        position: [1/m].
-        tilt: of the attitude error about body x and y [1/rad].
-        yaw: of the attitude error about body z [1/rad].
-        velocity: [s/m].
-        body_rates: [s/rad].
-        change: of a rotor's speed from one interval to the next, as a share of half the range between its limits.
-        terminal: factor on all deviations of the last state of the horizon.
+    Tilt and rotor speed must differ from their reference in a steady wind or under an error of k. Tilt therefore costs
+    little, and of rotor speeds only the changes cost; otherwise position would pay for it.
 
     Raises:
-        ValueError: a weight that is negative or not finite; a position, a yaw or a change that costs nothing.
+        ValueError: a weight is negative or not finite, or `position`, `yaw` or `change` is zero.
     """
 
-    position: float = 10.0
-    tilt: float = 0.3
-    yaw: float = 3.0
-    velocity: float = 1.5
-    body_rates: float = 0.3
-    change: float = 1.0
-    terminal: float = 3.0
+    position: float = 10.0  # 1/m
+    tilt: float = 0.3  # of the attitude error about body x and y, 1/rad
+    yaw: float = 3.0  # of the attitude error about body z, 1/rad
+    velocity: float = 1.5  # s/m
+    body_rates: float = 0.3  # s/rad
+    change: float = 1.0  # of a rotor's speed from one interval to the next, as a share of half its range
+    terminal: float = 3.0  # factor on all deviations of the last state of the horizon
 
     def __post_init__(self):
         for field in fields(self):
@@ -49,15 +40,15 @@ class Weights:
 
 
 def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12"]:
-    """Weighted deviations of one state from its reference: position, attitude, velocity, body rates."""
-    turn = attitude_error(reference[QUATERNION], x[QUATERNION])
-    away = x - reference
+    """Weighted deviations of a state from its reference: position, attitude, velocity, body rates."""
+    difference = x - reference
     return jnp.concatenate(
         [
-            weights.position * away[POSITION],
-            jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype) * turn,
-            weights.velocity * away[VELOCITY],
-            weights.body_rates * away[BODY_RATES],
+            weights.position * difference[POSITION],
+            jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype)
+            * attitude_error(reference[QUATERNION], x[QUATERNION]),
+            weights.velocity * difference[VELOCITY],
+            weights.body_rates * difference[BODY_RATES],
         ]
     )
 
@@ -70,13 +61,13 @@ def stage_factors(weights: Weights, steps: int) -> Float[np.ndarray, " t"]:
 def plan_cost(
     weights: Weights, reference: Float[Array, "t 13"], x: Float[Array, "t 13"], share: Float[Array, "t 4"]
 ) -> Scalar:
-    """The cost of inputs (shares −1 … 1 of their range) and the states that they lead to."""
-    apart = jax.vmap(lambda wanted, found: deviations(weights, wanted, found))(reference, x)
-    tracking = jnp.sum(jnp.square(stage_factors(weights, len(x))[:, None] * apart))
+    """Cost of inputs (shares −1 … 1 of their range) and of the states x that they lead to."""
+    weighted = jax.vmap(lambda wanted, found: deviations(weights, wanted, found))(reference, x)
+    tracking = jnp.sum(jnp.square(stage_factors(weights, len(x))[:, None] * weighted))
     return tracking + jnp.sum(jnp.square(weights.change * jnp.diff(share, axis=0)))
 
 
-def unrest(weights: Weights, steps: int) -> Float[np.ndarray, "t t"]:
-    """M such that the changes of one rotor's shares s cost sᵀ M s."""
+def input_rate_penalty(weights: Weights, steps: int) -> Float[np.ndarray, "t t"]:
+    """Matrix M such that the changes of one rotor's shares s cost sᵀ M s."""
     differences = weights.change * np.diff(np.eye(steps, dtype=np.float32), axis=0)
     return differences.T @ differences

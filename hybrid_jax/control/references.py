@@ -1,8 +1,8 @@
-"""Paths to follow, sampled as reference states: position, velocity, and the attitude and rates that they ask for.
+"""Reference paths, and their sampling as reference states.
 
-A path is a function of time [s] to position [m, world] and yaw [rad]. All else follows from it because a multirotor is
-differentially flat (Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011): thrust
-points along a + g, so attitude is known from the acceleration and the yaw, and the rates are its derivative.
+A path maps time [s] to position [m, world] and yaw [rad]. The rest of the state follows by differential flatness
+(Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011): thrust points along a + g,
+so acceleration and yaw give the attitude, and its derivative the body rates.
 """
 
 import math
@@ -25,21 +25,21 @@ X, Y, Z = np.eye(3).tolist()
 
 
 def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
-    """Reference states every period for a flight of so many seconds and the horizon after its last call.
+    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call.
 
     Raises:
-        ValueError: no path, or a duration that is no positive number.
+        ValueError: `path` is not callable, or `duration` is not a positive number.
     """
     if not callable(path):
         raise ValueError(f"path must be a function of time, such as hover(), got {checks.short_repr(path)}")
     checks.positive("duration", duration, "a positive number of seconds")
     count = round(duration / controller.period) + controller.steps * controller.stride + 1
     times = controller.period * jnp.arange(count)
-    return jax.vmap(lambda t: state_on(path, t, controller.vehicle.gravity))(times)
+    return jax.vmap(lambda t: reference_state(path, t, controller.vehicle.gravity))(times)
 
 
-def state_on(path: Path, t: Scalar, gravity: float) -> State:
-    """The state at time t of a multirotor that follows the path without drag, its thrust never below the horizon."""
+def reference_state(path: Path, t: Scalar, gravity: float) -> State:
+    """The state at time t of a multirotor that follows the path without drag."""
 
     def moving(t):
         return jax.jvp(lambda t: path(t)[0], (t,), (jnp.ones_like(t),))
@@ -54,7 +54,7 @@ def state_on(path: Path, t: Scalar, gravity: float) -> State:
 
 
 def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
-    """The attitude of this yaw whose z axis points along thrust: turns about z, then y, then x."""
+    """The attitude with this yaw whose z axis points along `thrust`: rotations about z, then y, then x."""
     ahead = jnp.cos(yaw) * thrust[0] + jnp.sin(yaw) * thrust[1]
     left = jnp.cos(yaw) * thrust[1] - jnp.sin(yaw) * thrust[0]
     pitch = jnp.arctan2(ahead, thrust[2])
@@ -64,10 +64,10 @@ def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
 
 
 def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0.0) -> Path:
-    """Stay at a place [m].
+    """Stay at a position [m].
 
     Raises:
-        ValueError: a place that is none, or a number that is not finite.
+        ValueError: `position` is not three finite numbers, or `yaw` is not finite.
     """
     _check_vector("position", position)
     checks.number("yaw", yaw)
@@ -75,19 +75,19 @@ def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0
 
 
 def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
-    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, at an even phase; fastest, √2 a φ̇ [m/s], at its centre.
+    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, with constant φ̇; fastest at its centre, √2 a φ̇ [m/s].
 
     Raises:
-        ValueError: a speed or a width that is not positive, or a number that is not finite.
+        ValueError: `top_speed` or `half_width` [m] is not positive, or a number is not finite.
     """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
-    checks.number("altitude", altitude)
-    checks.number("yaw", yaw)
-    turning = top_speed / (math.sqrt(2) * half_width)  # rad/s
+    for name, value in (("altitude", altitude), ("yaw", yaw)):
+        checks.number(name, value)
+    rate = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):
-        phase = turning * t
+        phase = rate * t
         place = jnp.stack([jnp.sin(phase), jnp.sin(2 * phase) / 2, 0 * t])
         return half_width * place + altitude * jnp.array(Z), yaw + 0 * t
 
@@ -95,10 +95,10 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
 
 
 def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, altitude: float = 1.5) -> Path:
-    """Hover over the origin, and from time `at` [s] on further by `to` [m] and turned by yaw [rad], all at once.
+    """Hover over the origin; at time `at` [s] the position jumps by `to` [m] and the yaw to `yaw` [rad].
 
     Raises:
-        ValueError: a way that is none, or a number that is not finite.
+        ValueError: `to` is not three finite numbers, or another number is not finite.
     """
     _check_vector("to", to)
     for name, value in (("at", at), ("yaw", yaw), ("altitude", altitude)):
@@ -112,12 +112,12 @@ def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, alti
 
 
 def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: float = 5.0) -> Path:
-    """Ahead along x at this speed [m/s], down to the altitude `low` [m] and up to `high` again, every so many seconds.
+    """Fly along x at `speed` [m/s], down to the altitude `low` [m] and up to `high`, every `every` seconds.
 
-    The descent, cos⁴, is flat at the bottom: two fifths of the time are spent in the lowest tenth.
+    The altitude follows cos⁴, which is flat at the bottom: 40 % of the time is spent in the lowest tenth.
 
     Raises:
-        ValueError: altitudes that are not 0 < low < high, a time that is not positive, or a number that is not finite.
+        ValueError: not 0 < low < high, `every` is not positive, or a number is not finite.
     """
     checks.number("speed", speed)
     checks.number("high", high)
@@ -133,11 +133,11 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
     return path
 
 
-def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
-    """The state thrown into a rotation [rad/s, body frame]: a start, from which to recover to hover.
+def add_body_rates(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
+    """The state with body rates [rad/s] added: a large-rate initial condition.
 
     Raises:
-        ValueError: no state, or no rates.
+        ValueError: `state` is not of shape (13,), or `rates` are not three finite numbers.
     """
     state = checks.floating("state", state)
     if state.shape != (STATE_SIZE,):
@@ -147,6 +147,6 @@ def upset(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> 
 
 
 def _check_vector(name: str, value: tuple[float, float, float]) -> None:
-    array = checks.finite(name, checks.real_array(name, value))  # no JAX array: modules make paths when imported
+    array = checks.finite(name, checks.real_array(name, value))  # no JAX array: modules define paths at import
     if array.shape != (3,):
         raise ValueError(f"{name} must be three numbers (x, y, z), got {checks.short_repr(value)}")

@@ -1,9 +1,8 @@
-"""One step of a model, and how it answers to small changes: what condensing needs of a vector field.
+"""One RK4 step of a model and its Jacobian, which condensing needs.
 
-The derivative of a Runge–Kutta step is a step of the same method of ẋ = f(x, u), Ṡ = ∂f/∂x S + ∂f/∂u: internal
-numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981). So a
-field is asked for its own derivative at the stages, and a network answers by one product of its matrices, in which a
-hidden layer of hundreds of units is gone before any of the 17 columns of S is met.
+The derivative of a Runge–Kutta step is a step of the same method on ẋ = f(x, u), Ṡ = ∂f/∂x S + ∂f/∂u: internal
+numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981). The
+field provides its own derivative at each stage (`linearize`), which for a network is one product of its matrices.
 """
 
 import diffrax
@@ -16,10 +15,10 @@ from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION, Input, State
 
 
-def advanced(
+def advance_with_jacobian(
     model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True
 ) -> tuple[State, Float[Array, "13 17"]]:
-    """`advance`, and its Jacobian (13, 17) in x and u."""
+    """`advance`, and its Jacobian in x and u."""
     directions = jnp.eye(len(x) + len(u), dtype=x.dtype)
     dx, du = directions[: len(x)], directions[len(x) :]
 

@@ -1,4 +1,4 @@
-"""The controller's problem once more, written in CasADi and solved to convergence by IPOPT: rotor speeds in a box."""
+"""The controller's problem in CasADi, solved to convergence by IPOPT with box constraints on the rotor speeds."""
 
 import casadi as ca
 import numpy as np
@@ -6,7 +6,7 @@ import numpy as np
 from hybrid_jax.control.controller import Controller
 
 
-def turned(a, b):
+def product(a, b):
     """a ⊗ b."""
     return ca.vertcat(a[0] * b[0] - ca.dot(a[1:], b[1:]), a[0] * b[1:] + b[0] * a[1:] + ca.cross(a[1:], b[1:]))
 
@@ -20,11 +20,11 @@ def rigid_body(vehicle):
     torque = ca.vertcat(
         ca.dot(py, thrust), -ca.dot(px, thrust), vehicle.torque_coefficient * ca.dot(np.array(vehicle.spin), u**2)
     )
-    lift = turned(turned(q, ca.vertcat(0, 0, 0, ca.sum1(thrust))), ca.vertcat(q[0], -q[1:]))[1:]
+    lift = product(product(q, ca.vertcat(0, 0, 0, ca.sum1(thrust))), ca.vertcat(q[0], -q[1:]))[1:]
     inertia = np.array(vehicle.inertia)
     spin_up = (torque - ca.cross(w, inertia * w)) / inertia
     slope = ca.vertcat(
-        v, 0.5 * turned(q, ca.vertcat(0, w)), lift / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin_up
+        v, 0.5 * product(q, ca.vertcat(0, w)), lift / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin_up
     )
     return ca.Function("f", [x, u], [slope])
 
@@ -41,9 +41,9 @@ def one_step(vehicle, dt):
     return ca.Function("step", [x, u], [end])
 
 
-def apart(reference, x, weights):
-    """Weighted deviations; the rotation vector holds for errors of attitude between 0 and π, not at either."""
-    error = turned(ca.vertcat(reference[3], -reference[4:7]), x[3:7])
+def deviations(reference, x, weights):
+    """Weighted deviations, for attitude errors strictly between 0 and π."""
+    error = product(ca.vertcat(reference[3], -reference[4:7]), x[3:7])
     error = ca.if_else(error[0] < 0, -error, error)
     sine = ca.sqrt(ca.sumsqr(error[1:]) + 1e-16)
     turn = 2 * ca.atan2(sine, error[0]) / sine * error[1:]
@@ -55,7 +55,7 @@ def apart(reference, x, weights):
 
 
 def best_cost(controller: Controller, reference, x0) -> tuple[float, np.ndarray]:
-    """The least cost of a plan from x0 and its rotor speeds (t, 4) [rad/s], by multiple shooting."""
+    """The least cost of a plan from x0, and its rotor speeds (t, 4) [rad/s], by multiple shooting."""
     vehicle, weights, n = controller.vehicle, controller.weights, controller.steps
     half = (vehicle.max_rotor_speed - controller.min_speed) / 2
     x, share = ca.SX.sym("x", 13, n), ca.SX.sym("s", 4, n)
@@ -66,7 +66,7 @@ def best_cost(controller: Controller, reference, x0) -> tuple[float, np.ndarray]
         gaps.append(x[:, k] - step(start, speeds[:, k]))
         start = x[:, k]
         factor = weights.terminal if k == n - 1 else 1.0
-        cost += ca.sumsqr(factor * apart(ca.DM(reference[k]), start, weights))
+        cost += ca.sumsqr(factor * deviations(ca.DM(reference[k]), start, weights))
         cost += ca.sumsqr(weights.change * (share[:, k] - share[:, k - 1])) if k else 0
     problem = {"x": ca.veccat(x, share), "f": cost, "g": ca.vertcat(*gaps)}
     solver = ca.nlpsol("solver", "ipopt", problem, {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes"}})

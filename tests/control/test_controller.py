@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, Weights, advance, hover, sample, upset
+from hybrid_jax.control import Controller, Weights, add_body_rates, advance, hover, sample
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.rotation import from_axis_angle, normalise
 
@@ -22,7 +22,7 @@ BODY = hj.rigid_body(VEHICLE)
 
 @eqx.filter_jit
 def call(model, reference, x, plan, iterations):
-    """One program for any number of iterations, which a controller holds as a plain number otherwise."""
+    """The number of iterations is traced, so that all share one program."""
     return Controller(VEHICLE, min_speed=LOWEST, iterations=iterations)(model, reference, x, plan)
 
 
@@ -42,7 +42,7 @@ def still():
 
 
 def test_hover_is_an_equilibrium(still):
-    """The command is the hover speed, and the shifted plan does not drift off either."""
+    """The command is the hover speed, and the shifted plan does not drift."""
     x, reference = still
     plan = None
     for _ in range(20):
@@ -53,8 +53,8 @@ def test_hover_is_an_equilibrium(still):
 
 
 @pytest.mark.parametrize("model", [BODY, hybrid(0)], ids=["physics", "hybrid"])
-def test_a_start_from_minus_q_gives_the_same_command(model, still):
-    """Even with a network, to which −q is another state, and by the very same numbers."""
+def test_q_and_minus_q_give_the_same_command(model, still):
+    """Bit by bit, even with a network, for which −q is another input."""
     x, reference = still
     x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
     plan = opposite = None
@@ -62,22 +62,22 @@ def test_a_start_from_minus_q_gives_the_same_command(model, still):
         u, plan = command(x, reference, plan, model)
         again, opposite = command(x.at[3:7].multiply(-1), reference, opposite, model)
         np.testing.assert_array_equal(u, again)
-        # The sign of the reference says nothing either; here sums may be rounded otherwise.
+        # The sign of the reference does not matter either; only rounding may differ.
         third, _ = command(x, reference.at[:, 3:7].multiply(-1), plan, model)
         np.testing.assert_allclose(third, command(x, reference, plan, model)[0], rtol=1e-5)
 
 
 @pytest.mark.parametrize("cosine", [0.0, 1e-7, -1e-7])
-def test_half_a_turn_of_yaw_is_left(still, cosine):
+def test_half_a_turn_of_yaw_is_corrected(still, cosine):
     x, reference = still
     x = x.at[3:7].set(jnp.array([cosine, 0.0, 0.0, 1.0]))
     u, _ = command(x, reference, iterations=6)
     torque = np.sum(np.array(VEHICLE.spin) * np.asarray(u) ** 2)
-    # More than half of what the rotors can do about z with the thrust of hover, either way.
+    # More than half of the largest yaw torque at hover thrust, in either direction.
     assert abs(torque) > 0.5 * 4 * VEHICLE.hover_speed**2
 
 
-def test_speeds_stay_within_the_limits_and_reach_them(still):
+def test_speeds_reach_the_limits_and_stay_within(still):
     x, reference = still
     plan, found = None, []
     for away in (30.0, 3000.0, -30.0, -3000.0):
@@ -89,39 +89,39 @@ def test_speeds_stay_within_the_limits_and_reach_them(still):
 
 
 def test_more_iterations_never_raise_the_cost(still):
-    """From a tumble, a wrong heading and afar, where many a step is no descent."""
+    """Also from large rates, a wrong heading and far away, where many steps are no descent."""
     x, reference = still
     turned = x.at[3:7].set(from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(2.5)))
-    for start in (upset(x, (5.0, -6.0, 4.0)), turned, x.at[:3].add(3.0)):
+    for start in (add_body_rates(x, (5.0, -6.0, 4.0)), turned, x.at[:3].add(3.0)):
         costs = np.array([command(start, reference, iterations=n)[1].cost for n in range(1, 13)])
         assert (np.diff(costs) <= 0).all()
         assert costs[-1] < 0.95 * costs[0]
 
 
-def test_the_cost_of_a_plan_is_that_of_its_rollout_and_has_no_slope_at_the_end(still):
-    """The Jacobians that the controller puts together are those that autodiff finds."""
+def test_plan_cost_equals_its_rollout_and_is_stationary(still):
+    """The assembled Jacobians agree with autodiff."""
     x, reference = still
     x = x.at[0].add(0.2).at[11].set(1.0)
     _, plan = command(x, reference, iterations=30)
 
     @jax.jit
     @jax.value_and_grad
-    def cost(free):
+    def cost(variables):
         def interval(x, u):
             x = advance(BODY, x, u, CONTROLLER.interval)
             return x, x
 
-        speeds = CONTROLLER.speeds(eqx.tree_at(lambda plan: plan.free, plan, free))
+        speeds = CONTROLLER.speeds(eqx.tree_at(lambda plan: plan.variables, plan, variables))
         states = jax.lax.scan(interval, x, speeds)[1]
-        return plan_cost(CONTROLLER.weights, reference, states, jnp.tanh(free))
+        return plan_cost(CONTROLLER.weights, reference, states, jnp.tanh(variables))
 
-    value, slope = cost(plan.free)
+    value, slope = cost(plan.variables)
     np.testing.assert_allclose(value, plan.cost, rtol=1e-5)
-    begin = np.abs(cost(CONTROLLER.begin().free)[1]).max()
+    begin = np.abs(cost(CONTROLLER.begin().variables)[1]).max()
     assert np.abs(slope).max() < 1e-4 * begin
 
 
-def test_the_length_of_the_quaternion_says_nothing_and_is_refused_where_it_is_known(still):
+def test_quaternion_length_is_ignored_if_traced_and_refused_if_concrete(still):
     x, reference = still
     x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
     for factor in (0.5, 1.1):
@@ -134,7 +134,7 @@ def test_the_length_of_the_quaternion_says_nothing_and_is_refused_where_it_is_kn
         CONTROLLER(BODY, reference.at[2, 3:7].multiply(2.0), x, CONTROLLER.begin())
 
 
-def test_lanes_of_fields_references_and_states_are_single_calls(still):
+def test_vmap_equals_single_calls(still):
     x, reference = still
     models = [hybrid(i) for i in range(3)]
     lanes = jax.tree.map(lambda *leaves: jnp.stack(leaves), *models)
@@ -149,7 +149,7 @@ def test_lanes_of_fields_references_and_states_are_single_calls(still):
         np.testing.assert_allclose(found.cost[i], plan.cost, rtol=5e-3)
 
 
-def test_the_quaternion_is_normalised_or_not():
+def test_unit_quaternion_switches_the_normalisation():
     long = jnp.zeros(13).at[3].set(1.1)
     u = jnp.full(4, 600.0)
     assert np.linalg.norm(advance(BODY, long, u, 0.05)[3:7]) == pytest.approx(1.0, rel=1e-6)
@@ -169,12 +169,12 @@ def test_the_quaternion_is_normalised_or_not():
         ({"vehicle": None}, "vehicle must be a Vehicle, got None"),
     ],
 )
-def test_what_makes_no_sense_is_refused(wrong, said):
+def test_invalid_hyper_parameters_are_refused(wrong, said):
     with pytest.raises(ValueError, match=said):
         Controller(**{"vehicle": hj.IRIS, **wrong})
 
 
-def test_wrong_weights_and_shapes_are_refused(still):
+def test_invalid_weights_and_shapes_are_refused(still):
     x, reference = still
     with pytest.raises(ValueError, match="yaw"):
         Weights(yaw=0.0)
@@ -188,5 +188,5 @@ def test_wrong_weights_and_shapes_are_refused(still):
         CONTROLLER(None, reference, x, CONTROLLER.begin())
     with pytest.raises(ValueError, match=r"plan must be begin\(\) or that of the last call, got None"):
         CONTROLLER(BODY, reference, x, None)
-    with pytest.raises(ValueError, match=r"plan must be one of 20 intervals, .* of shape \(10, 4\)"):
+    with pytest.raises(ValueError, match=r"plan must have variables of shape \(20, 4\), got \(10, 4\)"):
         CONTROLLER(BODY, reference, x, Controller(VEHICLE, steps=10).begin())

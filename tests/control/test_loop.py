@@ -10,15 +10,15 @@ import hybrid_jax as hj
 from hybrid_jax.control import (
     Controller,
     Flight,
+    actual_cost,
+    add_body_rates,
     advance,
     figure_eight,
     fly,
     hover,
     low_pass,
     performance,
-    realised,
     sample,
-    upset,
 )
 from hybrid_jax.dynamics.disturbance import disturbed
 
@@ -31,29 +31,29 @@ def plant(field):
     return lambda x, u, t: advance(field, x, u, CONTROLLER.period)
 
 
-def judged(wind, reference, x0, bandwidth):
+def simulate(wind, reference, x0, bandwidth):
     flight = fly(plant(disturbed(BODY, wind)), BODY, reference, x0, CONTROLLER, bandwidth)
     return flight, performance(flight, reference, CONTROLLER)
 
 
-alone = jax.jit(judged)
+alone = jax.jit(simulate)
 
 SECONDS = 2.0
 REFERENCES = [sample(path, CONTROLLER, SECONDS) for path in (hover(), figure_eight(3.5), figure_eight(6.0), low_pass())]
 
 
 @pytest.mark.parametrize(("i", "allowed"), [(0, 0.001), (1, 0.001), (2, 0.005), (3, 0.002)])
-def test_the_true_model_keeps_to_its_path(i, allowed):
-    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm low: RK4 of 50 ms plans for a plant of 10 ms."""
+def test_true_model_tracks_the_reference(i, allowed):
+    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
     _, found = alone(jnp.zeros(6), REFERENCES[i], REFERENCES[i][0], 0.0)
     assert found.position_rmse < allowed
     assert found.yaw_rmse < 0.002
     assert not found.crashed
 
 
-def test_an_upset_of_6_rad_per_s_is_recovered_from():
+def test_recovery_from_a_rate_of_6_rad_per_s():
     reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, SECONDS)
-    flight, found = alone(jnp.zeros(6), reference, upset(reference[0]), 0.0)
+    flight, found = alone(jnp.zeros(6), reference, add_body_rates(reference[0]), 0.0)
     assert found.largest_error < 0.3
     assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
@@ -61,15 +61,15 @@ def test_an_upset_of_6_rad_per_s_is_recovered_from():
     assert away[7:].max() < 0.1
 
 
-def test_a_kick_after_a_second_of_quiet_is_answered_as_one_at_the_start():
-    """At the best plan nothing lowers the cost; that is no reason for small steps when there is something to do."""
+def test_damping_does_not_grow_at_the_optimum():
+    """A kick after a second of hover is corrected as well as one at the start."""
     reference = REFERENCES[0]
 
     @jax.jit
     def furthest(at):
         def kicked(x, u, t):
             x = plant(BODY)(x, u, t)
-            return jnp.where(jnp.abs(t - at) < 0.5 * CONTROLLER.period, upset(x), x)
+            return jnp.where(jnp.abs(t - at) < 0.5 * CONTROLLER.period, add_body_rates(x), x)
 
         flight = fly(kicked, BODY, reference, reference[0], CONTROLLER)
         return performance(flight, reference, CONTROLLER).largest_error
@@ -77,7 +77,7 @@ def test_a_kick_after_a_second_of_quiet_is_answered_as_one_at_the_start():
     assert furthest(1.0) < 1.03 * furthest(0.0)
 
 
-def test_the_observer_finds_the_wind_and_takes_its_error_away():
+def test_observer_finds_the_wind_and_removes_its_error():
     reference = REFERENCES[0]
     _, without = alone(WIND, reference, reference[0], 0.0)
     flight, found = alone(WIND, reference, reference[0], 10.0)
@@ -87,30 +87,30 @@ def test_the_observer_finds_the_wind_and_takes_its_error_away():
     assert np.linalg.norm(flight.x[-1, :3] - reference[0, :3]) < 0.01
 
 
-def test_a_lane_is_the_lone_loop():
+def test_vmap_equals_single_flights():
     winds = jnp.stack([0 * WIND, WIND])
     references = jnp.stack([REFERENCES[0], REFERENCES[1]])[:, : 1 + 100 + 50]
     bandwidths = jnp.array([0.0, 10.0])
-    lanes, found = jax.jit(jax.vmap(judged))(winds, references, references[:, 0], bandwidths)
+    lanes, found = jax.jit(jax.vmap(simulate))(winds, references, references[:, 0], bandwidths)
     for i in range(2):
         flight, single = alone(winds[i], references[i], references[i][0], bandwidths[i])
         np.testing.assert_allclose(lanes.x[i], flight.x, rtol=0, atol=2e-3)
         np.testing.assert_allclose(found.position_rmse[i], single.position_rmse, rtol=0, atol=2e-4)
 
 
-def test_a_true_model_keeps_its_promise_and_a_wrong_one_does_not():
-    """What is promised is for steps of 0.05 s, what is realised for the plant's of 0.01 s."""
+def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
+    """Predictions have steps of 0.05 s, the plant 0.01 s."""
     reference = REFERENCES[1]
 
     @jax.jit
-    def kept(wind):
-        flight = judged(wind, reference, reference[0], 0.0)[0]
+    def ratio(wind):
+        flight = simulate(wind, reference, reference[0], 0.0)[0]
         calls = jnp.arange(50, 200, 25)
-        costs = jax.vmap(lambda i: realised(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
+        costs = jax.vmap(lambda i: actual_cost(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
         return costs / flight.plans.cost[calls]
 
-    np.testing.assert_allclose(kept(jnp.zeros(6)), 1.0, rtol=0.01)
-    assert (kept(WIND) > 5.0).all()
+    np.testing.assert_allclose(ratio(jnp.zeros(6)), 1.0, rtol=0.01)
+    assert (ratio(WIND) > 5.0).all()
 
 
 def still(periods=4):
@@ -119,7 +119,7 @@ def still(periods=4):
     return Flight(x, u, CONTROLLER.begin(), jnp.zeros((periods, 6)))
 
 
-def test_errors_are_those_of_the_flight():
+def test_performance_of_a_known_flight():
     flight, reference = still(), sample(hover(), CONTROLLER, 0.1)
     flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[2:, 1].add(jnp.array([0.3, 0.0, 0.4])))
     flight = eqx.tree_at(lambda f: f.u, flight, flight.u.at[0, 0].set(1099.0).at[1, 1].set(1.0))
@@ -131,7 +131,7 @@ def test_errors_are_those_of_the_flight():
     assert not found.crashed
 
 
-def test_yaw_is_compared_on_the_circle():
+def test_yaw_error_wraps():
     flight, reference = still(), sample(hover(yaw=np.pi - 0.1), CONTROLLER, 0.1)
     ahead = sample(hover(yaw=-np.pi + 0.1), CONTROLLER, 0.1)[0]
     flight = eqx.tree_at(lambda f: f.x, flight, jnp.tile(ahead, (5, 1)))
@@ -139,13 +139,13 @@ def test_yaw_is_compared_on_the_circle():
 
 
 @pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
-def test_below_ground_far_away_and_no_number_are_crashes(end):
+def test_crashes_are_below_ground_too_far_or_not_finite(end):
     flight = still()
     flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[3, :3].set(jnp.array(end)))
     assert performance(flight, sample(hover(), CONTROLLER, 0.1), CONTROLLER).crashed
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_arguments_are_refused():
     reference = REFERENCES[0]
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
@@ -159,8 +159,8 @@ def test_what_makes_no_sense_is_refused():
 
 @pytest.mark.parametrize("start", [np.float32, np.float64])
 @pytest.mark.parametrize("wanted", [np.float32, np.float64])
-def test_single_and_double_precision_fly_together(start, wanted):
-    """A plant may also be in another one than all the rest; the controller alone takes what it is given as well."""
+def test_mixed_precision_is_promoted(start, wanted):
+    """For the loop with a plant of another precision, and for the controller alone."""
     with jax.enable_x64(True):
         controller, body = Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
         reference = np.asarray(sample(hover(), controller, 0.02), wanted)
@@ -175,7 +175,7 @@ def test_single_and_double_precision_fly_together(start, wanted):
     np.testing.assert_allclose(flight.u[0], u, rtol=1e-5)
 
 
-def test_the_example_of_the_package_flies(capsys):
+def test_docstring_example_runs(capsys):
     import hybrid_jax.control as package
 
     lines = package.__doc__.split("\n\n")

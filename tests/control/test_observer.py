@@ -17,7 +17,7 @@ START = jnp.zeros(13).at[2].set(2.0).at[3].set(1.0)
 
 
 def watch(field, plant, bandwidth, periods=100, sign=1.0):
-    """The estimates over a flight of the plant under wild speeds, all seen through quaternions of this sign."""
+    """Estimates over a flight of the plant at random speeds; the observer sees quaternions of this sign."""
     speeds = hj.IRIS.hover_speed + 20 * jax.random.normal(jax.random.key(0), (periods, 4))
 
     def tick(carry, u):
@@ -38,23 +38,23 @@ def fields():
 
 
 @pytest.mark.parametrize("name", ["physics", "hybrid", "network"])
-def test_a_constant_disturbance_is_found_at_the_stated_bandwidth(fields, name):
-    """Of a first-order filter: 1 − exp(−β t) of it by time t, whatever the field."""
+def test_estimate_converges_at_the_bandwidth(fields, name):
+    """As a first-order filter, 1 − exp(−β t), for any field."""
     found = watch(fields[name], disturbed(fields[name], TRUE), 5.0)
     share = -np.expm1(-5.0 * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.
     np.testing.assert_allclose(found, share * TRUE, rtol=0, atol=2e-2)
 
 
-def test_without_bandwidth_there_is_no_observer(fields):
+def test_zero_bandwidth_estimates_zero(fields):
     np.testing.assert_array_equal(watch(BODY, disturbed(BODY, TRUE), 0.0), 0.0)
 
 
-def test_an_exact_model_has_no_disturbance():
+def test_exact_model_has_no_disturbance():
     np.testing.assert_allclose(watch(BODY, BODY, 5.0), 0.0, atol=1e-3)
 
 
-def test_the_sign_of_the_quaternion_is_nothing_to_it(fields):
+def test_quaternion_sign_does_not_matter(fields):
     hybrid = fields["hybrid"]
     plant = disturbed(hybrid, TRUE)
     np.testing.assert_array_equal(watch(hybrid, plant, 5.0), watch(hybrid, plant, 5.0, sign=-1.0))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, figure_eight, hover, low_pass, sample, step, upset
+from hybrid_jax.control import Controller, add_body_rates, figure_eight, hover, low_pass, sample, step
 from hybrid_jax.control.attitude import heading
 from hybrid_jax.rotation import body_z, normalise
 
@@ -15,7 +15,7 @@ DT = CONTROLLER.period
 
 
 def spiral(t):
-    """A path on which everything changes."""
+    """A path on which all states change."""
     return jnp.stack([jnp.sin(t), jnp.cos(2 * t), 0.3 * t**2]), jnp.sin(2 * t)
 
 
@@ -25,7 +25,7 @@ def states():
         return np.asarray(sample(spiral, CONTROLLER, 1.0))
 
 
-def test_it_reaches_to_the_end_of_the_last_horizon(states):
+def test_samples_cover_the_last_horizon(states):
     assert len(states) == 100 + CONTROLLER.steps * CONTROLLER.stride + 1
     horizon = CONTROLLER.horizon(jnp.asarray(states), 100)
     np.testing.assert_allclose(horizon[-1], states[-1], rtol=1e-6)
@@ -36,7 +36,7 @@ def test_it_reaches_to_the_end_of_the_last_horizon(states):
         CONTROLLER.horizon(jnp.asarray(states), -1)
 
 
-def test_velocity_and_rates_are_the_derivatives_of_position_and_attitude(states):
+def test_velocity_and_rates_are_derivatives(states):
     # Central differences of second order: 1e-4 of the third derivatives, which are below 20.
     np.testing.assert_allclose((states[2:, :3] - states[:-2, :3]) / (2 * DT), states[1:-1, 7:10], rtol=0, atol=1e-3)
     turning = (states[2:, 3:7] - states[:-2, 3:7]) / (2 * DT)
@@ -44,7 +44,7 @@ def test_velocity_and_rates_are_the_derivatives_of_position_and_attitude(states)
     np.testing.assert_allclose(turning[::10], found, rtol=0, atol=2e-3)
 
 
-def test_thrust_points_along_what_the_path_asks_for_and_the_nose_along_the_yaw(states):
+def test_attitude_follows_acceleration_and_yaw(states):
     acceleration = (states[2:, 7:10] - states[:-2, 7:10]) / (2 * DT) + [0, 0, hj.IRIS.gravity]
     asked = acceleration / np.linalg.norm(acceleration, axis=1, keepdims=True)
     np.testing.assert_allclose(np.asarray(body_z(states[1:-1, 3:7].T)).T, asked, rtol=0, atol=1e-3)
@@ -53,32 +53,32 @@ def test_thrust_points_along_what_the_path_asks_for_and_the_nose_along_the_yaw(s
 
 
 @pytest.mark.parametrize("speed", [3.5, 6.0])
-def test_the_figure_eight_is_as_fast_as_asked(speed):
+def test_figure_eight_reaches_its_top_speed(speed):
     flown = np.linalg.norm(sample(figure_eight(speed), CONTROLLER, 10.0)[:, 7:10], axis=1)
     assert flown.max() == pytest.approx(speed, rel=1e-3)
     assert flown.min() > 0.3 * speed
 
 
-def test_hover_and_both_sides_of_a_step_stand_still():
+def test_hover_and_step_have_zero_velocity():
     samples = sample(step(to=(2.0, 0.0, 1.0), at=0.5, yaw=1.0, altitude=1.5), CONTROLLER, 1.0)
     np.testing.assert_array_equal(samples[:, 7:], 0)
     np.testing.assert_allclose(samples[0], sample(hover((0.0, 0.0, 1.5)), CONTROLLER, 1.0)[0])
     np.testing.assert_allclose(samples[-1], sample(hover((2.0, 0.0, 2.5), yaw=1.0), CONTROLLER, 1.0)[0], atol=1e-6)
 
 
-def test_the_low_pass_is_low_for_two_fifths_of_the_time():
+def test_low_pass_is_low_for_two_fifths_of_the_time():
     altitude = np.asarray(sample(low_pass(low=0.15, high=1.0, every=5.0), CONTROLLER, 9.0)[:, 2])
     assert altitude.min() == pytest.approx(0.15, abs=1e-4)
     assert altitude.max() == pytest.approx(1.0, abs=1e-4)
     assert np.mean(altitude < 0.15 + 0.085) == pytest.approx(0.4, abs=0.03)
 
 
-def test_an_upset_adds_rates():
+def test_add_body_rates():
     state = sample(hover(), CONTROLLER, 1.0)[0]
-    np.testing.assert_array_equal(upset(state) - state, 6.0 * np.eye(13)[10])
+    np.testing.assert_array_equal(add_body_rates(state) - state, 6.0 * np.eye(13)[10])
 
 
-def test_what_makes_no_sense_is_refused():
+def test_invalid_parameters_are_refused():
     with pytest.raises(ValueError, match="high"):
         low_pass(low=1.0, high=0.5)
     with pytest.raises(ValueError, match="top_speed"):
@@ -98,11 +98,11 @@ def test_what_makes_no_sense_is_refused():
         (lambda: step(to=(1.0, 2.0)), "to must be three numbers"),
         (lambda: step(to=(1.0, 2.0, 3.0), at=np.nan), "at must be a finite number"),
         (lambda: low_pass(speed=np.inf), "speed must be a finite number"),
-        (lambda: upset(jnp.zeros(4)), r"state \(13,\) expected"),
-        (lambda: upset(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
+        (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
+        (lambda: add_body_rates(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
         (lambda: sample(None, CONTROLLER, 1.0), "path must be a function of time"),
     ],
 )
-def test_a_place_or_a_number_that_is_none_is_refused(make, said):
+def test_invalid_arguments_are_refused(make, said):
     with pytest.raises(ValueError, match=said):
         make()

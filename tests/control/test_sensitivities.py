@@ -1,4 +1,4 @@
-"""Laws of a step's derivative: it is autodiff's, for any field, and that of what is flown."""
+"""The Jacobian of a step equals that of autodiff, for any field."""
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +7,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.sensitivities import advanced
+from hybrid_jax.control.sensitivities import advance_with_jacobian
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import ForcedBody
@@ -21,31 +21,31 @@ SCALING = InputScaling(hj.IRIS.hover_speed, hj.IRIS.hover_speed / 10)
 
 
 def network(inputs="all", outputs="all", norm="batch", linear=False):
-    """With every number of it at work."""
+    """A network in which every parameter matters."""
     known = {"hidden": 8, "scaling": SCALING, "vehicle": hj.IRIS}
     made = make_residual(jax.random.key(1), inputs=inputs, outputs=outputs, norm=norm, linear=linear, **known)
     return jax.tree.map(lambda leaf: leaf + 0.3 + 0.2 * jnp.sin(jnp.arange(leaf.size)).reshape(leaf.shape), made)
 
 
 class Spun(hj.AbstractVectorField):
-    """A user's own field, of which nothing is known but what it returns."""
+    """A user's field without a registered derivative."""
 
     def __call__(self, x, u):
         return jnp.sin(x) + jnp.concatenate([x[5:9] * u / 600, x[:9]])
 
 
-SAFE = hj.Hybrid(FORCED, network("near_ground", "rotors", "none", linear=True))
+INVARIANT = hj.Hybrid(FORCED, network("near_ground", "rotors", "none", linear=True))
 FIELDS = {
     "physics": BODY,
     "paper": hj.Hybrid(BODY, network()),
     "layer norm": hj.Hybrid(BODY, network(norm="layer")),
-    "no place": hj.Hybrid(BODY, network("no_xy", norm="none")),
-    "from the body": hj.Hybrid(BODY, network("body", "motion")),
-    "safe": SAFE,
-    "safe, observed": disturbed(SAFE, jnp.ones(6)),
+    "no x, y": hj.Hybrid(BODY, network("no_xy", norm="none")),
+    "body frame": hj.Hybrid(BODY, network("body", "motion")),
+    "invariant": INVARIANT,
+    "invariant, disturbed": disturbed(INVARIANT, jnp.ones(6)),
     "no physics": network(),
     "frozen": hj.Hybrid(BODY, Frozen(LinearResidual(jnp.ones((13, 17)) / 50, jnp.ones(13)))),
-    "one's own": Spun(),
+    "user": Spun(),
 }
 
 
@@ -59,13 +59,13 @@ def samples(count=3):
 
 @pytest.mark.parametrize("unit_quaternion", [True, False], ids=["|q| = 1", "|q| as it is"])
 @pytest.mark.parametrize("name", FIELDS)
-def test_the_jacobian_of_a_step_is_that_of_autodiff(name, unit_quaternion):
-    """In double precision, where nothing hides behind rounding."""
+def test_jacobian_of_a_step_equals_autodiff(name, unit_quaternion):
+    """In double precision."""
 
     def both(field, x, u):
         expected = jax.jacfwd(lambda x, u: advance(field, x, u, DT, unit_quaternion), argnums=(0, 1))(x, u)
         state = advance(field, x, u, DT, unit_quaternion)
-        return advanced(field, x, u, DT, unit_quaternion), (state, jnp.concatenate(expected, axis=1))
+        return advance_with_jacobian(field, x, u, DT, unit_quaternion), (state, jnp.concatenate(expected, axis=1))
 
     with jax.enable_x64(True):
         field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), FIELDS[name])

@@ -1,0 +1,117 @@
+"""Simulate closed-loop flights: one compiled program for each structure of prediction model."""
+
+import time
+from collections import Counter, defaultdict
+from collections.abc import Sequence
+from functools import partial
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from experiments.closed_loop.scenarios import FORCES, PATHS, Flight, Scenario
+from hybrid_jax.control import (
+    Controller,
+    add_body_rates,
+    fly,
+    open_loop_costs,
+    performance,
+    relative_cost_error,
+    sample,
+)
+from hybrid_jax.io.archive import Arrays
+from hybrid_jax.sim.forces import Wrench
+from hybrid_jax.sim.quadrotor import Quadrotor
+from hybrid_jax.state import POSITION, STATE_SIZE
+from hybrid_jax.sweep.lanes import LaneMap, lane, stack
+
+WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of all
+CALL_EVERY = 50  # calls between two whose open-loop cost is computed
+DRAW_EVERY = 5  # states between two that are kept for figures
+
+
+class ClosedLoopRunner:
+    """Flies scenarios with one controller.
+
+    Args:
+        seconds: length of a flight.
+        scenarios: all that will be flown; programs are compiled for the largest.
+    """
+
+    def __init__(self, controller: Controller, seconds: float, scenarios: Sequence[Scenario]):
+        references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
+        starts = references[:, 0].copy()
+        spinning = list(PATHS).index("upset")
+        starts[spinning] = add_body_rates(jnp.asarray(references[spinning, 0]))
+        self.shared = (references, starts)
+        self._function = partial(simulate, controller)
+        self._capacity: Counter = Counter()
+        for scenario in scenarios:
+            self._capacity |= Counter(structure(flight) for flight in scenario.flights())
+        self._programs: dict[tuple, LaneMap] = {}
+
+    def fly(self, scenario: Scenario) -> tuple[Arrays, dict[str, Any]]:
+        """Results of all flights of a scenario, one per row, and the time they took without compiling [s]."""
+        groups = defaultdict(list)
+        flights = list(scenario.flights())
+        for i, flight in enumerate(flights):
+            groups[structure(flight)].append(i)
+        lanes = {key: stack([flights[i] for i in chosen]) for key, chosen in groups.items()}
+        for key in groups:
+            self._run(key, lanes[key], 0)  # compiles, flies nothing
+        began, worked = time.perf_counter(), time.process_time()
+        results: dict[int, Arrays] = {}
+        for key, chosen in groups.items():
+            found = self._run(key, lanes[key], len(chosen))
+            results |= {i: lane(found, place) for place, i in enumerate(chosen)}
+        spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
+        return stack([results[i] for i in range(len(flights))]), spent
+
+    def _run(self, key: tuple, lanes: Flight, active: int) -> Arrays:
+        """Fly the first `active` lanes. They are padded to the capacity, so that all scenarios share a program."""
+        capacity = self._capacity[key]
+        if key not in self._programs:
+            width = min(WIDTH.get(jax.default_backend(), -(-capacity // jax.device_count())), capacity)
+            self._programs[key] = LaneMap(self._function, width)
+        padded = lane(lanes, np.resize(np.arange(len(lanes.path)), capacity))
+        return self._programs[key](padded, self.shared, np.ones(capacity), range(active))
+
+
+def structure(flight: Flight) -> tuple:
+    """What flights must have in common to be stacked: the tree of the model, and its shapes and dtypes."""
+    leaves, tree = jax.tree.flatten(flight.model)
+    return tree, *((leaf.shape, leaf.dtype) for leaf in leaves)
+
+
+def simulate(
+    controller: Controller, flight: Flight, references: Float[Array, "k n 13"], starts: Float[Array, "k 13"]
+) -> dict[str, Array]:
+    """Fly one flight: `Performance`, open-loop costs of some calls and their relative error, and states."""
+    offset = jnp.zeros(STATE_SIZE).at[POSITION].set(flight.home)
+    reference, x0 = references[flight.path] + offset, starts[flight.path] + offset
+    truth = Quadrotor(flight.vehicle, (_weighted_forces(flight.shares),))
+
+    def plant(x, u, t):
+        return truth.step(x, u, t, controller.period)
+
+    flown = fly(plant, flight.model, reference, x0, controller, flight.bandwidth)
+    costs = open_loop_costs(plant, flown, reference, controller, range(CALL_EVERY, len(flown.u), CALL_EVERY))
+    return {
+        **vars(performance(flown, reference, controller)),
+        "promised": costs.predicted,
+        "realised": costs.actual,
+        "excess": relative_cost_error(costs, controller),
+        "states": flown.x[::DRAW_EVERY],
+    }
+
+
+def _weighted_forces(shares: Float[Array, " f"]):
+    """The sum of FORCES, each times its share."""
+
+    def force(x, u, t, parameters) -> Wrench:
+        wrenches = [each(x, u, t, parameters) for each in FORCES]
+        return Wrench(*(jnp.tensordot(shares, jnp.stack(parts), 1) for parts in zip(*wrenches, strict=True)))
+
+    return force
