@@ -1,4 +1,4 @@
-"""Trajectories of a vector field under inputs that are held over each interval, by any one-step solver of diffrax for ODEs.
+"""Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs.
 
 A single solve that looks up its input by time would be wrong: a stage at the end of a step reads the next input. So
 each interval is a solver step of its own, with its input as `args`, and a `scan` goes over the intervals.
@@ -89,6 +89,8 @@ def _prepared(solver: diffrax.AbstractSolver, dtype) -> diffrax.AbstractSolver:
     Diffrax takes tolerances from an adaptive step size controller, which fixed steps have not. Its default, a
     checkpointed loop, cannot be differentiated inside `shard_map`, where the runs of a sweep are.
     """
+    if isinstance(solver, diffrax.HalfSolver):
+        return eqx.tree_at(lambda half: half.solver, solver, _prepared(solver.solver, dtype))
     if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
         tolerance = 1e-5 if jnp.finfo(dtype).bits < 64 else 1e-10
         tolerances = tolerance, tolerance, optimistix.max_norm
