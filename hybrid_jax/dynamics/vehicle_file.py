@@ -1,4 +1,4 @@
-"""A vehicle file read whole: what flies, what else is known of it, and what may be learned.
+"""Vehicle files in TOML: constants, nominal values of further terms, and names of learned parameters.
 
 learn = ["Ix", "Iy", "k_rotors", "drag", "aerodynamic_moment"]    # names of `multirotor.SHAPES`; above all tables
 
@@ -28,15 +28,15 @@ TABLES = ("vehicle", "learn", "terms")
 
 @dataclass(frozen=True)
 class VehicleDescription:
-    """What a vehicle file says.
+    """The content of a vehicle file.
 
     Attributes:
         vehicle: the known constants and nominal values.
-        terms: nominal values of what a rigid body leaves out.
-        learn: names of `multirotor.SHAPES`, and "motor_time_constant" where the rotors' lag is to be found.
+        terms: nominal values of the terms beyond a rigid body.
+        learn: names of `multirotor.SHAPES`, and "motor_time_constant" to estimate the rotors' lag.
 
     Raises:
-        ValueError: a name of nothing that can be learned.
+        ValueError: an unknown parameter name.
     """
 
     vehicle: Vehicle
@@ -48,7 +48,7 @@ class VehicleDescription:
 
     @property
     def learns_motor_lag(self) -> bool:
-        """Whether the rotors' time constant is to be found from the logs."""
+        """Whether to estimate the rotors' time constant from the logs."""
         return LAG in self.learn
 
     def physics(self) -> Multirotor:
@@ -57,10 +57,10 @@ class VehicleDescription:
 
 
 def check_learned(learn: tuple[str, ...]) -> None:
-    """Refuse names of nothing that a field or, of the rotors' lag, the logs can teach.
+    """Raise if `learn` contains an unknown parameter name.
 
     Raises:
-        ValueError: what is there to be named, or which names do not go together.
+        ValueError: the known names, or which names do not go together.
     """
     if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
         raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
@@ -70,13 +70,13 @@ def check_learned(learn: tuple[str, ...]) -> None:
 
 
 def of_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """Those names that a field learns: all but the rotors' lag."""
+    """The names of the field's parameters: all but the rotors' lag."""
     return tuple(name for name in learn if name != LAG)
 
 
 def load_description(path: str | Path, variant: str | None = None) -> VehicleDescription:
-    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; without the last two it is a rigid body that learns
-    Ix, Iy and k.
+    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; by default, a rigid body that
+    learns Ix, Iy and k.
 
     Args:
         variant: as for `load_vehicle`.
