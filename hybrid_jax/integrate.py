@@ -1,4 +1,4 @@
-"""Trajectories of a vector field under inputs that are held over each interval, by any diffrax solver for ODEs.
+"""Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs.
 
 A single solve that looks up its input by time would be wrong: a stage at the end of a step reads the next input. So
 each interval is a solver step of its own, with its input as `args`, and a `scan` goes over the intervals.
@@ -97,6 +97,8 @@ def _prepared(solver: diffrax.AbstractSolver, dtype) -> diffrax.AbstractSolver:
     Diffrax takes tolerances from an adaptive step size controller, which fixed steps have not. Its default, a
     checkpointed loop, cannot be differentiated inside `shard_map`, where the runs of a sweep are.
     """
+    if isinstance(solver, diffrax.HalfSolver):
+        return eqx.tree_at(lambda half: half.solver, solver, _prepared(solver.solver, dtype))
     if isinstance(solver, diffrax.AbstractImplicitSolver) and not isinstance(solver.root_finder.rtol, float):  # pyright: ignore[reportAttributeAccessIssue]
         tolerance = 1e-5 if jnp.finfo(dtype).bits < 64 else 1e-10
         tolerances = tolerance, tolerance, optimistix.max_norm
@@ -121,7 +123,7 @@ def rollout(
 
     Args:
         dt: length of an interval [s].
-        solver: of diffrax, for ODEs; by default `RK4`.
+        solver: a one-step method of diffrax for ODEs; by default `RK4`.
         substeps: solver steps of equal length in each interval.
 
     Raises:
@@ -171,8 +173,9 @@ def checked(
     solver = RK4() if solver is None else solver
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
-    if solver.term_structure is not diffrax.AbstractTerm:
-        raise ValueError(f"solver must be one for ODEs; {type(solver).__name__} needs several terms or noise")
+    # A step starts at time zero, of which a multistep method would remember the wrong ones.
+    if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
+        raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
     slope = check_field(
         field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
     )

@@ -1,24 +1,23 @@
-"""f_p of a real multirotor: the rigid body with what else physics knows of it, and with what is learned chosen by name.
+"""f_p of a real multirotor: the rigid body with further terms, and with learned parameters chosen by name.
 
     ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
     m f = C (τ_y, −τ_x, 0) − D Rᵀv,   E = diag(1, 1, 0)
 
 T and τ are thrust and torque of the four rotors about a centre of mass that need not be the origin of their positions;
 a rotor's thrust is k_i u_i², with one k or four. Linear rotor drag D, the moment A that grows with the velocity in the
-body frame and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
+body frame, and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
 dynamics subject to rotor drag for accurate tracking of high-speed trajectories", 2018 (A there has the other sign). The
-gain G takes torque of the rotors away, or adds to it, where their speeds are not to be trusted for it. C is for a cable
-that pulls at 1/C below the centre of mass: no state of the vehicle tells where its load swings, but the rotors hold the
-moment of the pull, and tell it.
+gain G scales the torque of the rotors, where it cannot be computed from their speeds. C models a cable that pulls at
+1/C below the centre of mass: the state does not contain the position of the load, but the rotors' torque balances the
+moment of the pull, and so reveals it.
 
-S and λ are no physics but the estimator's. Many take all force of flight to be along the body's z axis, so that drag,
-wind or a cable reach their velocity v̂ from the position alone, d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the
-thrust. Then v − v̂ is λ times the force that a log shows there, which is f and what a residual adds to it
-(`apply_residual`). The gain S of each axis says the same of drag alone, and of other errors in scale.
+S and λ describe the state estimator. Many assume that all force but gravity is along the body's z axis, and correct
+their velocity v̂ for drag, wind or a cable by the position alone: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the
+thrust. Then v − v̂ is λ times the force in the log, which is f and what a residual adds to it (`apply_residual`). The
+gain S of each axis models the same for drag alone, and other errors of scale.
 
-The rotors' lag behind what a log says of them is no part of the field but a change to the log: as four more states they
-would start each window unknown, and a window is about as long as the lag. A log knows their past; see
-`hybrid_jax.flights.rotor_lag`.
+The lag of the rotors is not part of the field but applied to the log: as four more states, the rotor speeds would be
+unknown at the start of each window, which is about as long as the lag. See `hybrid_jax.flights.rotor_lag`.
 """
 
 from collections.abc import Callable
@@ -42,17 +41,16 @@ Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if 
 class Multirotor(AbstractRigidBody):
     """The rigid body with `Terms`; with the default ones and names it is `RigidBody`.
 
-    Parameters are held as deviations from nominal, so that all start at zero and one learning rate fits them all: what
-    is positive as log(value / nominal), the rest in units of the vehicle's weight and arm, taken at 1 m/s and 10 rad/s.
-    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
+    Parameters are deviations from nominal, so that all start at zero and one learning rate fits them all: positive ones
+    as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s.
 
     Attributes:
         deviations: of each learned parameter, by name; shapes as in `SHAPES`.
         vehicle: the known constants and the nominal values.
-        terms: the nominal values of what a rigid body has not; those that are zero and not learned cost nothing.
+        terms: the nominal values of the further terms; those that are zero and not learned cost nothing.
 
     Raises:
-        ValueError: parameters of another name, k beside k_rotors, or no vehicle or terms.
+        ValueError: an unknown parameter name, both k and k_rotors, or no vehicle or terms.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -87,7 +85,7 @@ class Multirotor(AbstractRigidBody):
         return evaluate_columns(self.of_rows, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
-        """A residual force, too, moves the position before the log's velocity has seen it."""
+        """A residual force, too, changes the position before it shows in the estimated velocity."""
         lag = _constants(self.vehicle, self.terms, self.entries())["velocity_lag"]
         if not _is_present(lag):
             return residual
@@ -101,12 +99,12 @@ class Multirotor(AbstractRigidBody):
 
     @property
     def of_rows(self) -> Callable[[dict[str, Rows], Rows, Rows], Float[Array, " 13 *b"]]:
-        """ẋ as a function of the entries of θ_p, x and u, which it reads one by one without putting them together."""
+        """ẋ as a function of the entries of θ_p, x and u, which spares stacking and unstacking them."""
         return partial(_of_rows, self.vehicle, self.terms)
 
 
 def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
-    """The multirotor at its nominal values, of which those named in `learn` are learned.
+    """The multirotor at its nominal values, which learns the parameters named in `learn`.
 
     Raises:
         ValueError: a name that is not in `SHAPES`, or k beside k_rotors.
@@ -116,9 +114,9 @@ def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms 
 
 
 def with_vehicle(field: Multirotor, vehicle: Vehicle) -> Multirotor:
-    """The field on another vehicle, such as the same one with a payload, with θ_p what it was in SI units.
+    """The field on another vehicle, such as the same one with a payload, with the same θ_p in SI units.
 
-    The same deviations would not do: they are relative to the vehicle's nominal values, weight and arm.
+    Its deviations differ, as they are relative to the vehicle's nominal values, weight and arm.
     """
     nominal, units = nominal_values(vehicle, field.terms), units_of(vehicle)
 
@@ -151,7 +149,7 @@ def _of_rows(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u:
 
 
 def _specific_force(vehicle: Vehicle, constants: Constants, velocity, torque):
-    """What pushes the body beside its thrust, in its frame [m/s²]: drag, and a cable that the rotors' torque holds."""
+    """Specific force without thrust in the body frame [m/s²]: drag, and a cable that the rotors' torque balances."""
     drag, pull = constants["drag"], constants["cable_pull"]
     x, y, z = 0.0, 0.0, 0.0
     if _is_present(drag):
@@ -162,7 +160,7 @@ def _specific_force(vehicle: Vehicle, constants: Constants, velocity, torque):
 
 
 def _faster(constants: Constants, velocity, force):
-    """By how much the position moves faster than a log's velocity, in the body frame [m/s]."""
+    """ṗ less the estimated velocity, in the body frame [m/s]."""
     gain, lag = constants["velocity_gain"], constants["velocity_lag"]
     x, y, z = 0.0, 0.0, 0.0
     if _is_present(gain, absent=1.0):
@@ -173,7 +171,7 @@ def _faster(constants: Constants, velocity, force):
 
 
 def _in_air(constants: Constants, velocity, omega: Rows, torque):
-    """The torque with the moments of the air."""
+    """The torque including aerodynamic moments."""
     moment, damping = constants["aerodynamic_moment"], constants["rate_damping"]
     if _is_present(moment):
         torque = [part + _dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
@@ -183,7 +181,7 @@ def _in_air(constants: Constants, velocity, omega: Rows, torque):
 
 
 def _in_world(attitude, parts) -> Array | float:
-    """A vector of the body, or its first entries where the others are zero, in the world."""
+    """A body vector, or its first entries where the others are zero, in the world frame."""
     return jnp.stack([_dot(row[: len(parts)], parts) for row in attitude]) if _is_present(parts) else 0.0
 
 

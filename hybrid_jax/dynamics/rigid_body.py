@@ -22,7 +22,7 @@ LEARNED = ("Ix", "Iy", "k")
 
 
 class AbstractRigidBody(AbstractVectorField):
-    """A field whose state of 13 is that of state.py and whose parameters have physical units."""
+    """A field whose state is that of state.py (13) and whose parameters have physical units."""
 
     @abstractmethod
     def theta(self) -> dict[str, Array]:
@@ -33,8 +33,6 @@ class RigidBody(AbstractRigidBody):
     """A rigid body carried by four rotors, with no drag, ground effect or wind.
 
     θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
-    The code reads x[0], x[1], …, so x (13,) and u (4,) may carry trailing batch axes.
-
     Attributes:
         log_ratios: log(Ix / nominal), log(Iy / nominal), log(k / nominal).
         vehicle: the known constants and the nominal values.
@@ -65,7 +63,7 @@ class RigidBody(AbstractRigidBody):
         return evaluate_columns(RigidBody.of_rows, self, x, u)
 
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-        """ẋ from the entries of x and u one by one, so that nothing is put together to be taken apart again."""
+        """ẋ from the entries of x and u, which spares stacking and unstacking them."""
         q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
         theta = self.theta()
         thrust, torque = _wrench(self.vehicle, theta["k"], u)
@@ -78,14 +76,14 @@ class RigidBody(AbstractRigidBody):
 
 
 class ForcedBody(RigidBody):
-    """A rigid body to which a residual is a force and a torque, not accelerations.
+    """A rigid body for which a residual is a force and a torque, not an acceleration.
 
-    What the residual says of v̇ and ω̇ holds at the nominal inertia; at another, ω̇ is nominal / I times that. So what was
-    learned of the air and the ground stays true of a vehicle whose inertia changes. The mass is known.
+    The residual's v̇ and ω̇ hold at the nominal inertia; at another one, its ω̇ is scaled by nominal / I. So a learned
+    aerodynamic torque remains valid when the inertia changes. The mass is known.
     """
 
     def yielding(self) -> Float[Array, " 13"]:
-        """By what ẋ of a residual is multiplied: ones, but nominal / I for ω̇ about x and y."""
+        """The factors of a residual's ẋ: nominal / I for ω̇ about x and y, else 1."""
         easier = [jnp.exp(-self.log_ratios[name]) for name in ("Ix", "Iy")]
         return jnp.ones(STATE_SIZE, jnp.result_type(*easier)).at[BODY_RATES.start : -1].set(jnp.stack(easier))
 
@@ -117,16 +115,16 @@ def perturbed_by(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
 
 
 def moves_a_rigid_body(field) -> bool:
-    """Whether a rigid body is anywhere in a field, so that a state of 13 is that of state.py."""
+    """Whether a field contains a rigid body, so that its state is that of state.py."""
     parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
     return any(isinstance(part, AbstractRigidBody) for part in parts)
 
 
 def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
-    """Refuse starts of a rigid body whose quaternion is no rotation; of another field's nothing is known.
+    """Check that initial states of a rigid body hold unit quaternions; accept any state of another field.
 
     Raises:
-        ValueError: the place of the first and its norm.
+        ValueError: the index of the first quaternion that is not of unit norm, and its norm.
     """
     if x0.shape[-1:] == (STATE_SIZE,) and moves_a_rigid_body(field):
         checks.unit_quaternions("x0", x0)

@@ -1,4 +1,4 @@
-"""What is nominal of a multirotor beyond a rigid body, and the names, shapes and units of what a field may learn."""
+"""Terms of a multirotor beyond the rigid body, and names, shapes and units of all learnable parameters."""
 
 import math
 from dataclasses import dataclass
@@ -18,7 +18,7 @@ SIGNED = {
     "velocity_gain": (3,),
     "velocity_lag": (),
 }
-SHAPES = POSITIVE | SIGNED  # of what a field may learn, by name
+SHAPES = POSITIVE | SIGNED  # of all learnable parameters
 
 
 Three = tuple[float, float, float]
@@ -26,7 +26,7 @@ Three = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Terms:
-    """Nominal values of what a rigid body leaves out; by default there is none of it. Body frame, SI units.
+    """Nominal values of the terms beyond a rigid body, absent by default. Body frame, SI units.
 
     Attributes:
         torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
@@ -36,7 +36,7 @@ class Terms:
         aerodynamic_moment: A, one row for each of the three moments [N s].
         rate_damping: B [N m s].
         velocity_gain: S, of the position's derivative over the velocity in a log.
-        velocity_lag: λ, by which a log's velocity follows what pushes the vehicle across its thrust [s].
+        velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
         motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
 
     Raises:
@@ -60,16 +60,16 @@ class Terms:
 
 
 def check_names(learn) -> None:
-    """Refuse names of what cannot be learned, or not at once.
+    """Check the names of learned parameters.
 
     Raises:
-        ValueError: the first such name, and which ones there are.
+        ValueError: an unknown name, one given twice, or two that are not identifiable together.
     """
     for name in learn:
         if name not in tuple(SHAPES):
             raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {checks.short_repr(name)}")
     if len(set(learn)) != len(tuple(learn)):
-        raise ValueError(f"learn names something twice: {', '.join(learn)}")
+        raise ValueError(f"learn must not name a parameter twice, got {', '.join(learn)}")
     if {"k", "k_rotors"} <= set(learn):
         raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
 
