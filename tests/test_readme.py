@@ -1,5 +1,6 @@
 """What the README shows is what happens."""
 
+import os
 import re
 import subprocess
 import sys
@@ -19,17 +20,20 @@ def test_the_library_example_recovers_the_pendulums_length(tmp_path):
     (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     script = tmp_path / "example.py"
     script.write_text(code)
-    done = subprocess.run([sys.executable, script], cwd=ROOT, capture_output=True, text=True, timeout=300)
+    environment = os.environ | {"PYTHONPATH": str(ROOT)}
+    run = [sys.executable, script]
+    done = subprocess.run(run, cwd=tmp_path, env=environment, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
-    length, loss = map(float, re.fullmatch(r"length (\S+) validation loss (\S+)\n", done.stdout).groups())
-    # Damping pulls at the length until the network has taken it over; 5 % is far inside what a wrong sign would do.
-    assert abs(length / 0.7 - 1) < 0.05
-    assert loss < 1e-3
+    assert done.stdout.startswith("Adapted to 20 windows by least_squares: converged")
+    (length,) = re.findall(r"\nlength (\S+)\n", done.stdout)
+    # Damping pulls at the length until the network has taken it over; 3 % is far inside what a wrong sign would do.
+    assert abs(float(length) / 0.8 - 1) < 0.03
 
 
 def test_the_names_that_it_gives_are_there():
     names = set(re.findall(r"`(hybrid_jax(?:\.\w+)+)[`(]", README))
-    assert {"hybrid_jax.runtime.configure", "hybrid_jax.dynamics.disturbance"} <= names
+    assert "hybrid_jax.runtime.configure" in names
+    assert all(hasattr(hybrid_jax, name) for name in re.findall(r"`hj\.(\w+)", README))
     assert "runtime" in hybrid_jax.__all__
     for name in names:
         found = hybrid_jax
