@@ -139,6 +139,7 @@ def test_rates_that_do_not_go_with_the_field_are_refused(rates):
 # Name → a function of windows; each finite or refused, if the windows are those of a pendulum of moderate speed.
 OF_WINDOWS = {
     "fit_least_squares": lambda w, n: fit_least_squares(SWING, w, max_steps=n).field,
+    "adapt": lambda w, n: hj.adapt(SWING, w).field,
     "covariance": lambda w, n: uncertainty.covariance_of(SWING, w, chunk=n),
     "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
     "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_jax.io.datasets import Dataset, config_hash, content_hash, load_dataset, save_dataset
+from hybrid_jax.io.datasets import Dataset, content_hash, load_dataset, save_dataset
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.trajectories import Trajectories
 
@@ -72,23 +72,6 @@ def test_truncated_files_are_refused(file, share):
     assert "truncated" in refusal(file)
 
 
-def test_any_flipped_byte_is_noticed(file):
-    """Every 997th byte: data, header and directory; the zip's own slack is the one place that may change nothing."""
-    content = file.read_bytes()
-    digest = content_hash(load_dataset(file))
-    unnoticed = 0
-    for place in range(0, len(content), 997):
-        flipped = bytearray(content)
-        flipped[place] ^= 0x10
-        file.write_bytes(flipped)
-        try:
-            assert content_hash(load_dataset(file)) == digest
-            unnoticed += 1
-        except ValueError:
-            pass
-    assert unnoticed <= 1
-
-
 @pytest.mark.parametrize("missing", [False, True])
 def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     with zipfile.ZipFile(file) as archive:
@@ -103,19 +86,17 @@ def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     assert "checksum differs" in refusal(file)
 
 
-def test_missing_and_other_files_are_refused(tmp_path):
-    assert "no such file" in refusal(tmp_path / "none.npz")
-    stranger = tmp_path / "stranger.npz"
-    np.savez(stranger, a=np.zeros(3))
-    assert "not a hybrid_jax dataset" in refusal(stranger)
-    text = tmp_path / "text.npz"
-    text.write_text("hello")
-    assert "not a hybrid_jax dataset" in refusal(text)
-    array = tmp_path / "array.npz"
-    with array.open("wb") as handle:
-        np.save(handle, np.zeros(3))
-    assert "not a hybrid_jax dataset" in refusal(array)
+@pytest.mark.parametrize("content", [b"hello", {"a": np.zeros(3)}, np.zeros(3)], ids=["text", "npz", "npy"])
+def test_other_files_are_refused(content, tmp_path):
+    path = tmp_path / "stranger.npz"
+    with path.open("wb") as file:
+        if isinstance(content, bytes):
+            file.write(content)
+        else:
+            np.savez(file, **content) if isinstance(content, dict) else np.save(file, content)
+    assert "not a hybrid_jax dataset" in refusal(path)
     assert "not a hybrid_jax dataset" in refusal(tmp_path)
+    assert "no such file" in refusal(tmp_path / "none.npz")
 
 
 def test_another_configuration_names_the_fields_that_differ(file):
@@ -123,6 +104,8 @@ def test_another_configuration_names_the_fields_that_differ(file):
     assert "seed is 0, expected 1" in message
     assert "vehicle.mass is 1.5, expected 1.6" in message
     assert "inertia" not in message
+    assert load_dataset(file, {"seed": 0}).config == load_dataset(file).config  # others may be there
+    assert "horizon is null, expected 3" in refusal(file, expected_config={"horizon": 3})
 
 
 def test_overwriting_is_explicit(file, dataset):
@@ -169,8 +152,3 @@ def test_subsets_are_nested(file):
         loaded.first("train", 21)
     with pytest.raises(ValueError, match="no split 'validation', only"):
         loaded.first("validation")
-
-
-def test_config_hash_ignores_order_and_sees_values():
-    assert config_hash(CONFIG) == config_hash(dict(reversed(CONFIG.items())))
-    assert config_hash(CONFIG) != config_hash({**CONFIG, "seed": 1})

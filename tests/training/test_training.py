@@ -155,14 +155,13 @@ def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
     assert state.best_epoch == 1
 
 
-def test_without_a_better_epoch_patience_alone_decides():
-    state = trained(pendulum(LENGTH, DAMPING), 0.0, min_epochs=0, patience=7)
-    assert (state.status, state.epochs) == ("ok", 8)
-
-
-def test_the_cap_is_marked():
-    state = trained(pendulum(0.8, DAMPING), min_epochs=20, max_epochs=7)
-    assert (state.status, state.epochs) == ("capped", 7)
+@pytest.mark.parametrize(
+    ("rules", "ended"),
+    [({"min_epochs": 0, "patience": 7}, ("ok", 8)), ({"min_epochs": 20, "max_epochs": 7}, ("capped", 7))],
+)
+def test_patience_or_the_cap_ends_a_run_that_gets_no_better(rules, ended):
+    state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
+    assert (state.status, state.epochs) == ended
 
 
 def test_a_run_that_is_not_over_is_marked_running():
@@ -267,6 +266,21 @@ def test_a_weight_is_that_of_a_regulariser_or_is_refused():
     )
     assert eqx.tree_equal(usual, same)
     assert usual.history.train[0] < other.history.train[0]
+
+
+class Stopped(AbstractVectorField):
+    """A wrapper that hides its field from differentiation."""
+
+    gain: jax.Array
+    field: AbstractVectorField
+
+    def __call__(self, x, u):
+        return self.gain * jax.lax.stop_gradient(self.field(x, u))
+
+
+def test_a_batch_norm_whose_statistics_cannot_be_recorded_is_refused():
+    with pytest.raises(ValueError, match=r"field: Stopped holds a BatchNorm whose minibatch statistics"):
+        trained(Stopped(jnp.ones(()), residual_network(2, 1, KEY, hidden=4)))
 
 
 class Stiff(AbstractVectorField):
