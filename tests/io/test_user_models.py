@@ -143,15 +143,15 @@ def local_field(gain=2.0, size=3, dtype=np.float32):
 
 
 def with_activation(function):
-    return eqx.tree_at(lambda field: field.net.activation, FIELDS["perceptron"], function)
+    return eqx.tree_at(lambda field: field.network.activation, FIELDS["perceptron"], function)
 
 
 # Name → model that a file cannot rebuild, the same with other weights, and the part that is the reason.
 SKELETONS = {
     "local class": (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
-    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/net/activation"),
-    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/net/activation"),
-    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/net/activation.*prediction"),
+    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/network/activation"),
+    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/network/activation"),
+    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/network/activation.*prediction"),
 }
 
 

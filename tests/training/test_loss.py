@@ -9,8 +9,8 @@ from pendulum import pendulum
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import RK4, along, rollout_batch, rollout_minibatch
-from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.training.loss import REGULARISERS, Minibatch, cosine, minibatch
+from hybrid_jax.networks.mlp import residual_network, zero_output
+from hybrid_jax.training.loss import REGULARISERS, cosine, minibatch
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories
 
@@ -53,25 +53,16 @@ def regulariser(name, field, batch):
     return REGULARISERS[name](field, batch, rollout_minibatch(field, batch.x0, batch.u, batch.dt, RK4()))
 
 
-def silent(field):
-    """A residual whose output is zero everywhere."""
-    zero = (jnp.zeros_like(field.weight_out), jnp.zeros_like(field.bias_out))
-    return eqx.tree_at(lambda field: (field.weight_out, field.bias_out), field, zero)
-
-
 def network(seed=0):
     return residual_network(2, 1, jax.random.key(seed), hidden=5)
 
 
-def test_a_minibatch_has_features_first():
+def test_a_minibatch_has_features_first_and_its_step_static(batch):
     cut = windows()
-    turned = minibatch(cut, RK4())
-    assert turned.x.shape == (STEPS, 2, WINDOWS)
-    assert turned.dt == DT
-    for i in range(WINDOWS):
-        np.testing.assert_array_equal(turned.x0[:, i], cut.x0[i])
-        np.testing.assert_array_equal(turned.u[..., i], cut.u[i])
-        np.testing.assert_array_equal(turned.x[..., i], cut.x[i])
+    assert batch.dt == DT
+    assert len(jax.tree.leaves(batch)) == 3
+    for name in ("x0", "u", "x"):
+        np.testing.assert_array_equal(getattr(batch, name), np.moveaxis(getattr(cut, name), 0, -1))
 
 
 def test_trajectory_correlation_is_the_paper_s_formula(batch):
@@ -159,7 +150,7 @@ def test_residual_norm_is_the_mean_square_of_the_residual(batch):
 def test_gradients_are_finite_where_the_residual_is_zero(name, precision, batch):
     with jax.enable_x64(precision == np.float64):
         field, here = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), silent(network())), batch)
+            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), zero_output(network())), batch)
         )
         value, slope = eqx.filter_value_and_grad(lambda field: regulariser(name, field, here))(field)
     assert abs(value) < 1e-10
@@ -183,11 +174,6 @@ def test_the_loss_is_the_error_plus_the_weighted_regulariser(batch):
 def test_a_field_without_two_parts_has_no_regulariser(batch):
     for field in (pendulum(0.7), network()):
         assert loss(field, batch, cosine, 1e3) == loss(field, batch, None, 0.0)
-
-
-def test_minibatch_is_a_pytree_with_its_step_static(batch):
-    assert isinstance(batch, Minibatch)
-    assert len(jax.tree.leaves(batch)) == 3
 
 
 def test_a_regulariser_by_name_is_refused_where_it_is_set():

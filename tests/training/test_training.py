@@ -7,14 +7,14 @@ import numpy as np
 import optax
 import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
-from systems import SYSTEMS
+from systems import SYSTEMS, Dense
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
@@ -113,12 +113,10 @@ def test_exact_physics_leaves_a_silent_residual_silent():
     x0[:, 3], x0[:, 7:] = 1, rng.normal(size=(40, 6))
     u = np.asarray(IRIS.hover_speed + 30 * rng.normal(size=(40, 10, 4)), np.float32)
     network = residual_network(13, 4, KEY, hidden=8, scaling=InputScaling(IRIS.hover_speed, 60.0))
-    zero = (jnp.zeros_like(network.weight_out), jnp.zeros_like(network.bias_out))
-    silent = eqx.tree_at(lambda network: (network.weight_out, network.bias_out), network, zero)
     push = {}
     for truth in (rigid_body(IRIS), Dragged(rigid_body(IRIS))):
         flown = Trajectories(x0, u, np.asarray(jax.jit(rollout_batch)(truth, x0, u, 0.01)), 0.01)
-        field = Hybrid(rigid_body(IRIS), silent)
+        field = Hybrid(rigid_body(IRIS), zero_output(network))
         state = trained(field, Hybrid(0.0, 3e-3), train=flown, validation=flown, max_epochs=40, min_epochs=40)
         forces = jax.vmap(state.best.residual)(x0, u[:, 0])[:, VELOCITY]
         push[type(truth)] = float(jnp.sqrt(jnp.mean(jnp.square(forces))))
@@ -195,17 +193,8 @@ def test_each_epoch_sees_every_window_once():
         np.testing.assert_allclose(state.history.train[0], rollout_mse(field, TRAIN), rtol=1e-5)  # float32 sums
 
 
-class Learned(AbstractVectorField):
-    """A field of Equinox' own parts; its activation is a function, which is no array."""
-
-    network: eqx.nn.MLP
-
-    def __call__(self, x, u):
-        return self.network(jnp.concatenate([x, u]))
-
-
 def test_a_field_with_leaves_that_are_no_arrays_trains():
-    field = Learned(eqx.nn.MLP(3, 2, 16, 1, activation=lambda z: jax.nn.softplus(z), key=KEY))
+    field = Dense(eqx.nn.MLP(3, 2, 16, 1, activation=lambda z: jax.nn.softplus(z), key=KEY))
     with pytest.warns(UserWarning, match="activation is the callable .*, which is not `hybrid_jax.portable`"):
         state = trained(field, 0.01, max_epochs=40)
     assert state.best_mse < 0.5 * validated(field)
