@@ -174,12 +174,13 @@ def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
 @pytest.mark.filterwarnings("ignore:.*like=")
 def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
     hj.save(tmp_path / "model.npz", local_field())
-    with pytest.raises(ValueError, match=r"'field/net/bias' is float32\[3\], expected float32\[4\]$"):
-        hj.load(tmp_path / "model.npz", like=local_field(size=4))
-    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected int32\[\]$"):
-        hj.load(tmp_path / "model.npz", like=local_field(dtype=np.int32))
-    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected none$"):
-        hj.load(tmp_path / "model.npz", like=pendulum())
+    for like, said in (
+        (local_field(size=4), r"'field/net/bias' is float32\[3\], expected float32\[4\]$"),
+        (local_field(dtype=np.int32), r"'field/gain' is float32\[\], expected int32\[\]$"),
+        (pendulum(), r"'field/gain' is float32\[\], expected none$"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            hj.load(tmp_path / "model.npz", like=like)
 
 
 def test_a_skeleton_with_other_static_values_is_refused(tmp_path):

@@ -15,6 +15,7 @@ from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories
 
 DT, WINDOWS, STEPS = 0.05, 6, 4
+TURN, OTHER = np.array([[0.3, 1.2], [-0.7, 0.4]]), np.array([[0.5, -0.1], [0.2, 0.9]])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -78,13 +79,12 @@ def test_trajectory_correlation_is_the_paper_s_formula(batch):
 
 
 def test_trajectory_correlation_grows_with_the_residual_from_zero(batch):
-    small = network()
-    strengths = [0.0, 0.1, 0.3, 1.0, 3.0]
-    values = []
-    for strength in strengths:
-        parts = (strength * small.weight_out, strength * small.bias_out)
-        residual = eqx.tree_at(lambda field: (field.weight_out, field.bias_out), small, parts)
-        values.append(float(regulariser("trajectory_correlation", Hybrid(pendulum(), residual), batch)))
+    def value(strength):
+        residual = affine([[0.0, 0.3], [-0.2, 0.1]], (0.5, -1.0))
+        scaled = jax.tree.map(lambda leaf: strength * leaf, residual)
+        return float(regulariser("trajectory_correlation", Hybrid(pendulum(), scaled), batch))
+
+    values = list(map(value, (0.0, 0.1, 0.3, 1.0, 3.0)))
     assert abs(values[0]) < 1e-25  # ½‖a − b‖² of equal a and b
     assert values == sorted(values)
     assert values[-1] > 1e-4
@@ -102,42 +102,37 @@ def test_trajectory_correlation_shows_small_differences_in_single_precision(batc
 
 
 def test_cosine_is_one_for_parallel_and_zero_for_orthogonal_parts(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
-    for factor in (2.0, -0.5):
-        # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
-        np.testing.assert_allclose(
-            regulariser("cosine", Hybrid(affine(turn), affine(factor * turn)), batch), 1, rtol=0, atol=1e-7
-        )
-    assert abs(regulariser("cosine", Hybrid(affine(turn), affine(quarter @ turn)), batch)) < 1e-20
+    def value(other):
+        return regulariser("cosine", Hybrid(affine(TURN), affine(other)), batch)
+
+    # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
+    np.testing.assert_allclose([value(2.0 * TURN), value(-0.5 * TURN)], 1, rtol=0, atol=1e-7)
+    assert abs(value(np.array([[0.0, -1.0], [1.0, 0.0]]) @ TURN)) < 1e-20  # a quarter turn
 
 
 def test_inner_product_is_the_squared_product_of_the_parts(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    other = np.array([[0.5, -0.1], [0.2, 0.9]])
-    field = Hybrid(affine(turn), affine(other, (0.3, -0.2)))
+    field = Hybrid(affine(TURN), affine(OTHER, (0.3, -0.2)))
     predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
     x = np.concatenate([batch.x0[None], np.asarray(predicted)[:-1]])
-    products = np.einsum("tib,tib->tb", np.einsum("ij,tjb->tib", turn, x),
-                         np.einsum("ij,tjb->tib", other, x) + np.array([0.3, -0.2])[:, None])  # fmt: skip
+    products = np.einsum("tib,tib->tb", np.einsum("ij,tjb->tib", TURN, x),
+                         np.einsum("ij,tjb->tib", OTHER, x) + np.array([0.3, -0.2])[:, None])  # fmt: skip
     found = regulariser("inner_product", field, batch)
     np.testing.assert_allclose(found, np.mean(products**2), rtol=1e-12)
-    assert abs(regulariser("inner_product", Hybrid(affine(turn), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
+    assert abs(regulariser("inner_product", Hybrid(affine(TURN), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
 
 
 def test_pearson_is_the_correlation_and_blind_to_offset_and_scale(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    other = affine([[0.5, -0.1], [0.2, 0.9]])
-    predicted = rollout_minibatch(Hybrid(affine(turn), other), batch.x0, batch.u, DT, RK4())
+    other = affine(OTHER)
+    predicted = rollout_minibatch(Hybrid(affine(TURN), other), batch.x0, batch.u, DT, RK4())
 
     def value(residual):
-        return REGULARISERS["pearson"](Hybrid(affine(turn), residual), batch, predicted)
+        return REGULARISERS["pearson"](Hybrid(affine(TURN), residual), batch, predicted)
 
     x, _ = along(batch.x0, predicted, batch.u)
-    expected = [np.corrcoef(a, b)[0, 1] ** 2 for a, b in zip(turn @ x, other.matrix @ x, strict=True)]
+    expected = [np.corrcoef(a, b)[0, 1] ** 2 for a, b in zip(TURN @ x, other.matrix @ x, strict=True)]
     np.testing.assert_allclose(value(other), np.mean(expected), rtol=1e-9)  # the 1e-12 under the roots
     np.testing.assert_allclose(value(affine(-7 * other.matrix, (5.0, -3.0))), value(other), rtol=1e-9)
-    np.testing.assert_allclose(value(affine(3 * turn, (1.0, 1.0))), 1, rtol=1e-9)
+    np.testing.assert_allclose(value(affine(3 * TURN, (1.0, 1.0))), 1, rtol=1e-9)
 
 
 def test_residual_norm_is_the_mean_square_of_the_residual(batch):

@@ -19,7 +19,7 @@ from hybrid_jax.state import VELOCITY
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
 from hybrid_jax.training.driver import FitInterrupted
-from hybrid_jax.training.fitting import DIVERGED, RUNNING, make_run_config, run, start
+from hybrid_jax.training.fitting import DIVERGED, make_run_config, run, start
 from hybrid_jax.training.loss import residual_norm, trajectory_correlation
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -162,11 +162,6 @@ def test_patience_or_the_cap_ends_a_run_that_gets_no_better(rules, ended):
     assert (state.status, state.epochs) == ended
 
 
-def test_a_run_that_is_not_over_is_marked_running():
-    plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
-    assert _run(start(pendulum(), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3)).status == RUNNING
-
-
 def test_the_key_decides_the_order_of_minibatches(damped):
     again, other = (trained(pendulum(0.8, DAMPING), key=key) for key in (KEY, jax.random.key(5)))
     assert again.field.log_length == damped.field.log_length
@@ -238,11 +233,6 @@ def test_bad_data_are_refused_by_name(name):
     spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[2, 3, 1].set(jnp.inf))
     with pytest.raises(ValueError, match=rf"^{name}: x\[2, 3, 1\] is not finite"):
         trained(pendulum(), **{name: spoiled})
-
-
-def test_fewer_windows_than_a_minibatch_are_refused():
-    with pytest.raises(ValueError, match="19 windows, fewer than batch_size=20"):
-        trained(pendulum(), train=TRAIN[:19])
 
 
 def test_a_weight_is_that_of_a_regulariser_or_is_refused():
