@@ -30,20 +30,25 @@ class Objective(Protocol):
         Raises:
             ValueError: windows that cannot be used; `name` is the argument's name.
         """
+        ...
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
         """A minibatch in the layout that `loss` needs."""
+        ...
 
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
     ) -> tuple[Float[Array, ""], PyTree]:
         """The loss on a minibatch, and what `observe` needs of the evaluation."""
+        ...
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
         """The field with its running statistics updated by the minibatch; learned parameters stay as they are."""
+        ...
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
         """The validation loss, which early stopping and the choice of the best epoch use."""
+        ...
 
 
 class AbstractTrajectoryLoss:
