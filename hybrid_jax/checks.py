@@ -1,7 +1,7 @@
-"""What public functions ask of their arguments: a check names the argument as the user wrote it, in one line.
+"""Checks of arguments. Each raises a ValueError of one line: the argument's name, what was expected, and the value.
 
-Raise outside, carry inside: in a compiled or mapped program an array has a shape and a type but no numbers yet (it is
-traced), so there no number is looked at, and what comes of bad ones is carried.
+In a compiled or mapped program an array is traced: it has a shape and a type but no numbers yet. There the numbers are
+not checked.
 """
 
 import math
@@ -18,7 +18,10 @@ Numbers = jax.Array | np.ndarray
 
 UNIT = 1e-2  # |q| may be off 1 by this: rounding and noise are far below, and it is 2 % of the thrust
 MOST = np.iinfo(np.int32).max  # what a count may be in a compiled program
-SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of what is not zero there
+SMALLEST, LARGEST = (
+    float(np.finfo(np.float32).tiny),
+    float(np.finfo(np.float32).max),
+)  # of positive numbers
 
 
 def is_traced(value: Any) -> bool:
@@ -27,11 +30,7 @@ def is_traced(value: Any) -> bool:
 
 
 def real_array(name: str, value: Any) -> Numbers:
-    """The value as an array of real numbers; what is an array stays as it is.
-
-    Raises:
-        ValueError: it is none, for example text, objects, complex numbers or lists of unequal lengths.
-    """
+    """The value as an array of real numbers; an array is returned unchanged."""
     try:
         array = value if isinstance(value, Numbers) else np.asarray(value)
     except (TypeError, ValueError) as error:
@@ -43,21 +42,13 @@ def real_array(name: str, value: Any) -> Numbers:
 
 
 def floating(name: str, value: Any) -> jax.Array:
-    """The value as a JAX array of floating-point numbers, all finite as far as they are known.
-
-    Raises:
-        ValueError: no array of real numbers, or the first one that is not finite in JAX's precision.
-    """
+    """The value as a JAX array of finite floating-point numbers."""
     array = finite(name, real_array(name, value))
     return jnp.asarray(array, None if jnp.issubdtype(array.dtype, jnp.floating) else float)
 
 
 def finite(name: str, array: Numbers) -> Numbers:
-    """The array unchanged.
-
-    Raises:
-        ValueError: the place of the first number that is not finite, or too large for JAX's precision.
-    """
+    """The array unchanged. Refuses a number that is not finite in JAX's precision, and says where it is."""
     if is_traced(array):
         return array
     values, precision = np.asarray(array), jnp.result_type(float)
@@ -72,11 +63,7 @@ def finite(name: str, array: Numbers) -> Numbers:
 
 
 def unit_quaternions(name: str, states: Numbers) -> None:
-    """Refuse states (..., 13) whose quaternion is none of a rotation.
-
-    Raises:
-        ValueError: the place of the first and its norm.
-    """
+    """Refuse states (..., 13) whose quaternion is not of norm 1."""
     if is_traced(states):
         return
     norms = np.linalg.norm(np.asarray(states)[..., QUATERNION], axis=-1)
@@ -98,43 +85,27 @@ def real(value: Any) -> float | None:
 
 
 def number(name: str, value: Any) -> None:
-    """Refuse what is no number that is finite in single precision.
-
-    Raises:
-        ValueError: the name, what was expected and the value.
-    """
+    """Require a number that is finite in single precision."""
     found = real(value)
     if not is_traced(value) and (found is None or not abs(found) <= LARGEST):
         raise ValueError(f"{name} must be a finite number, got {short_repr(value)}")
 
 
 def positive(name: str, value: Any, what: str = "a positive finite number") -> None:
-    """Refuse what is no positive finite number in single precision.
-
-    Raises:
-        ValueError: the name, what was expected and the value.
-    """
+    """Require a positive number that is finite in single precision."""
     found = real(value)
     if not is_traced(value) and (found is None or not SMALLEST <= found <= LARGEST):
         raise ValueError(f"{name} must be {what}, got {short_repr(value)}")
 
 
 def not_negative(name: str, value: Any) -> None:
-    """Refuse what is neither zero nor as `positive` wants it.
-
-    Raises:
-        ValueError: as `positive`.
-    """
+    """Require zero or a number that passes `positive`."""
     if real(value) != 0:
         positive(name, value, "a finite number of at least 0")
 
 
 def count(name: str, value: Any, least: int = 1) -> None:
-    """Refuse what is no integer of at least `least`.
-
-    Raises:
-        ValueError: the name, what was expected and the value.
-    """
+    """Require an integer of at least `least`."""
     if is_traced(value):
         return
     found = value.item() if isinstance(value, Numbers) and value.ndim == 0 else value
@@ -143,11 +114,7 @@ def count(name: str, value: Any, least: int = 1) -> None:
 
 
 def key(name: str, value: Any) -> None:
-    """Refuse what is no random key of JAX, of the new kind or the old.
-
-    Raises:
-        ValueError: the name and how to make one.
-    """
+    """Require a random key of JAX, typed or raw."""
     if isinstance(value, jax.Array | np.ndarray):
         new = jnp.issubdtype(value.dtype, jax.dtypes.prng_key) and value.ndim == 0
         if new or (value.dtype == np.uint32 and value.shape == (2,)):

@@ -1,10 +1,9 @@
-"""Metrics of predictions: L_MSE of windows and ρ, the relative improvement by adaptation (paper, Sec. 3.3, Eq. 9)."""
+"""L_MSE of predicted windows (paper, Sec. 3.3)."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
@@ -59,14 +58,3 @@ def mean_over(
     rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
     parts = [jax.lax.map(errors, chunks).ravel()] if whole else []
     return jnp.mean(jnp.concatenate([*parts, errors(rest)] if len(rest) else parts))
-
-
-def improvement(source_mse: Float[Array, "*n"], adapted_mse: Float[Array, "*n"]) -> Float[Array, "*n"]:
-    """ρ = (L^S − L^T) / L^S: 1 is perfect, 0 no improvement, below 0 worse than the source model (paper, Eq. 9).
-
-    Raises:
-        ValueError: a source_mse that is not positive.
-    """
-    if not checks.is_traced(source_mse) and not np.all(np.asarray(source_mse) > 0):
-        raise ValueError(f"source_mse must be positive, got {source_mse}")
-    return (source_mse - adapted_mse) / source_mse

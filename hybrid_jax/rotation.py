@@ -61,12 +61,6 @@ def normalise(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch 4"]:
     return q / jnp.linalg.norm(q, axis=-1, keepdims=True)
 
 
-def angle_between(a: Float[Array, "*batch 4"], b: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:
-    """The angle [rad, 0 … π] of the rotation from a to b; q and −q are the same rotation."""
-    alignment = jnp.abs(jnp.sum(normalise(a) * normalise(b), axis=-1))
-    return 2 * jnp.arccos(jnp.clip(alignment, 0.0, 1.0))
-
-
 def from_axis_angle(axis: Vector, angle: Float[Array, ""]) -> Quaternion:
     """The rotation by angle [rad] about a unit axis."""
     half = jnp.asarray(angle) / 2

@@ -53,7 +53,8 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     if not isinstance(trajectories, Trajectories):
         raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
-    for part, array in (("x0", x0), ("u", u), ("x", x)):
+    parts = {"x0": x0, "u": u, "x": x}
+    for part, array in parts.items():
         found = getattr(array, "dtype", type(array).__name__)
         if not isinstance(array, checks.Numbers) or found not in (np.float32, np.float64):
             raise ValueError(f"{name}: {part} must be an array of float32 or float64, got {found}")
@@ -69,7 +70,7 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
     if isinstance(trajectories.dt, np.ndarray | jax.Array):
         raise ValueError(f"{name}: dt must be a number and no array, such as float(dt)")
     checks.positive(f"{name}: dt", trajectories.dt, "a positive number of seconds")
-    for part, array in (("x0", x0), ("u", u), ("x", x)):
+    for part, array in parts.items():
         checks.finite(f"{name}: {part}", array)
     return trajectories
 
@@ -80,9 +81,9 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
     Raises:
         ValueError: the index of the first such quaternion and its norm.
     """
-    for part in ("x0", "x"):
-        if trajectories.x0.shape[-1] == STATE_SIZE:
-            checks.unit_quaternions(f"{name}: {part}", getattr(trajectories, part))
+    if trajectories.x0.shape[-1] == STATE_SIZE:
+        checks.unit_quaternions(f"{name}: x0", trajectories.x0)
+        checks.unit_quaternions(f"{name}: x", trajectories.x)
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
@@ -117,10 +118,8 @@ def windows_of(
     Raises:
         ValueError: arrays of the wrong shape or type, a dt that is not positive, or fewer intervals than one window.
     """
-    states, inputs = (
-        np.asarray(checks.real_array("states", states)),
-        np.asarray(checks.real_array("inputs", inputs)),
-    )
+    arrays = {"states": states, "inputs": inputs}
+    states, inputs = (np.asarray(checks.real_array(name, array)) for name, array in arrays.items())
     if states.ndim != 2 or inputs.ndim != 2 or len(states) != len(inputs) + 1:
         raise ValueError(f"states (t + 1, d) and inputs (t, m) expected, got shapes {states.shape} and {inputs.shape}")
     checks.positive("dt", dt, "a positive number of seconds")

@@ -17,13 +17,8 @@ TOTAL = {"full": 10_000}.get(os.environ.get("CASES", ""), 300)
 def cases(share):
     """This share of all cases, drawn the same way every time."""
     ignored = [HealthCheck.too_slow, HealthCheck.data_too_large, HealthCheck.filter_too_much]
-    return settings(
-        max_examples=max(round(share * TOTAL), 5),
-        derandomize=True,
-        deadline=None,
-        database=None,
-        suppress_health_check=ignored,
-    )
+    same = {"derandomize": True, "deadline": None, "database": None, "suppress_health_check": ignored}
+    return settings(max_examples=max(round(share * TOTAL), 5), **same)
 
 
 def outcome(function, *arguments, naming="", **named):
@@ -101,15 +96,7 @@ def spoiled(draw, array, harm=0.5):
 def odd(*sound):
     """A sound number most of the time, or what a user might pass in its place."""
     wrong = (0, -1, -0.5, 0.0, np.nan, np.inf, -np.inf, 1e300, 1e-320, 10**400, 2**31, 2.5, True, None, "1", 1j)
-    objects = (
-        Fraction(1, 2),
-        np.float64(-1),
-        np.array(np.nan),
-        np.ones(2),
-        jnp.zeros(()),
-        [1],
-        {},
-        b"1",
-        np.longdouble(-1),
+    objects = (Fraction(1, 2), np.float64(-1), np.array(np.nan), np.ones(2), jnp.zeros(()), [1], {}, b"1")
+    return st.one_of(
+        st.sampled_from(sound), st.sampled_from(sound), st.sampled_from((*wrong, *objects, np.longdouble(-1)))
     )
-    return st.one_of(st.sampled_from(sound), st.sampled_from(sound), st.sampled_from(wrong + objects))

@@ -138,14 +138,10 @@ def windows(field, start, inputs, dt, count, seed):
     return hj.Trajectories(x0, u, jax.jit(hj.rollout_batch)(field, x0, u, dt), dt)
 
 
-def _system(truth, changed, model, start, inputs, dt, counts=(60, 30)) -> System:
-    def made(field, count, seed):
-        return windows(field, start, inputs, dt, count, seed)
-
-    many, few = counts
-    return System(
-        truth, changed, model, made(truth, many, 0), made(truth, few, 1), made(changed, 20, 2), made(changed, few, 3)
-    )
+def _system(truth, changed, model, start, inputs, dt) -> System:
+    drawn = zip((truth, truth, changed, changed), (60, 30, 20, 30), strict=True)
+    made = [windows(field, start, inputs, dt, count, seed) for seed, (field, count) in enumerate(drawn)]
+    return System(truth, changed, model, *made)
 
 
 def _pendulum(wrap=lambda network: network, norm="batch") -> System:
@@ -189,9 +185,8 @@ def _flights(truth, changed, model) -> System:
     def start(rng, n):
         q = np.array([1.0, 0, 0, 0]) + 0.2 * rng.normal(size=(n, 4))
         q /= np.linalg.norm(q, axis=-1, keepdims=True)
-        return np.concatenate(
-            [rng.normal(size=(n, 3)), q, 2 * rng.normal(size=(n, 3)), rng.normal(size=(n, 3))], axis=-1
-        )
+        position, velocity, rates = (scale * rng.normal(size=(n, 3)) for scale in (1, 2, 1))
+        return np.concatenate([position, q, velocity, rates], axis=-1)
 
     def inputs(rng, shape):
         return speed * (1 + 0.1 * rng.normal(size=(shape[0], 1, 4)) + 0.02 * rng.normal(size=(*shape, 4)))

@@ -139,6 +139,7 @@ def test_rates_that_do_not_go_with_the_field_are_refused(rates):
 # Name → a function of windows; each finite or refused, if the windows are those of a pendulum of moderate speed.
 OF_WINDOWS = {
     "fit_least_squares": lambda w, n: fit_least_squares(SWING, w, max_steps=n).field,
+    "adapt": lambda w, n: hj.adapt(SWING, w).field,
     "covariance": lambda w, n: uncertainty.covariance_of(SWING, w, chunk=n),
     "linear": lambda w, n: ridge.linear_residual(SWING, w, n),
     "last layer": lambda w, n: ridge.last_layer(MIXED, w, n),
@@ -170,15 +171,12 @@ def test_intervals_are_finite_or_refused(covariance, level, field):
 
 
 @cases(0.04)
-@given(spoiled(WINDOWS.x), spoiled(WINDOWS.x), odd(1.0), odd(0.5))
-def test_errors_and_gains_are_finite_or_refused(predicted, truth, before, after):
+@given(spoiled(WINDOWS.x), spoiled(WINDOWS.x))
+def test_an_error_is_finite_or_refused(predicted, truth):
     pair = [np.asarray(a, float) for a in (predicted, truth) if isinstance(a, np.ndarray) and a.dtype.kind in "fiu"]
-    if len(pair) == 2:  # these two are called in compiled code: arrays they are, of numbers of any size
+    if len(pair) == 2:  # it is called in compiled code, on arrays of numbers of any size
         found = outcome(metrics.mse, *map(jnp.asarray, pair))
         assert found is None or is_finite(found) or not all(np.abs(a).max(initial=0) < 1e4 for a in pair)
-    if isinstance(before, float) and isinstance(after, float):
-        gain = outcome(metrics.improvement, before, after)
-        assert gain is None or is_finite(gain) or not (np.isfinite(before) and np.isfinite(after))
 
 
 CONSTANTS = {

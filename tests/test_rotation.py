@@ -86,27 +86,6 @@ def test_derivative_is_the_limit_of_a_finite_rotation_about_a_body_axis(q, rates
     np.testing.assert_allclose(rotation.derivative(jnp.asarray(q), jnp.asarray(rates)), slope, rtol=0, atol=1e-9)
 
 
-@given(units(), units())
-@quick
-def test_angle_between_is_symmetric_and_blind_to_sign(a, b):
-    a, b = jnp.asarray(a), jnp.asarray(b)
-    angle = rotation.angle_between(a, b)
-    assert 0 <= angle <= np.pi
-    for other in (rotation.angle_between(b, a), rotation.angle_between(a, -b), rotation.angle_between(-3 * a, b)):
-        # arccos near 1 turns a round-off of 1e-16 into 2 √(2e-16).
-        np.testing.assert_allclose(other, angle, rtol=0, atol=5e-8)
-
-
-@given(units(), vectors, st.floats(0.01, 3.1))
-@quick
-def test_angle_between_is_the_angle_turned(q, axis, angle):
-    assume(np.linalg.norm(axis) > 0.1)
-    turn = rotation.from_axis_angle(jnp.asarray(axis / np.linalg.norm(axis)), jnp.asarray(angle))
-    found = rotation.angle_between(jnp.asarray(q), rotation.multiply(turn, jnp.asarray(q)))
-    # Round-off over the slope of the cosine at the smallest half angle, 1e-16 / sin(0.005), with a margin.
-    np.testing.assert_allclose(found, angle, rtol=0, atol=1e-12)
-
-
 @given(units(), st.floats(0.01, 100))
 @quick
 def test_normalise_gives_the_unit_quaternion_of_the_same_direction(q, length):

@@ -6,50 +6,36 @@ import sys
 
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
-PROGRAM = """
+CONFIGURED = """
 import sys
 from pathlib import Path
 import jax
 from hybrid_jax.runtime import configure, cores
 configure(Path(sys.argv[1]))
+"""
+PROGRAM = f"""{CONFIGURED}
 events = []
 jax.monitoring.register_event_listener(lambda name, **_: events.append(name))
 jax.jit(lambda x: x @ x.T)(jax.numpy.ones((5, 5)))
 assert len(jax.devices()) == cores()
 print(events.count("/jax/compilation_cache/cache_hits"), events.count("/jax/compilation_cache/cache_misses"))
 """
-
-LOOP = """
-import sys
-from pathlib import Path
-import jax
-from hybrid_jax.runtime import configure
-configure(Path(sys.argv[1]))
+LOOP = f"""{CONFIGURED}
 loop = jax.jit(lambda x: jax.lax.scan(lambda x, _: (x - x[::-1] ** 3, None), x, length=10)[0])
 print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_small_call"))
 """
-
-PRECISION = """
-import sys
-from pathlib import Path
-import jax
-from hybrid_jax.runtime import configure
-configure(Path(sys.argv[1]))
+PRECISION = f"""{CONFIGURED}
 print(jax.jit(lambda x: x @ x.T).lower(jax.numpy.ones((5, 5))).as_text().count("precision = [HIGHEST, HIGHEST]"))
 """
-
-IMPORTS = """
-import importlib, pkgutil, sys
-from pathlib import Path
-import jax
+IMPORTS = f"""
+import importlib, pkgutil
 import benchmarks, experiments, hybrid_jax
-from hybrid_jax.runtime import configure, cores
 packages = (benchmarks, experiments, hybrid_jax)
 found = [module for package in packages for module in pkgutil.walk_packages(package.__path__, package.__name__ + ".")]
 names = [module.name for module in found if not module.name.endswith(("__main__", "torch_rivals"))]
 for name in names:
     importlib.import_module(name)
-configure(Path(sys.argv[1]))
+{CONFIGURED}
 assert len(jax.devices()) == cores()
 print(len(names))
 """
@@ -61,10 +47,6 @@ def printed(program, cache, **more):
     run = subprocess.run(command, env=own | more, capture_output=True, text=True, check=False)
     assert run.returncode == 0, run.stderr
     return [int(number) for number in run.stdout.split()]
-
-
-def hits_and_misses(cache):
-    return printed(PROGRAM, cache)
 
 
 def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
@@ -81,17 +63,17 @@ def test_products_are_in_single_precision_on_every_device(tmp_path):
 
 
 def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
-    hits, compiled = hits_and_misses(tmp_path / "here")
+    hits, compiled = printed(PROGRAM, tmp_path / "here")
     assert hits == 0
     assert compiled > 0
     (tmp_path / "here").rename(tmp_path / "there")
-    assert hits_and_misses(tmp_path / "there") == [compiled, 0]
+    assert printed(PROGRAM, tmp_path / "there") == [compiled, 0]
 
 
 def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
-    _, compiled = hits_and_misses(tmp_path)
+    _, compiled = printed(PROGRAM, tmp_path)
     whole, empty = sorted((tmp_path / "programs").glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
     os.truncate(whole, whole.stat().st_size - 1)
     os.truncate(empty, 0)
-    assert hits_and_misses(tmp_path) == [compiled - 2, 2]
-    assert hits_and_misses(tmp_path) == [compiled, 0]
+    assert printed(PROGRAM, tmp_path) == [compiled - 2, 2]
+    assert printed(PROGRAM, tmp_path) == [compiled, 0]

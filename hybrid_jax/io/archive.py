@@ -26,10 +26,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:
-    """Write an archive atomically.
-
-    Args:
-        form: the kind of archive and its version, such as "hybrid_jax model 2".
+    """Write an archive atomically. `form` is its kind and version, such as "hybrid_jax model 2".
 
     Raises:
         ValueError: the metadata are not JSON, or an array is not numeric.
@@ -45,15 +42,12 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
         archive.writestr(zipfile.ZipInfo(HEADER), encode(header))
         for name, array in arrays.items():
             with archive.open(zipfile.ZipInfo(f"{name}.npy"), "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, _contiguous(array), allow_pickle=False)
+                np.lib.format.write_array(entry, np.asarray(array, order="C"), allow_pickle=False)
     write_atomic(path, buffer.getvalue())
 
 
 def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """Read and verify an archive of one of these forms.
-
-    Returns:
-        Its metadata, and its arrays by name.
+    """The metadata and the arrays by name of an archive of one of these forms, after checks.
 
     Raises:
         ValueError: the file is missing, truncated, damaged or of another form; one line that names the file.
@@ -84,7 +78,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
     """
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
-        array = _contiguous(arrays[name])
+        array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would make a vector of a scalar
         found.update(encode([name, array.dtype.str, list(array.shape)]))
         found.update(array.tobytes())
     return found.hexdigest()
@@ -108,11 +102,13 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
     Raises:
         ValueError: two arrays have the same path.
     """
-    paths, leaves, _ = _flatten(eqx.filter(tree, eqx.is_array))
-    if len(set(paths)) < len(paths):
-        twice = next(path for path in paths if paths.count(path) > 1)
-        raise ValueError(f"two arrays have the path {twice!r}: no key of a dictionary may contain '/'")
-    return dict(zip(paths, map(to_numpy, leaves), strict=True))
+    named = {}
+    for keys, leaf in jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))[0]:
+        path = jax.tree_util.keystr(keys, simple=True, separator="/")
+        if path in named:
+            raise ValueError(f"two arrays have the path {path!r}: no key of a dictionary may contain '/'")
+        named[path] = to_numpy(leaf)
+    return named
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
@@ -121,24 +117,20 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) 
     Raises:
         ValueError: paths, shapes or types differ; names `origin` and the first difference.
     """
+
+    def form(array: np.ndarray | None, absent: str) -> str:
+        return absent if array is None else f"{array.dtype}{list(array.shape)}"
+
     expected = named_leaves(like)
     for name in sorted(expected.keys() | arrays.keys()):
-        want, have = expected.get(name), arrays.get(name)
-        if want is None or have is None or (want.shape, want.dtype) != (have.shape, have.dtype):
-            found = "absent" if have is None else f"{have.dtype}{list(have.shape)}"
-            wanted = "none" if want is None else f"{want.dtype}{list(want.shape)}"
+        found, wanted = form(arrays.get(name), "absent"), form(expected.get(name), "none")
+        if found != wanted:
             where = "" if origin is None else f"{origin}: "
             raise ValueError(f"{where}array {name!r} is {found}, expected {wanted}")
     dynamic, rest = eqx.partition(like, eqx.is_array)
-    paths, leaves, structure = _flatten(dynamic)
-    filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(paths, leaves, strict=True)]
+    leaves, structure = jax.tree.flatten(dynamic)
+    filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(expected, leaves, strict=True)]
     return eqx.combine(jax.tree.unflatten(structure, filled), rest)
-
-
-def _flatten(tree: PyTree) -> tuple[list[str], list[Any], Any]:
-    leaves, structure = jax.tree_util.tree_flatten_with_path(tree)
-    names = [jax.tree_util.keystr(path, simple=True, separator="/") for path, _ in leaves]
-    return names, [leaf for _, leaf in leaves], structure
 
 
 def array_type(array: Any) -> dict[str, str]:
@@ -188,8 +180,3 @@ def _read_array(name: str, entry: bytes) -> np.ndarray:
         raise ValueError(f"entry {name!r} is not numeric, or its size is not that of {dtype}{list(shape)}")
     order = "F" if in_fortran_order else "C"
     return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)
-
-
-def _contiguous(array: np.ndarray) -> np.ndarray:
-    # np.ascontiguousarray would make a vector of a scalar.
-    return np.asarray(array, order="C")

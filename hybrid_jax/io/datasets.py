@@ -2,6 +2,7 @@
 
 import platform
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -19,10 +20,9 @@ ARRAYS = ("x0", "u", "x")
 
 @dataclass(frozen=True)
 class Dataset:
-    """Named splits of windows.
+    """Windows by the name of their split.
 
     Attributes:
-        splits: windows by name.
         metadata: JSON values. `config` determines the windows; the rest (versions, counts, …) describes them.
         origin: the file it was read from, for messages.
     """
@@ -61,8 +61,10 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
     path = Path(path)
     _check_splits(path, dataset)
     if path.exists() and not overwrite:
-        if _has_content(path, content_hash(dataset)):
-            return
+        content = content_hash(dataset)
+        with suppress(ValueError):
+            if content_hash(load_dataset(path)) == content:
+                return
         raise ValueError(f"{path}: exists with other content; choose another path or pass overwrite=True")
     header = {"about": dataset.metadata, "splits": _split_table(dataset)}
     save_archive(path, FORMAT, header, _named_arrays(dataset))
@@ -71,9 +73,12 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
 def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = None) -> Dataset:
     """Read and verify a dataset.
 
+    Args:
+        expected_config: entries that its configuration must have; it may have others.
+
     Raises:
-        ValueError: the file is missing, damaged or not a dataset, or its configuration is not the expected one; one
-            line that names the file.
+        ValueError: the file is missing, damaged or not a dataset, or of another configuration; one line that names the
+            file and every entry that differs.
     """
     header, arrays = load_archive(path, FORMAT)
     try:
@@ -85,8 +90,15 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete dataset: lacks {first_line(error)}") from error
     _check_splits(path, dataset)
-    if expected_config is not None:
-        require_config(path, dataset.config, expected_config)
+    expected = expected_config or {}
+    wanted, found = _flatten(expected), _flatten({key: dataset.config.get(key) for key in expected})
+    differing = [
+        f"{key} is {found.get(key, 'absent')}, expected {wanted.get(key, 'absent')}"
+        for key in sorted(found.keys() | wanted.keys())
+        if found.get(key) != wanted.get(key)
+    ]
+    if differing:
+        raise ValueError(f"{path}: other configuration: {'; '.join(differing)}")
     return dataset
 
 
@@ -95,21 +107,15 @@ def content_hash(dataset: Dataset) -> str:
     return digest([dataset.config, _split_table(dataset)], _named_arrays(dataset))
 
 
-def config_hash(config: Mapping[str, Any]) -> str:
-    """SHA-256 (hex) of a configuration. The order of keys does not matter."""
-    return digest(config, {})
-
-
 def versions(*packages: str) -> dict[str, str]:
     """The version of Python and of each package, or "not installed"."""
-    return {"python": platform.python_version()} | {package: _version(package) for package in packages}
-
-
-def _version(package: str) -> str:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return "not installed"
+    found = {"python": platform.python_version()}
+    for package in packages:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "not installed"
+    return found
 
 
 def _check_splits(path: Path | str, dataset: Dataset) -> None:
@@ -128,29 +134,6 @@ def _split_table(dataset: Dataset) -> dict[str, Any]:
 def _named_arrays(dataset: Dataset) -> dict[str, np.ndarray]:
     places = ((name, part) for name in sorted(dataset.splits) for part in ARRAYS)
     return {f"{name}/{part}": np.asarray(getattr(dataset.splits[name], part)) for name, part in places}
-
-
-def _has_content(path: Path, digest: str) -> bool:
-    try:
-        return content_hash(load_dataset(path)) == digest
-    except ValueError:
-        return False
-
-
-def require_config(path: str | Path, found: Mapping[str, Any], expected: Mapping[str, Any]) -> None:
-    """Compare two configurations.
-
-    Raises:
-        ValueError: they differ; one line that names the file and every field that differs.
-    """
-    found, expected = _flatten(found), _flatten(expected)
-    differing = [
-        f"{key} is {found.get(key, 'absent')}, expected {expected.get(key, 'absent')}"
-        for key in sorted(found.keys() | expected.keys())
-        if found.get(key) != expected.get(key)
-    ]
-    if differing:
-        raise ValueError(f"{path}: other configuration: {'; '.join(differing)}")
 
 
 def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:

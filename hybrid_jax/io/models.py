@@ -29,7 +29,6 @@ class Model:
     """A vector field and what is known about it.
 
     Attributes:
-        field: the vector field ẋ = f(x, u).
         about: JSON values, such as where the model comes from and its test error.
     """
 
@@ -41,14 +40,15 @@ class Model:
     ) -> Float[Array, "*n t d"]:
         """The states of one window, or of n, under inputs that are held for dt each.
 
+        To keep the other windows where some diverge, use `rollout_batch`.
+
         Args:
             x0: initial states.
             u: inputs of t intervals.
             dt: length of an interval [s].
 
         Returns:
-            The state at the end of each interval; finite. To keep the other windows where some diverge, use
-            `rollout_batch`.
+            The state at the end of each interval; finite.
 
         Raises:
             ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
@@ -85,7 +85,7 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
             container or module; names its path.
         OSError: the file cannot be written.
     """
-    structure = _structure(field)
+    structure = Structure(field)
     arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
     save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about or {})}, arrays)
     if structure.problem is not None:
@@ -122,7 +122,7 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
     filled = with_leaves({"field": like}, dynamic)["field"]
     saved = static_values(tree)
-    for key, value in static_values(_structure(like).tree).items():
+    for key, value in static_values(Structure(like).tree).items():
         if saved.get(key, value) != value:
             raise ValueError(f"{key} is {saved[key]!r}, but {value!r} in `like`")
     return jax.tree.map(lambda leaf: jnp.asarray(leaf) if isinstance(leaf, np.ndarray) else leaf, filled)
@@ -134,7 +134,7 @@ def check_savable(field: Any) -> str | None:
     In most cases `save` still works, and `load` needs `like`.
     """
     try:
-        return _structure(field).problem
+        return Structure(field).problem
     except ValueError as error:
         return str(error)
 
@@ -145,13 +145,7 @@ def describe(field: eqx.Module) -> Any:
     Raises:
         ValueError: a part of the field has no name that a file could refer to.
     """
-    structure = _structure(field)
+    structure = Structure(field)
     if structure.problem is not None:
         raise ValueError(structure.problem)
     return structure.tree
-
-
-def _structure(field: eqx.Module) -> Structure:
-    if not isinstance(field, eqx.Module):
-        raise ValueError(f"field must be an Equinox module, got {checks.short_repr(field)}")
-    return Structure(field)

@@ -1,4 +1,4 @@
-"""Classes that files name otherwise than the library does today: what keeps files of earlier versions loadable."""
+"""Names of classes in files of earlier versions, and the classes of today."""
 
 from collections.abc import Callable
 from typing import Any

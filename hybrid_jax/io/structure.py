@@ -20,6 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hybrid_jax.checks import short_repr
 from hybrid_jax.io.archive import Arrays, array_type, from_numpy
 from hybrid_jax.io.renamed import RENAMED
 
@@ -88,10 +89,12 @@ class Structure:
         problem: why `decode` cannot rebuild the field, or None.
 
     Raises:
-        ValueError: the field contains an object that cannot be saved; names its path.
+        ValueError: no Equinox module, or one with an object that cannot be saved; names its path.
     """
 
     def __init__(self, field: eqx.Module):
+        if not isinstance(field, eqx.Module):
+            raise ValueError(f"field must be an Equinox module, got {short_repr(field)}")
         self.static_arrays: dict[str, Any] = {}
         self.problem: str | None = None
         try:

@@ -13,12 +13,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.integrate import rollout_batch, rollout_minibatch
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import mean_over
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.training.loss import Minibatch
-from hybrid_jax.training.objective import Settings, TrajectoryLoss
+from hybrid_jax.training.objective import AbstractTrajectoryLoss, Settings
 from hybrid_jax.trajectories import Trajectories, check
 
 MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
@@ -43,7 +42,7 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class ChannelLoss:
+class ChannelLoss(AbstractTrajectoryLoss):
     """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg. Validation leaves L_reg out.
 
     ρ(r) = r² up to `huber` and 2 huber r − huber² beyond (Huber 1964, doubled). It applies to the norm of a channel's
@@ -68,18 +67,8 @@ class ChannelLoss:
             raise ValueError(f"{name}: states of at least {widest} numbers expected, got {windows.x.shape[-1]}")
         return windows
 
-    def batch(self, picked: Trajectories, settings: Settings) -> Minibatch:
-        return TrajectoryLoss().batch(picked, settings)
-
-    def loss(self, field: AbstractVectorField, batch: Minibatch, settings: Settings, weight: Float[Array, ""]):
-        predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
-        value = jnp.mean(self.error(jnp.moveaxis(predicted - batch.x, 1, -1)))
-        if settings.regulariser is not None and isinstance(field, Hybrid):
-            value = value + weight * settings.regulariser(field, batch, predicted)
-        return value, predicted
-
-    def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
-        return TrajectoryLoss().observe(field, batch, seen)
+    def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
+        return jnp.mean(self.error(jnp.moveaxis(difference, 1, -1)))
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: Settings) -> Float[Array, ""]:
         def errors(windows: Trajectories) -> Float[Array, " n"]:
@@ -99,9 +88,7 @@ class ChannelLoss:
 
 
 def channels_from(
-    baseline: AbstractVectorField,
-    windows: Trajectories,
-    parts: Mapping[str, slice] | None = None,
+    baseline: AbstractVectorField, windows: Trajectories, parts: Mapping[str, slice] | None = None
 ) -> tuple[Channel, ...]:
     """Channels scaled by the RMS error of a baseline, such as one of baselines.py, at the end of the windows.
 

@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.scaling import with_scaling
 from hybrid_jax.training.fitting import (
@@ -24,20 +24,21 @@ from hybrid_jax.training.fitting import (
     RUNNING,
     STATUS_NAMES,
     FitState,
+    Optimiser,
     RunConfig,
     make_run_config,
     run_recorded,
     start,
 )
-from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, prepared
+from hybrid_jax.training.objective import AbstractTrajectoryLoss, Learner, Settings, prepared
 from hybrid_jax.trajectories import Trajectories, check
 
 WEIGHT = 1e-3  # λ, where none is given
-PHYSICS_RATE, NETWORK_RATE = 1e-2, 3e-3
-FEW = 100  # so many learned numbers are taken for physical parameters
+RATE = 1e-2
 BLOCK, BLOCK_SECONDS = 200, 0.5  # most epochs of a block, and how long it should take
 
 Report = Callable[[int, FitState], object]
+Shared = tuple[PyTree, Settings, Optimiser]  # validation data as prepared by the objective, …
 
 
 class History(eqx.Module):
@@ -101,7 +102,7 @@ def fit(
     key: PRNGKeyArray,
     *,
     rates: PyTree = None,
-    optimiser: optax.GradientTransformation | None = None,
+    optimiser: Optimiser | None = None,
     min_epochs: int = 100,
     patience: int = 20,
     max_epochs: int = 2000,
@@ -115,8 +116,8 @@ def fit(
 
     Args:
         key: of the order of the minibatches.
-        rates: learning rates of Adam, a tree prefix of the field: a number, or e.g. `Hybrid(1e-2, 3e-3)`. By default
-            1e-2 for the physics of a `Hybrid` and for a field of at most 100 learned numbers, and 3e-3 otherwise.
+        rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
+            `Hybrid(1e-2, 1e-3)` for physics and residual.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
         min_epochs: no early stop before this many epochs.
@@ -131,21 +132,43 @@ def fit(
     Raises:
         ValueError: windows that the objective refuses, that do not match the field, or are of a rigid body and have no
             unit quaternions; fewer training windows than a minibatch; minibatches of one window that are normalised by
-            themselves; a field with nothing to learn; rates that do not match the field; a weight without a
-            regulariser; another argument out of range.
+            themselves; a batch norm that cannot be trained; a field with nothing to learn; rates that do not match the
+            field; a weight without a regulariser; another argument out of range.
         FitInterrupted: Ctrl-C; a KeyboardInterrupt that holds the result so far.
     """
-    settings = default_settings(train) if settings is None else settings
-    data, validated_on = prepared(field, train, validation, key, settings)
-    optimiser = descent(optimiser)
-    rates = default_rates(field, optimiser) if rates is None else rates
+    data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
+    if rates is None:
+        rates = RATE if optimiser is None else 1.0
     rates = _of_each(rates, eqx.filter(field, trainable(field)))
-    weight = default_weight(regulariser_weight, settings)
     make_run_config(rates, 0, 0, min_epochs, patience, max_epochs, weight)  # refuses before the field is evaluated
     field = ready(field, train)
     rates = jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(rates)
     plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
-    return drive(start(field, key, optimiser), plan, data, validated_on, settings, optimiser, progress)
+    return drive(start(field, key, shared[-1]), plan, data, shared, progress)
+
+
+def checked_arguments(
+    field: Learner,
+    train: Trajectories,
+    validation: Trajectories,
+    key: PRNGKeyArray,
+    settings: Settings | None,
+    optimiser: Optimiser | None,
+    weight: float | None,
+) -> tuple[PyTree, Shared, float]:
+    """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
+    if settings is None:
+        settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
+    data, validated_on = prepared(field, train, validation, key, settings)
+    if not isinstance(optimiser, Optimiser | None):
+        raise ValueError(f"optimiser must be an optax.GradientTransformation, got {checks.short_repr(optimiser)}")
+    if weight is not None and settings.regulariser is None and isinstance(settings.objective, AbstractTrajectoryLoss):
+        raise ValueError(
+            f"regulariser_weight is {checks.short_repr(weight)} but settings.regulariser is None; leave it out, or "
+            "take one of hybrid_jax.training.loss.REGULARISERS"
+        )
+    shared = validated_on, settings, ADAM if optimiser is None else _negated(optimiser)
+    return data, shared, WEIGHT if weight is None else weight
 
 
 def _of_each(rates: PyTree, learned: Learner) -> list:
@@ -166,47 +189,9 @@ def ready(field: Learner, train: Trajectories) -> Learner:
     return with_scaling(field, train) if isinstance(field, AbstractVectorField) else field
 
 
-def default_settings(train: Trajectories) -> Settings:
-    """Minibatches of 100 windows, or of all."""
-    return Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
-
-
-def default_rates(field: Learner, optimiser: optax.GradientTransformation = ADAM) -> PyTree:
-    """The learning rates of `fit`: see there."""
-    if optimiser is not ADAM:
-        return 1.0
-    if isinstance(field, Hybrid):
-        return Hybrid(PHYSICS_RATE, NETWORK_RATE)  # pyright: ignore[reportArgumentType]
-    learned = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(field, trainable(field))))
-    return PHYSICS_RATE if learned <= FEW else NETWORK_RATE
-
-
-def default_weight(given: float | None, settings: Settings) -> float:
-    """λ, 1e-3 by default.
-
-    Raises:
-        ValueError: a weight without a regulariser.
-    """
-    if given is None:
-        return WEIGHT
-    if settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
-        raise ValueError(
-            f"regulariser_weight is {checks.short_repr(given)} but settings.regulariser is None; leave it out, or "
-            "take one of hybrid_jax.training.loss.REGULARISERS"
-        )
-    return given
-
-
-def drive(
-    state: FitState,
-    plan: RunConfig,
-    data: PyTree,
-    validated_on: PyTree,
-    settings: Settings,
-    optimiser: optax.GradientTransformation,
-    progress: Report | bool | None,
-) -> FitResult:
+def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progress: Report | bool | None) -> FitResult:
     """Take a run to its end in blocks of epochs, and report the progress between them."""
+    validated_on, settings, optimiser = shared
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most = [np.zeros((0, 2))], 1
@@ -226,26 +211,15 @@ def drive(
     return _result(state, losses)
 
 
-@eqx.filter_jit
-def _block(state, losses, plan, train, validation, settings, until, optimiser):
-    return run_recorded(state, losses, plan, train, validation, settings, until, optimiser)
+_block = eqx.filter_jit(run_recorded)
 
 
 def _result(state: FitState, losses: list[np.ndarray]) -> FitResult:
     return FitResult(state, History(*np.concatenate(losses).T), STATUS_NAMES[int(state.status)])
 
 
-def descent(optimiser: optax.GradientTransformation | None) -> optax.GradientTransformation:
-    """Adam by default; another optimiser with its sign changed, as `fitting` subtracts updates."""
-    if optimiser is None:
-        return ADAM
-    if not isinstance(optimiser, optax.GradientTransformation):
-        raise ValueError(f"optimiser must be an optax.GradientTransformation, got {checks.short_repr(optimiser)}")
-    return _negated(optimiser)
-
-
 @cache  # the same object for the same optimiser, so that its program is compiled once
-def _negated(optimiser: optax.GradientTransformation) -> optax.GradientTransformation:
+def _negated(optimiser: Optimiser) -> Optimiser:
     """The optimiser with updates that are subtracted, as those of `fitting`, rather than added."""
     return optax.chain(optimiser, optax.scale(-1.0))
 

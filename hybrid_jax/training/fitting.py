@@ -15,6 +15,7 @@ from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.training.objective import Learner, Settings
 
 RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
+Optimiser = optax.GradientTransformation
 ADAM = optax.scale_by_adam()
 SHORTCUT = 8  # a run that uses at most 1 / SHORTCUT of its listed windows sorts only that part
 STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
@@ -24,12 +25,9 @@ class RunConfig(eqx.Module):
     """Hyper-parameters that may differ between the runs of a sweep.
 
     Attributes:
-        rates: learning rates, a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
-        subset: indices of the training windows that the run may use, in order.
-        n_train: the run uses the first n_train of `subset`.
-        min_epochs: no early stop before this many epochs.
-        patience: stop after this many epochs without a better validation loss.
-        max_epochs: stop after this many epochs.
+        rates: a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
+        subset: indices of the training windows that the run may use; it uses the first n_train.
+        min_epochs, patience, max_epochs: see `fit`.
         regulariser_weight: λ.
     """
 
@@ -59,7 +57,7 @@ class FitState(eqx.Module):
     key: PRNGKeyArray
 
 
-def start(field: Learner, key: PRNGKeyArray, optimiser: optax.GradientTransformation = ADAM) -> FitState:
+def start(field: Learner, key: PRNGKeyArray, optimiser: Optimiser = ADAM) -> FitState:
     """A run at epoch 0. The key sets the order of the minibatches."""
     zero = jnp.zeros((), jnp.int32)
     infinity = jnp.array(jnp.inf)
@@ -70,18 +68,9 @@ def start(field: Learner, key: PRNGKeyArray, optimiser: optax.GradientTransforma
 
 
 def run(
-    state: FitState,
-    plan: RunConfig,
-    train: PyTree,
-    validation: PyTree,
-    settings: Settings,
-    until: Int[Array, ""] | int,
+    state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings, until: Int[Array, ""] | int
 ) -> FitState:
-    """Continue until the run has stopped or has completed `until` epochs.
-
-    Args:
-        train, validation: as prepared by the objective.
-    """
+    """Continue until the run has stopped or has completed `until` epochs, on data as prepared by the objective."""
     return run_recorded(state, None, plan, train, validation, settings, until)[0]
 
 
@@ -93,16 +82,16 @@ def run_recorded(
     validation: PyTree,
     settings: Settings,
     until: Int[Array, ""] | int,
-    optimiser: optax.GradientTransformation = ADAM,
+    optimiser: Optimiser = ADAM,
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
     """`run` that also records the training and the validation loss of its first epochs in the rows of `losses`."""
-
-    def is_running(state: FitState) -> Bool[Array, ""]:
-        return (state.status == RUNNING) & (state.epoch < until)
-
     first = state.epoch
     # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)
+
+    def is_running(carry) -> Bool[Array, ""]:
+        state = eqx.combine(carry[0], rest)
+        return (state.status == RUNNING) & (state.epoch < until)
 
     def one_epoch(carry):
         state, losses = eqx.combine(carry[0], rest), carry[1]
@@ -112,31 +101,23 @@ def run_recorded(
             losses = losses.at[state.epoch - first].set(row, mode="drop")
         return eqx.filter(after, eqx.is_array), losses
 
-    arrays, losses = jax.lax.while_loop(
-        lambda carry: is_running(eqx.combine(carry[0], rest)), one_epoch, (arrays, losses)
-    )
+    arrays, losses = jax.lax.while_loop(is_running, one_epoch, (arrays, losses))
     return eqx.combine(arrays, rest), losses
 
 
 def _epoch(
-    state: FitState,
-    plan: RunConfig,
-    train: PyTree,
-    validation: PyTree,
-    settings: Settings,
-    optimiser: optax.GradientTransformation,
+    state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings, optimiser: Optimiser
 ) -> tuple[FitState, Float[Array, ""]]:
     """One pass over the training windows in a new order, then a validation; returns the validation loss too."""
     key, order_key = jax.random.split(state.key)
-    order = _shuffled(plan, order_key)
-    batches = plan.n_train // settings.batch_size
-
+    order, size = _shuffled(plan, order_key), settings.batch_size
+    batches = plan.n_train // size
     arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run_recorded`
 
     def update(i, carry):
         arrays, adam, total = carry
-        picked = jax.lax.dynamic_slice(order, (i * settings.batch_size,), (settings.batch_size,))
-        field, adam, value = gradient_step(eqx.combine(arrays, rest), adam, plan, train[picked], settings, optimiser)
+        picked = train[jax.lax.dynamic_slice(order, (i * size,), (size,))]
+        field, adam, value = gradient_step(eqx.combine(arrays, rest), adam, plan, picked, settings, optimiser)
         return eqx.filter(field, eqx.is_array), adam, total + value
 
     arrays, adam, total = jax.lax.fori_loop(0, batches, update, (arrays, state.adam, jnp.zeros(())))
@@ -146,12 +127,7 @@ def _epoch(
 
 
 def gradient_step(
-    field: Learner,
-    adam: PyTree,
-    plan: RunConfig,
-    picked: PyTree,
-    settings: Settings,
-    optimiser: optax.GradientTransformation = ADAM,
+    field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings, optimiser: Optimiser = ADAM
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
     """One optimiser step on one minibatch; running statistics are updated with the same minibatch."""
     learned = trainable(field)
@@ -165,7 +141,11 @@ def gradient_step(
 
     (value, seen), gradient = jax.value_and_grad(objective, has_aux=True)(parameters)
     direction, adam = optimiser.update(gradient, adam, parameters)
-    moved = _descend(plan.rates, parameters, direction)
+
+    def descend(rate, parameters, direction):
+        return jax.tree.map(lambda p, d: (p - rate * d).astype(p.dtype), parameters, direction)
+
+    moved = jax.tree.map(descend, plan.rates, parameters, direction)
     return settings.objective.observe(eqx.combine(moved, rest), batch, seen), adam, value
 
 
@@ -177,28 +157,13 @@ def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, re
     """
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
-    counts = {
-        "n_train": (n_train, 0),
-        "min_epochs": (min_epochs, 0),
-        "patience": (patience, 0),
-        "max_epochs": (max_epochs, 1),
-    }
-    for name, (value, least) in counts.items():
-        checks.count(name, value, least)
+    counts = {"n_train": n_train, "min_epochs": min_epochs, "patience": patience, "max_epochs": max_epochs}
+    for name, value in counts.items():
+        checks.count(name, value, least=int(name == "max_epochs"))
     checks.not_negative("regulariser_weight", regulariser_weight)
-
-    def integer(number) -> Int[Array, "..."]:
-        return jnp.asarray(number, jnp.int32)
-
-    return RunConfig(
-        rates=jax.tree.map(jnp.asarray, rates),
-        subset=integer(subset),
-        n_train=integer(n_train),
-        min_epochs=integer(min_epochs),
-        patience=integer(patience),
-        max_epochs=integer(max_epochs),
-        regulariser_weight=jnp.asarray(regulariser_weight, float),
-    )
+    integers = {name: jnp.asarray(value, jnp.int32) for name, value in (counts | {"subset": subset}).items()}
+    weight = jnp.asarray(regulariser_weight, float)
+    return RunConfig(rates=jax.tree.map(jnp.asarray, rates), regulariser_weight=weight, **integers)
 
 
 def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
@@ -215,13 +180,6 @@ def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
     # A run that uses few of many windows does not pay for sorting all of them.
     few = listed // SHORTCUT
     return jax.lax.cond(plan.n_train <= few, lambda: among(few), lambda: among(listed))
-
-
-def _descend(rates: PyTree, parameters: Learner, direction: PyTree) -> Learner:
-    def part(rate, parameters, direction):
-        return jax.tree.map(lambda p, d: (p - rate * d).astype(p.dtype), parameters, direction)
-
-    return jax.tree.map(part, rates, parameters, direction)
 
 
 def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:

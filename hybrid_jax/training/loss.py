@@ -1,8 +1,8 @@
-"""The training loss L = L_MSE + λ L_reg (paper, Eq. 6 and 7) of a minibatch, features first.
+"""Minibatches, features first, and the regularisers L_reg that keep f_d from replacing f_p.
 
-A regulariser is a function of (hybrid, minibatch, predicted states). It keeps f_d from replacing f_p. There are the
-correlation of trajectories (the paper), inner product, cosine and Pearson correlation of f_p and f_d (Takeishi and
-Kalousis 2023; Osaka et al. 2025), and ‖f_d‖² (Yin et al. 2021, APHYNITY).
+A regulariser is a function of (hybrid, minibatch, predicted states): the correlation of trajectories (paper, Eq. 7);
+inner product, cosine and Pearson correlation of f_p and f_d (Takeishi and Kalousis 2023; Osaka et al. 2025); or ‖f_d‖²
+(Yin et al. 2021, APHYNITY).
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, train_batch
+from hybrid_jax.dynamics.base import Hybrid, train_batch
 from hybrid_jax.integrate import RK4, along, rollout_minibatch
 from hybrid_jax.trajectories import Trajectories
 
@@ -34,11 +34,6 @@ def minibatch(windows: Trajectories, solver: diffrax.AbstractSolver) -> Minibatc
     """The windows with features first and samples last."""
     last = (jnp.moveaxis(a, 0, -1) for a in (windows.x0, windows.u, windows.x))
     return Minibatch(*last, dt=windows.dt, solver=solver)
-
-
-def mse(predicted: Float[Array, "t d *b"], truth: Float[Array, "t d *b"]) -> Float[Array, "*b"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each trajectory (paper, Sec. 3.3)."""
-    return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=1), axis=0)
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
@@ -73,26 +68,8 @@ def residual_norm(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d 
 
 
 REGULARISERS: dict[str, Regulariser] = {
-    "trajectory_correlation": trajectory_correlation,
-    "inner_product": inner_product,
-    "cosine": cosine,
-    "pearson": pearson,
-    "residual_norm": residual_norm,
+    rule.__name__: rule for rule in (trajectory_correlation, inner_product, cosine, pearson, residual_norm)
 }
-
-
-def loss(
-    field: AbstractVectorField,
-    batch: Minibatch,
-    predicted: Float[Array, "t d b"],
-    regulariser: Regulariser | None,
-    weight: Float[Array, ""] | float,
-) -> Float[Array, ""]:
-    """L_MSE averaged over the minibatch, plus weight × regulariser if there is one and the field is a `Hybrid`."""
-    error = jnp.mean(mse(predicted, batch.x))
-    if regulariser is None or not isinstance(field, Hybrid):
-        return error
-    return error + weight * regulariser(field, batch, predicted)
 
 
 def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]):

@@ -1,5 +1,6 @@
 """What a training run minimises and validates on, and the checks before it begins."""
 
+from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
@@ -9,12 +10,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, trainable, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, check_batch_norm, trainable, update_running_stats
+from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import RK4, along, checked, rollout_minibatch
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.networks.normalisation import BatchNorm
-from hybrid_jax.training.loss import Minibatch, Regulariser, loss, minibatch
+from hybrid_jax.training.loss import Minibatch, Regulariser, minibatch
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
@@ -50,23 +51,37 @@ class Objective(Protocol):
         ...
 
 
-@dataclass(frozen=True)
-class TrajectoryLoss:
-    """L_MSE + λ L_reg of predicted trajectories (paper, Sec. 3.3). Validation uses L_MSE alone."""
+class AbstractTrajectoryLoss:
+    """An error of predicted trajectories, plus λ L_reg where the field is a `Hybrid`. Validation leaves L_reg out."""
 
-    def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        return check(windows, name)
+    @abstractmethod
+    def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
+        """The error of a minibatch, given predicted minus true states."""
 
     def batch(self, picked: Trajectories, settings: "Settings") -> Minibatch:
         return minibatch(picked, settings.solver)
 
     def loss(self, field: AbstractVectorField, batch: Minibatch, settings: "Settings", weight: Float[Array, ""]):
         predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
-        return loss(field, batch, predicted, settings.regulariser, weight), predicted
+        value = self.mean_error(predicted - batch.x)
+        if settings.regulariser is not None and isinstance(field, Hybrid):
+            value = value + weight * settings.regulariser(field, batch, predicted)
+        return value, predicted
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
         x, u = along(batch.x0, seen, batch.u)
         return update_running_stats(field, x, u)
+
+
+@dataclass(frozen=True)
+class TrajectoryLoss(AbstractTrajectoryLoss):
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories, plus λ L_reg (paper, Sec. 3.3, Eq. 6)."""
+
+    def prepare(self, windows: Trajectories, name: str) -> Trajectories:
+        return check(windows, name)
+
+    def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
+        return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: "Settings") -> Float[Array, ""]:
         return rollout_mse(field, data, solver=settings.solver)
@@ -99,13 +114,15 @@ def prepared(
     """Both sets of windows as prepared by the objective, after all checks of what a run is given.
 
     Raises:
-        ValueError: windows that the objective refuses, that do not match the field, or are of a rigid body and have no
-            unit quaternions; fewer windows than a minibatch; a minibatch that `check_minibatch` refuses; a field with
-            nothing to learn; or no random key.
+        ValueError: as `fit` for its windows, key, field and settings.
     """
     data = settings.objective.prepare(train, "train")
     validated_on = settings.objective.prepare(validation, "validation")
-    _check_learns(field)
+    if not any(jax.tree.leaves(trainable(field))):
+        raise ValueError(
+            f"field: {type(field).__name__} has nothing to learn, no array of floating-point numbers; a Python float "
+            "is none, use jnp.asarray"
+        )
     for name, windows in (("train", train), ("validation", validation)):
         _check_match(field, windows, name, settings)
     checks.key("key", key)
@@ -122,18 +139,9 @@ def check_minibatch(field: Learner, settings: Settings) -> None:
     Raises:
         ValueError: the field learns through a BatchNorm, and the minibatch is smaller than 2.
     """
-    nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, Frozen | BatchNorm))
-    if settings.batch_size < 2 and any(isinstance(node, BatchNorm) for node in nodes):
+    if settings.batch_size < 2 and batch_norms(field):
         raise ValueError(
             f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {settings.batch_size}"
-        )
-
-
-def _check_learns(field: Learner) -> None:
-    if not any(jax.tree.leaves(trainable(field))):
-        raise ValueError(
-            f"field: {type(field).__name__} has nothing to learn, no array of floating-point numbers; a Python float "
-            "is none, use jnp.asarray"
         )
 
 
@@ -141,10 +149,11 @@ def _check_match(field: Learner, windows: Trajectories, name: str, settings: Set
     """Refuse windows that do not match a vector field. Other learners are checked by their objective."""
     if isinstance(field, AbstractVectorField):
         try:
-            x0, _, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+            x0, u, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
         except ValueError as error:
             raise ValueError(f"{name}: {error}") from error
         if x0.dtype != jnp.result_type(windows.x0):
             raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
+        check_batch_norm(field, x0[:2].T, u[:2, 0].T)
     if moves_a_rigid_body(field):
         check_attitudes(windows, name)

@@ -10,15 +10,14 @@ from dataclasses import dataclass, replace
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import optax
 from jaxtyping import PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
-from hybrid_jax.training.driver import FitResult, Report, default_settings, default_weight, descent, drive, ready
-from hybrid_jax.training.fitting import FitState, make_run_config, start
-from hybrid_jax.training.objective import Learner, Settings, prepared
+from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
+from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start
+from hybrid_jax.training.objective import Learner, Settings
 from hybrid_jax.trajectories import Trajectories
 
 
@@ -30,8 +29,8 @@ class Stage:
         rates: learning rate of each group of parameters. A group is named by the beginning of its path in the field,
             e.g. "physics", "residual/weight_out" or "physics/deviations/drag"; "" is the whole field. The longest name
             that matches counts. Parameters in no group are frozen.
-        steps: number of intervals of each window that are trained on, from its start; by default all.
-        epochs: stop after this many epochs.
+        steps: intervals of each window that are trained on, from its start; by default all.
+        epochs: stop after this many.
         patience: stop after this many epochs without a better validation loss.
 
     Raises:
@@ -46,8 +45,8 @@ class Stage:
     def __post_init__(self):
         for rate in self.rates.values():
             checks.not_negative("rates", rate)
-        for name in ("epochs", "patience"):
-            checks.count(name, getattr(self, name))
+        checks.count("epochs", self.epochs)
+        checks.count("patience", self.patience)
         if self.steps is not None:
             checks.count("steps", self.steps)
 
@@ -103,7 +102,7 @@ def fit_in_stages(
     key: PRNGKeyArray,
     stages: Sequence[Stage],
     *,
-    optimiser: optax.GradientTransformation | None = None,
+    optimiser: Optimiser | None = None,
     regulariser_weight: float | None = None,
     settings: Settings | None = None,
     progress: Report | bool | None = None,
@@ -117,20 +116,17 @@ def fit_in_stages(
         ValueError: as `fit`; windows shorter than a stage needs; rates of a group that the field does not have; or no
             stages.
     """
-    settings = default_settings(train) if settings is None else settings
-    data, validated_on = prepared(field, train, validation, key, settings)
+    data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
     field, results = ready(field, train), []
     rates = [rates_by_group(field, stage.rates) for stage in stages]
     horizons = [cut(data, stage.steps) for stage in stages]
-    optimiser, weight = descent(optimiser), default_weight(regulariser_weight, settings)
     keys = jax.random.split(key, len(stages))
     for stage, rate, windows, stage_key in zip(stages, rates, horizons, keys, strict=True):
-        listed = jnp.arange(len(data)), len(data)
-        plan = make_run_config(rate, *listed, 0, stage.patience, stage.epochs, weight)
-        state = _validated(start(field, stage_key, optimiser), validated_on, settings)
-        results.append(drive(state, plan, windows, validated_on, settings, optimiser, progress))
+        plan = make_run_config(rate, jnp.arange(len(data)), len(data), 0, stage.patience, stage.epochs, weight)
+        state = _validated(start(field, stage_key, shared[-1]), *shared[:2])
+        results.append(drive(state, plan, windows, shared, progress))
         field = results[-1].best
     return results
 

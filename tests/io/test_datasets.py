@@ -6,29 +6,25 @@ import time
 import zipfile
 from dataclasses import replace
 
+import equinox as eqx
+import jax
 import numpy as np
 import pytest
+from pendulum import swings
 
-from hybrid_jax.io.datasets import Dataset, config_hash, content_hash, load_dataset, save_dataset
-from hybrid_jax.state import QUATERNION
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.io.datasets import Dataset, content_hash, load_dataset, save_dataset
 
 CONFIG = {"domain": "source", "seed": 0, "vehicle": {"mass": 1.5, "inertia": (0.1, 0.2, 0.3)}}
 
 
-def windows(count, steps=10, seed=0):
-    rng = np.random.default_rng(seed)
-    shapes = (count, 13), (count, steps, 4), (count, steps, 13)
-    x0, u, x = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
-    for states in (x0, x):
-        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
-    return Trajectories(x0, u, x, dt=0.01)
+def windows(*size):
+    return jax.tree.map(np.array, swings(*size))
 
 
 @pytest.fixture
 def dataset():
     metadata = {"config": CONFIG, "versions": {"jax": "1"}}
-    return Dataset({"train": windows(20), "test": windows(5, 100, seed=1)}, metadata)
+    return Dataset({"train": windows(20), "test": windows(5, 100, 1)}, metadata)
 
 
 @pytest.fixture
@@ -50,12 +46,8 @@ def refusal(file, **expected):
 def test_round_trip(file, dataset):
     loaded = load_dataset(file, CONFIG)
     assert content_hash(loaded) == content_hash(dataset)
-    for name, split in dataset.splits.items():
-        for part in ("x0", "u", "x"):
-            found = getattr(loaded.splits[name], part)
-            np.testing.assert_array_equal(found, getattr(split, part))
-            assert found.dtype == np.float32
-        assert loaded.splits[name].dt == 0.01
+    assert eqx.tree_equal(dict(loaded.splits), dict(dataset.splits))
+    assert all(split.x.dtype == np.float32 for split in loaded.splits.values())
 
 
 def test_equal_content_gives_equal_bytes(file, dataset, tmp_path, monkeypatch):
@@ -72,23 +64,6 @@ def test_truncated_files_are_refused(file, share):
     assert "truncated" in refusal(file)
 
 
-def test_any_flipped_byte_is_noticed(file):
-    """Every 997th byte: data, header and directory; the zip's own slack is the one place that may change nothing."""
-    content = file.read_bytes()
-    digest = content_hash(load_dataset(file))
-    unnoticed = 0
-    for place in range(0, len(content), 997):
-        flipped = bytearray(content)
-        flipped[place] ^= 0x10
-        file.write_bytes(flipped)
-        try:
-            assert content_hash(load_dataset(file)) == digest
-            unnoticed += 1
-        except ValueError:
-            pass
-    assert unnoticed <= 1
-
-
 @pytest.mark.parametrize("missing", [False, True])
 def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     with zipfile.ZipFile(file) as archive:
@@ -103,19 +78,17 @@ def test_an_altered_or_missing_array_fails_the_checksum(file, missing):
     assert "checksum differs" in refusal(file)
 
 
-def test_missing_and_other_files_are_refused(tmp_path):
-    assert "no such file" in refusal(tmp_path / "none.npz")
-    stranger = tmp_path / "stranger.npz"
-    np.savez(stranger, a=np.zeros(3))
-    assert "not a hybrid_jax dataset" in refusal(stranger)
-    text = tmp_path / "text.npz"
-    text.write_text("hello")
-    assert "not a hybrid_jax dataset" in refusal(text)
-    array = tmp_path / "array.npz"
-    with array.open("wb") as handle:
-        np.save(handle, np.zeros(3))
-    assert "not a hybrid_jax dataset" in refusal(array)
+@pytest.mark.parametrize("content", [b"hello", {"a": np.zeros(3)}, np.zeros(3)], ids=["text", "npz", "npy"])
+def test_other_files_are_refused(content, tmp_path):
+    path = tmp_path / "stranger.npz"
+    with path.open("wb") as file:
+        if isinstance(content, bytes):
+            file.write(content)
+        else:
+            np.savez(file, **content) if isinstance(content, dict) else np.save(file, content)
+    assert "not a hybrid_jax dataset" in refusal(path)
     assert "not a hybrid_jax dataset" in refusal(tmp_path)
+    assert "no such file" in refusal(tmp_path / "none.npz")
 
 
 def test_another_configuration_names_the_fields_that_differ(file):
@@ -123,6 +96,8 @@ def test_another_configuration_names_the_fields_that_differ(file):
     assert "seed is 0, expected 1" in message
     assert "vehicle.mass is 1.5, expected 1.6" in message
     assert "inertia" not in message
+    assert load_dataset(file, {"seed": 0}).config == load_dataset(file).config  # others may be there
+    assert "horizon is null, expected 3" in refusal(file, expected_config={"horizon": 3})
 
 
 def test_overwriting_is_explicit(file, dataset):
@@ -149,17 +124,14 @@ def test_an_interrupted_write_leaves_the_old_file_alone(file, dataset, monkeypat
     assert list(file.parent.iterdir()) == [file]
 
 
-def test_malformed_windows_are_not_saved(tmp_path, dataset):
+def test_malformed_windows_and_metadata_are_not_saved(tmp_path, dataset):
     broken = windows(4)
-    broken.x[2, 3, 5] = np.nan
-    with pytest.raises(ValueError, match=r"split 'train'.*\[2, 3, 5\]"):
+    broken.x[2, 3, 1] = np.nan
+    with pytest.raises(ValueError, match=r"split 'train'.*\[2, 3, 1\]"):
         save_dataset(tmp_path / "a.npz", replace(dataset, splits={"train": broken}))
-    assert not list(tmp_path.iterdir())
-
-
-def test_metadata_must_be_json(tmp_path, dataset):
     with pytest.raises(ValueError, match="JSON"):
         save_dataset(tmp_path / "a.npz", replace(dataset, metadata={"config": {"a": float("nan")}}))
+    assert not list(tmp_path.iterdir())
 
 
 def test_subsets_are_nested(file):
@@ -169,8 +141,3 @@ def test_subsets_are_nested(file):
         loaded.first("train", 21)
     with pytest.raises(ValueError, match="no split 'validation', only"):
         loaded.first("validation")
-
-
-def test_config_hash_ignores_order_and_sees_values():
-    assert config_hash(CONFIG) == config_hash(dict(reversed(CONFIG.items())))
-    assert config_hash(CONFIG) != config_hash({**CONFIG, "seed": 1})

@@ -72,13 +72,6 @@ def test_equal_models_are_equal_files(file, tmp_path):
     assert (tmp_path / "again.npz").read_bytes() == file.read_bytes()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9, 0.999])
-def test_truncated_files_are_refused(file, share):
-    content = file.read_bytes()
-    file.write_bytes(content[: int(share * len(content))])
-    assert "truncated" in refusal(file)
-
-
 def test_a_flipped_bit_never_changes_a_model(file):
     """Every 37th bit, and all of the zip's directory at the end: refused in one line, or without effect."""
     content = file.read_bytes()
@@ -120,32 +113,22 @@ def test_a_vehicle_in_a_file_is_checked(tmp_path):
     assert "mass must be a positive" in refusal(tmp_path / "model.npz")
 
 
-@pytest.mark.parametrize(
-    "shapes",
-    [
-        ((13,), (3, 5, 4)),
-        ((3, 13), (5, 4)),
-        ((3, 13), (2, 5, 4)),
-        ((13,), (4,)),
-        ((2, 3, 13), (2, 3, 5, 4)),
-    ],
-    ids=str,
-)
+SHAPES = [((13,), (3, 5, 4)), ((3, 13), (5, 4)), ((3, 13), (2, 5, 4)), ((13,), (4,)), ((2, 3, 13), (2, 3, 5, 4))]
+
+
+@pytest.mark.parametrize("shapes", SHAPES, ids=str)
 def test_inconsistent_shapes_are_refused(shapes):
     with pytest.raises(ValueError, match="expected, got"):
         models.Model(PHYSICS).predict(np.zeros(shapes[0]), np.zeros(shapes[1]), 0.01)
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf])
-@pytest.mark.parametrize("which", [0, 1])
-def test_non_finite_numbers_are_refused(which, bad):
-    inputs = flight()
-    inputs[which][0, 2] = bad
-    with pytest.raises(ValueError, match="is not finite"):
-        models.Model(PHYSICS).predict(*inputs, 0.01)
-
-
-@pytest.mark.parametrize("dt", [0.0, -0.01, np.nan, np.inf])
-def test_a_non_positive_step_is_refused(dt):
-    with pytest.raises(ValueError, match="dt must be a positive"):
-        models.Model(PHYSICS).predict(*flight(), dt)
+def test_numbers_that_are_not_finite_and_steps_that_are_not_positive_are_refused(bad):
+    for which in (0, 1):
+        inputs = flight()
+        inputs[which][0, 2] = bad
+        with pytest.raises(ValueError, match="is not finite"):
+            models.Model(PHYSICS).predict(*inputs, 0.01)
+    for dt in (0.0, -0.01, bad):
+        with pytest.raises(ValueError, match="dt must be a positive"):
+            models.Model(PHYSICS).predict(*flight(), dt)

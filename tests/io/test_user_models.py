@@ -143,15 +143,15 @@ def local_field(gain=2.0, size=3, dtype=np.float32):
 
 
 def with_activation(function):
-    return eqx.tree_at(lambda field: field.net.activation, FIELDS["perceptron"], function)
+    return eqx.tree_at(lambda field: field.network.activation, FIELDS["perceptron"], function)
 
 
 # Name → model that a file cannot rebuild, the same with other weights, and the part that is the reason.
 SKELETONS = {
     "local class": (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
-    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/net/activation"),
-    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/net/activation"),
-    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/net/activation.*prediction"),
+    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/network/activation"),
+    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/network/activation"),
+    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/network/activation.*prediction"),
 }
 
 
@@ -174,12 +174,13 @@ def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
 @pytest.mark.filterwarnings("ignore:.*like=")
 def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
     hj.save(tmp_path / "model.npz", local_field())
-    with pytest.raises(ValueError, match=r"'field/net/bias' is float32\[3\], expected float32\[4\]$"):
-        hj.load(tmp_path / "model.npz", like=local_field(size=4))
-    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected int32\[\]$"):
-        hj.load(tmp_path / "model.npz", like=local_field(dtype=np.int32))
-    with pytest.raises(ValueError, match=r"'field/gain' is float32\[\], expected none$"):
-        hj.load(tmp_path / "model.npz", like=pendulum())
+    for like, said in (
+        (local_field(size=4), r"'field/net/bias' is float32\[3\], expected float32\[4\]$"),
+        (local_field(dtype=np.int32), r"'field/gain' is float32\[\], expected int32\[\]$"),
+        (pendulum(), r"'field/gain' is float32\[\], expected none$"),
+    ):
+        with pytest.raises(ValueError, match=said):
+            hj.load(tmp_path / "model.npz", like=like)
 
 
 def test_a_skeleton_with_other_static_values_is_refused(tmp_path):

@@ -7,26 +7,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from pendulum import pendulum
+from systems import Dense
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.kinematics import Kinematics
-
-
-class Pendulum(hj.AbstractVectorField):
-    log_length: jax.Array
-
-    def __call__(self, x, u):
-        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0])])
-
-
-class Perceptron(hj.AbstractVectorField):
-    net: eqx.nn.MLP
-
-    def __init__(self, size, key):
-        self.net = eqx.nn.MLP(size, size - 1, 8, 2, activation=jax.nn.gelu, key=key)
-
-    def __call__(self, x, u):
-        return self.net(jnp.concatenate([x, u]))
 
 
 class Convolution(hj.AbstractVectorField):
@@ -100,10 +85,10 @@ def fields():
     """Name → model, each with random weights of one seed."""
     key = jax.random.key(0)
     return {
-        "perceptron": Perceptron(3, key),
+        "perceptron": Dense(eqx.nn.MLP(3, 2, 8, 2, activation=jax.nn.gelu, key=key)),
         "convolution": Convolution(key),
         "wrapper": Scaled(hj.residual_network(2, 1, key, hidden=4), (1.0, 2.0)),
-        "pendulum": hj.Hybrid(Pendulum(jnp.log(0.7)), hj.residual_network(2, 1, key, hidden=4)),
+        "pendulum": hj.Hybrid(pendulum(0.7), hj.residual_network(2, 1, key, hidden=4)),
         "nested": Nested(key),
         "no physics": hj.Hybrid(Kinematics(), hj.residual_network(13, 4, key, hidden=4)),
     }

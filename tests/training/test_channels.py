@@ -28,12 +28,11 @@ def loss(objective, windows, field=FIELD):
 
 def test_with_a_scale_of_one_it_is_the_plain_loss():
     np.testing.assert_allclose(loss(PLAIN, TRAIN), loss(TrajectoryLoss(), TRAIN), rtol=1e-6)
-    np.testing.assert_allclose(PLAIN.validate(FIELD, VALIDATION, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-6)
-
-
-def test_validation_in_chunks_is_that_of_all():
     many = jax.tree.map(lambda leaf: np.tile(leaf, (26, *(1,) * (leaf.ndim - 1))), VALIDATION)
-    np.testing.assert_allclose(PLAIN.validate(FIELD, many, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5)
+    for windows in (VALIDATION, many):  # whole, and in chunks
+        np.testing.assert_allclose(
+            PLAIN.validate(FIELD, windows, Settings()), rollout_mse(FIELD, VALIDATION), rtol=1e-5
+        )
 
 
 def test_scales_are_the_baseline_s_errors_at_the_horizon():

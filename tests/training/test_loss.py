@@ -9,12 +9,13 @@ from pendulum import pendulum
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import RK4, along, rollout_batch, rollout_minibatch
-from hybrid_jax.networks.mlp import residual_network
-from hybrid_jax.training.loss import REGULARISERS, Minibatch, cosine, loss, minibatch, mse
-from hybrid_jax.training.objective import Settings
+from hybrid_jax.networks.mlp import residual_network, zero_output
+from hybrid_jax.training.loss import REGULARISERS, cosine, minibatch
+from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories
 
 DT, WINDOWS, STEPS = 0.05, 6, 4
+TURN, OTHER = np.array([[0.3, 1.2], [-0.7, 0.4]]), np.array([[0.5, -0.1], [0.2, 0.9]])
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -53,33 +54,16 @@ def regulariser(name, field, batch):
     return REGULARISERS[name](field, batch, rollout_minibatch(field, batch.x0, batch.u, batch.dt, RK4()))
 
 
-def silent(field):
-    """A residual whose output is zero everywhere."""
-    zero = (jnp.zeros_like(field.weight_out), jnp.zeros_like(field.bias_out))
-    return eqx.tree_at(lambda field: (field.weight_out, field.bias_out), field, zero)
-
-
 def network(seed=0):
     return residual_network(2, 1, jax.random.key(seed), hidden=5)
 
 
-def test_a_minibatch_has_features_first():
+def test_a_minibatch_has_features_first_and_its_step_static(batch):
     cut = windows()
-    turned = minibatch(cut, RK4())
-    assert turned.x.shape == (STEPS, 2, WINDOWS)
-    assert turned.dt == DT
-    for i in range(WINDOWS):
-        np.testing.assert_array_equal(turned.x0[:, i], cut.x0[i])
-        np.testing.assert_array_equal(turned.u[..., i], cut.u[i])
-        np.testing.assert_array_equal(turned.x[..., i], cut.x[i])
-
-
-def test_mse_by_hand():
-    truth = jnp.zeros((2, 3))
-    predicted = jnp.array([[1.0, 2.0, 2.0], [0.0, 3.0, 4.0]])
-    assert mse(predicted, truth) == (9 + 25) / 2  # squared norms, mean over time: not over the elements
-    both = mse(jnp.stack([predicted, 2 * predicted], -1), jnp.zeros((2, 3, 2)))
-    np.testing.assert_array_equal(both, [17, 68])
+    assert batch.dt == DT
+    assert len(jax.tree.leaves(batch)) == 3
+    for name in ("x0", "u", "x"):
+        np.testing.assert_array_equal(getattr(batch, name), np.moveaxis(getattr(cut, name), 0, -1))
 
 
 def test_trajectory_correlation_is_the_paper_s_formula(batch):
@@ -95,13 +79,12 @@ def test_trajectory_correlation_is_the_paper_s_formula(batch):
 
 
 def test_trajectory_correlation_grows_with_the_residual_from_zero(batch):
-    small = network()
-    strengths = [0.0, 0.1, 0.3, 1.0, 3.0]
-    values = []
-    for strength in strengths:
-        parts = (strength * small.weight_out, strength * small.bias_out)
-        residual = eqx.tree_at(lambda field: (field.weight_out, field.bias_out), small, parts)
-        values.append(float(regulariser("trajectory_correlation", Hybrid(pendulum(), residual), batch)))
+    def value(strength):
+        residual = affine([[0.0, 0.3], [-0.2, 0.1]], (0.5, -1.0))
+        scaled = jax.tree.map(lambda leaf: strength * leaf, residual)
+        return float(regulariser("trajectory_correlation", Hybrid(pendulum(), scaled), batch))
+
+    values = list(map(value, (0.0, 0.1, 0.3, 1.0, 3.0)))
     assert abs(values[0]) < 1e-25  # ½‖a − b‖² of equal a and b
     assert values == sorted(values)
     assert values[-1] > 1e-4
@@ -119,42 +102,37 @@ def test_trajectory_correlation_shows_small_differences_in_single_precision(batc
 
 
 def test_cosine_is_one_for_parallel_and_zero_for_orthogonal_parts(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    quarter = np.array([[0.0, -1.0], [1.0, 0.0]])
-    for factor in (2.0, -0.5):
-        # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
-        np.testing.assert_allclose(
-            regulariser("cosine", Hybrid(affine(turn), affine(factor * turn)), batch), 1, rtol=0, atol=1e-7
-        )
-    assert abs(regulariser("cosine", Hybrid(affine(turn), affine(quarter @ turn)), batch)) < 1e-20
+    def value(other):
+        return regulariser("cosine", Hybrid(affine(TURN), affine(other)), batch)
+
+    # The 1e-12 of the unit vectors, against squared norms of at least 1e-4.
+    np.testing.assert_allclose([value(2.0 * TURN), value(-0.5 * TURN)], 1, rtol=0, atol=1e-7)
+    assert abs(value(np.array([[0.0, -1.0], [1.0, 0.0]]) @ TURN)) < 1e-20  # a quarter turn
 
 
 def test_inner_product_is_the_squared_product_of_the_parts(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    other = np.array([[0.5, -0.1], [0.2, 0.9]])
-    field = Hybrid(affine(turn), affine(other, (0.3, -0.2)))
+    field = Hybrid(affine(TURN), affine(OTHER, (0.3, -0.2)))
     predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
     x = np.concatenate([batch.x0[None], np.asarray(predicted)[:-1]])
-    products = np.einsum("tib,tib->tb", np.einsum("ij,tjb->tib", turn, x),
-                         np.einsum("ij,tjb->tib", other, x) + np.array([0.3, -0.2])[:, None])  # fmt: skip
+    products = np.einsum("tib,tib->tb", np.einsum("ij,tjb->tib", TURN, x),
+                         np.einsum("ij,tjb->tib", OTHER, x) + np.array([0.3, -0.2])[:, None])  # fmt: skip
     found = regulariser("inner_product", field, batch)
     np.testing.assert_allclose(found, np.mean(products**2), rtol=1e-12)
-    assert abs(regulariser("inner_product", Hybrid(affine(turn), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
+    assert abs(regulariser("inner_product", Hybrid(affine(TURN), affine([[0.7, -0.4], [0.3, 1.2]])), batch)) < 1e-25
 
 
 def test_pearson_is_the_correlation_and_blind_to_offset_and_scale(batch):
-    turn = np.array([[0.3, 1.2], [-0.7, 0.4]])
-    other = affine([[0.5, -0.1], [0.2, 0.9]])
-    predicted = rollout_minibatch(Hybrid(affine(turn), other), batch.x0, batch.u, DT, RK4())
+    other = affine(OTHER)
+    predicted = rollout_minibatch(Hybrid(affine(TURN), other), batch.x0, batch.u, DT, RK4())
 
     def value(residual):
-        return REGULARISERS["pearson"](Hybrid(affine(turn), residual), batch, predicted)
+        return REGULARISERS["pearson"](Hybrid(affine(TURN), residual), batch, predicted)
 
     x, _ = along(batch.x0, predicted, batch.u)
-    expected = [np.corrcoef(a, b)[0, 1] ** 2 for a, b in zip(turn @ x, other.matrix @ x, strict=True)]
+    expected = [np.corrcoef(a, b)[0, 1] ** 2 for a, b in zip(TURN @ x, other.matrix @ x, strict=True)]
     np.testing.assert_allclose(value(other), np.mean(expected), rtol=1e-9)  # the 1e-12 under the roots
     np.testing.assert_allclose(value(affine(-7 * other.matrix, (5.0, -3.0))), value(other), rtol=1e-9)
-    np.testing.assert_allclose(value(affine(3 * turn, (1.0, 1.0))), 1, rtol=1e-9)
+    np.testing.assert_allclose(value(affine(3 * TURN, (1.0, 1.0))), 1, rtol=1e-9)
 
 
 def test_residual_norm_is_the_mean_square_of_the_residual(batch):
@@ -167,38 +145,34 @@ def test_residual_norm_is_the_mean_square_of_the_residual(batch):
 def test_gradients_are_finite_where_the_residual_is_zero(name, precision, batch):
     with jax.enable_x64(precision == np.float64):
         field, here = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), silent(network())), batch)
+            lambda leaf: jnp.asarray(leaf, precision), (Hybrid(pendulum(), zero_output(network())), batch)
         )
         value, slope = eqx.filter_value_and_grad(lambda field: regulariser(name, field, here))(field)
     assert abs(value) < 1e-10
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(slope))
 
 
+def loss(field, batch, rule, weight):
+    return TrajectoryLoss().loss(field, batch, Settings(regulariser=rule), weight)[0]
+
+
 def test_the_loss_is_the_error_plus_the_weighted_regulariser(batch):
     field = Hybrid(pendulum(0.7), network())
     predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
     error = np.square(np.asarray(predicted - batch.x)).sum(1).mean()
-    np.testing.assert_allclose(loss(field, batch, predicted, None, 1e3), error, rtol=1e-13)
+    np.testing.assert_allclose(loss(field, batch, None, 1e3), error, rtol=1e-13)
     for rule in REGULARISERS.values():
         expected = error + 0.3 * rule(field, batch, predicted)
-        np.testing.assert_allclose(loss(field, batch, predicted, rule, 0.3), expected, rtol=1e-13)
+        np.testing.assert_allclose(loss(field, batch, rule, 0.3), expected, rtol=1e-13)
 
 
-@pytest.mark.parametrize("name", REGULARISERS)
-def test_a_field_without_two_parts_has_no_regulariser(name, batch):
+def test_a_field_without_two_parts_has_no_regulariser(batch):
     for field in (pendulum(0.7), network()):
-        predicted = rollout_minibatch(field, batch.x0, batch.u, DT, RK4())
-        plain = loss(field, batch, predicted, None, 0.0)
-        assert loss(field, batch, predicted, REGULARISERS[name], 1e3) == plain
-
-
-def test_minibatch_is_a_pytree_with_its_step_static(batch):
-    assert isinstance(batch, Minibatch)
-    assert len(jax.tree.leaves(batch)) == 3
+        assert loss(field, batch, cosine, 1e3) == loss(field, batch, None, 0.0)
 
 
 def test_a_regulariser_by_name_is_refused_where_it_is_set():
-    said = r"^regulariser must be a function, such as one of hybrid_jax\.loss\.REGULARISERS, got 'cosine'$"
+    said = r"^regulariser must be a function, such as one of hybrid_jax\.training\.loss\.REGULARISERS, got 'cosine'$"
     with pytest.raises(ValueError, match=said):
         Settings(regulariser="cosine")
     assert hash(Settings(regulariser=cosine)) == hash(Settings(regulariser=cosine))

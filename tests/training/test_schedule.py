@@ -42,6 +42,7 @@ def test_the_longest_group_that_fits_counts():
     assert rates.physics.log_length == np.float32(1e-3)
     assert rates.residual.weight_in == np.float32(1e-2)
     assert rates.residual.norm.shift == 0
+    assert eqx.tree_equal(make_run_config(rates, jnp.arange(3), 3, 0, 1, 1, 0.0).rates, rates)  # what a sweep takes
     with pytest.raises(ValueError, match="no learned array begins with 'resid', only physics/log_length, residual"):
         rates_by_group(FIELD, {"resid": 1.0})
 
@@ -65,9 +66,8 @@ def test_the_start_is_kept_where_nothing_is_better():
 
 
 def test_short_windows_are_the_beginning_of_long_ones():
-    short = cut(TRAIN, 3)
-    np.testing.assert_array_equal(short.x, TRAIN.x[:, :3])
-    np.testing.assert_array_equal(short.u, TRAIN.u[:, :3])
+    for name in ("x", "u"):
+        np.testing.assert_array_equal(getattr(cut(TRAIN, 3), name), getattr(TRAIN, name)[:, :3])
     assert cut(TRAIN, None) is TRAIN
     with pytest.raises(ValueError, match="steps must be at most the 8 intervals"):
         cut(TRAIN, 9)
@@ -96,9 +96,3 @@ def test_stages_that_make_no_sense_are_refused(stages, said):
 def test_what_a_fit_refuses_stages_refuse(field, size, said):
     with pytest.raises(ValueError, match=f"^{said}"):
         fit_in_stages(field, TRAIN, VALIDATION, KEY, [Stage({"": 0.1})], settings=Settings(size))
-
-
-def test_rates_by_group_are_those_of_a_plan():
-    """What a sweep takes: the tree begins as the field does."""
-    plan = make_run_config(rates_by_group(FIELD, {"": 1e-3}), jnp.arange(3), 3, 0, 1, 1, 0.0)
-    assert all(rate == np.float32(1e-3) for rate in jax.tree.leaves(plan.rates))
