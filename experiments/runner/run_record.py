@@ -13,8 +13,8 @@ from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
 
 FILE = "run.json"
+HINT = "  --fresh starts anew and moves it aside; another --out leaves it as it is"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
-ANEW = "--fresh starts anew and moves it aside"
 
 
 class OtherRun(ValueError):
@@ -31,25 +31,24 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
         ValueError: the record or a given file of flights cannot be read.
     """
-    record = describe(config)
+    path, record = folder / FILE, describe(config)
     if config.fresh:
         _move_aside(folder, say)
-    found = read_json(folder / FILE) if (folder / FILE).exists() else {}
-    goes_on = found.get("state") == "unfinished"
-    if goes_on:
+    found = read_json(path) if path.exists() else {}
+    if found.get("state") == "unfinished":
         require_same(f"{folder}: holds an unfinished run, begun {found['started']}", found, record)
         record["started"] = found["started"]
         say(f"{folder}: goes on with the run begun {found['started']}")
-    _write(folder, record, "unfinished")
+    write_atomic(path, json_text(record | {"state": "unfinished"}))
     try:
         yield
     except ValueError:
         if found:
-            write_atomic(folder / FILE, json_text(found))
+            write_atomic(path, json_text(found))
         else:
-            (folder / FILE).unlink()
+            path.unlink()
         raise
-    _write(folder, record, "finished")
+    write_atomic(path, json_text(record | {"state": "finished"}))
 
 
 def describe(config: Run) -> dict[str, Any]:
@@ -77,11 +76,7 @@ def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> N
         if before.get(name) != now.get(name)
     ]
     if lines:
-        raise OtherRun("\n".join([f"{what}, that differs:", *lines, f"  {ANEW}; another --out leaves it as it is"]))
-
-
-def _write(folder: Path, record: Mapping[str, Any], state: str) -> None:
-    write_atomic(folder / FILE, json_text({**record, "state": state}))
+        raise OtherRun("\n".join([f"{what}, that differs:", *lines, HINT]))
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:

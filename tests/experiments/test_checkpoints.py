@@ -22,7 +22,7 @@ def saved(folder, count):
     """Checkpoints of that many saves, each with its number."""
     checkpoints = Checkpoints(folder)
     for number in range(1, count + 1):
-        checkpoints.save(ARRAYS, {"number": number})
+        checkpoints.save({"number": number}, ARRAYS)
     return checkpoints
 
 
@@ -38,7 +38,7 @@ def names(folder):
 
 def test_what_is_loaded_is_the_last_save_bit_for_bit(tmp_path):
     saved(tmp_path, 3)
-    (arrays, about), said = loaded(tmp_path)
+    (about, arrays), said = loaded(tmp_path)
     assert about == {"number": 3}
     assert said == []
     assert arrays.keys() == ARRAYS.keys()
@@ -65,12 +65,12 @@ def test_a_flipped_bit_is_detected(tmp_path):
         content = bytearray(intact)
         content[place] ^= 1 << rng.randrange(8)
         file.write_bytes(content)
-        (arrays, about), said = loaded(tmp_path)
+        (about, arrays), said = loaded(tmp_path)
         assert all(arrays[name].tobytes() == ARRAYS[name].tobytes() for name in ARRAYS)
         assert about == {"number": 2 - len(said)}
     assert len(list(tmp_path.glob("000002.npz.damaged-*"))) > 10
     file.write_bytes(intact)
-    assert loaded(tmp_path)[0][1] == {"number": 2}
+    assert loaded(tmp_path)[0][0] == {"number": 2}
 
 
 @pytest.mark.parametrize("left", [0.0, 0.5])
@@ -78,13 +78,13 @@ def test_a_truncated_checkpoint_is_named_and_renamed(left, tmp_path):
     saved(tmp_path, 2)
     file = tmp_path / "000002.npz"
     file.write_bytes(file.read_bytes()[: int(left * file.stat().st_size)])
-    (_, about), (line,) = loaded(tmp_path)
+    (about, _), (line,) = loaded(tmp_path)
     assert about == {"number": 1}
     assert line.startswith(f"{file}: truncated, damaged or not a hybrid_jax checkpoint")
     assert "renamed to 000002.npz.damaged-" in line
     assert [name.split("-")[0] for name in names(tmp_path)] == ["000001.npz", "000002.npz.damaged"]
-    Checkpoints(tmp_path).save(ARRAYS, {"number": 9})
-    assert loaded(tmp_path)[0][1] == {"number": 9}
+    Checkpoints(tmp_path).save({"number": 9}, ARRAYS)
+    assert loaded(tmp_path)[0][0] == {"number": 9}
 
 
 def test_checkpoints_of_the_version_before_are_moved_and_the_stage_starts_anew(tmp_path):
@@ -114,7 +114,7 @@ from pathlib import Path
 from experiments.runner.checkpoint import Checkpoints
 resource.setrlimit(resource.RLIMIT_FSIZE, (3000, resource.RLIM_INFINITY))  # no file may grow beyond 3 kB
 try:
-    Checkpoints(Path(sys.argv[1])).save({"large": np.random.default_rng(0).normal(size=10_000)}, {})
+    Checkpoints(Path(sys.argv[1])).save({}, {"large": np.random.default_rng(0).normal(size=10_000)})
 except OSError as error:
     sys.exit(str(error))
 """
@@ -128,5 +128,5 @@ def test_a_full_disk_leaves_what_was_saved(tmp_path):
     assert full.returncode == 1
     assert len(full.stderr.splitlines()) == 1
     assert "000003.npz: cannot be saved: File too large" in full.stderr
-    assert loaded(tmp_path)[0][1] == {"number": 2}
+    assert loaded(tmp_path)[0][0] == {"number": 2}
     assert names(tmp_path) == ["000001.npz", "000002.npz"]

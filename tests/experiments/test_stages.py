@@ -11,7 +11,7 @@ from rich.console import Console
 
 from experiments.paper.lanes import rows_of, trained
 from experiments.paper.tables import run_notes
-from experiments.runner.progress import SweepLine
+from experiments.runner.progress import Line
 from experiments.runner.stages import Stages
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
@@ -65,13 +65,13 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SweepLine, "show", interrupt)
+        patch.setattr(Line, "show_sweep", interrupt)
         with pytest.raises(KeyboardInterrupt):
             run(tmp_path)
     assert [path.name.endswith(".begun") for path in tmp_path.iterdir()] == [True]  # the block was finished, and saved
     later = []
     with monkeypatch.context() as patch:
-        patch.setattr(SweepLine, "show", lambda self, progress: later.append(progress.epochs))
+        patch.setattr(Line, "show_sweep", lambda self, progress: later.append(progress.epochs))
         resumed, found = run(tmp_path)
     assert later[0] > seen[0]  # it did not start anew
     assert found.reused == []
