@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from experiments.reporting.results import leaves
 from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from hybrid_jax.io.datasets import versions
@@ -69,7 +70,7 @@ def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> N
     Raises:
         OtherRun: they differ; the message begins with `what` and has a line `field: old → new` per difference.
     """
-    before, now = (_flat({name: each.get(name, {}) for name in FIXED}) for each in (old, new))
+    before, now = (dict(leaves({name: each.get(name, {}) for name in FIXED}, ".")) for each in (old, new))
     lines = [
         f"  {name}: {before.get(name, 'absent')} → {now.get(name, 'absent')}"
         for name in sorted(before.keys() | now.keys())
@@ -96,10 +97,3 @@ def _sha256(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat
