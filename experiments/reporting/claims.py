@@ -16,16 +16,13 @@ class Inconclusive(Exception):
 
 @dataclass(frozen=True)
 class Claim(Generic[Evidence]):
-    """A hypothesis.
+    """A hypothesis, and a function that decides it.
 
-    Attributes:
-        id: short name, such as "C1".
-        text: the hypothesis and its definition.
-        predicate: from the evidence, whether it holds and the numbers behind that; raises `Inconclusive` if the
-            evidence cannot decide.
+    The predicate returns whether the evidence supports the hypothesis and the numbers behind that; it raises
+    `Inconclusive` if the evidence cannot decide.
     """
 
-    id: str
+    id: str  # such as "C1"
     text: str
     predicate: Callable[[Evidence], tuple[bool, str]]
 
@@ -42,15 +39,14 @@ class Verdict:
 
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
     """The verdict on each claim."""
-
-    def one(claim: Claim[Evidence]) -> Verdict:
+    verdicts = []
+    for claim in claims:
         try:
             holds, measured = claim.predicate(evidence)
+            verdicts.append(Verdict(claim.id, claim.text, bool(holds), measured))
         except Inconclusive as why:
-            return Verdict(claim.id, claim.text, None, str(why))
-        return Verdict(claim.id, claim.text, bool(holds), measured)
-
-    return [one(claim) for claim in claims]
+            verdicts.append(Verdict(claim.id, claim.text, None, str(why)))
+    return verdicts
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:

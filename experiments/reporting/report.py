@@ -40,14 +40,9 @@ _RULES = {
 
 @dataclass(frozen=True)
 class Report:
-    """One experiment's outcome. Configuration, environment and `extra` are stored as JSON values.
+    """One experiment's outcome; mappings and notes are stored as JSON values.
 
     Attributes:
-        experiment: its name.
-        config: the configuration.
-        environment: see `environment`.
-        rows: a row per run.
-        claims: verdicts on what was to be shown.
         figures: path of a picture relative to the report → its caption.
         notes: sentences for the end of the page.
         extra: further keys of report.json.

@@ -72,9 +72,6 @@ class Checkpoints:
 class Autosave:
     """Save a sweep between blocks, within its share of the time, and whenever a signal is pending.
 
-    Attributes:
-        saving: seconds spent on saving.
-
     Args:
         spent: seconds that earlier runs spent on the sweep.
         share: largest share of the time that saving may take.
@@ -83,8 +80,9 @@ class Autosave:
     def __init__(self, checkpoints: Checkpoints, signals: DeferredSignals, name: str, spent: float, share: float):
         self._checkpoints, self._signals, self._name = checkpoints, signals, name
         self._spent, self._share = spent, share
-        self._began, self._cost, self.saving = time.perf_counter(), FIRST_COST, 0.0
+        self._began, self._cost = time.perf_counter(), FIRST_COST
         self._unsaved: FitState | None = None
+        self.saving = 0.0  # s spent on saving
 
     def seconds(self) -> float:
         """Time spent on the sweep so far, earlier runs included."""

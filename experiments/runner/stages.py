@@ -33,10 +33,6 @@ Result = TypeVar("Result")
 class Stages:
     """The stages of an experiment: cached training sweeps, and the time that each stage took.
 
-    Attributes:
-        seconds: by stage.
-        reused: names of the sweeps that came from the cache.
-
     Args:
         folder: of the cache.
         console: shows progress.
@@ -46,8 +42,8 @@ class Stages:
 
     def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
         self._folder, self._console, self._share, self._fresh = folder, console, saving, fresh
-        self.seconds: dict[str, float] = {}
-        self.reused: list[str] = []
+        self.seconds: dict[str, float] = {}  # by stage
+        self.reused: list[str] = []  # sweeps that came from the cache
         self._ran = self._saving = 0.0
 
     def run(
@@ -59,10 +55,7 @@ class Stages:
         data: Dataset,
         min_capacity: tuple[int, int] = (0, 0),
     ) -> FitState:
-        """The final states of a sweep on the train and validation splits of a dataset.
-
-        Args:
-            min_capacity: see `sweep`; it does not affect the result.
+        """The final states of a sweep on the train and validation splits of a dataset; see `sweep`.
 
         Raises:
             OtherRun: the sweep was begun by other versions of the libraries.
