@@ -24,7 +24,7 @@ def saved(folder, count):
 
 
 def loaded(folder):
-    """What a new process would find, and what it would say."""
+    """What a new process loads, and its messages."""
     said = []
     return Checkpoints(folder).load(said.append), said
 
@@ -44,12 +44,12 @@ def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
     assert names(tmp_path) == ["000003.npz", "000004.npz"]
 
 
-def test_nothing_saved_is_nothing_found(tmp_path):
+def test_nothing_is_loaded_if_nothing_was_saved(tmp_path):
     assert loaded(tmp_path / "absent") == (None, [])
 
 
 def test_a_flipped_bit_is_detected(tmp_path):
-    """Bits all over a checkpoint, each in turn: what is loaded is exact, or the checkpoint before it."""
+    """For bits all over a checkpoint: what is loaded is exact, or the checkpoint before."""
     saved(tmp_path, 2)
     file, rng = tmp_path / "000002.npz", random.Random(0)
     intact = file.read_bytes()

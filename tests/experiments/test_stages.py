@@ -1,4 +1,4 @@
-"""A sweep is run once, is not lost when interrupted, and is found again only by what it was."""
+"""A sweep is run once, survives an interrupt, and is found again only by what determines it."""
 
 import signal
 from dataclasses import replace
@@ -46,7 +46,7 @@ def same(one, other):
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_finished_sweep_is_found_not_run(folder, whole):
+def test_a_finished_sweep_is_loaded(folder, whole):
     again, found = run(folder)
     assert found.reused == ["a sweep"]
     assert same(again, whole)
@@ -109,8 +109,8 @@ def test_anything_else_is_another_sweep(folder, whole, other):
     assert run(folder, **other)[1].reused == []
 
 
-def test_a_diverged_lane_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
-    """A learning rate of 1e3 in one lane: the other keeps every bit."""
+def test_a_diverged_run_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
+    """With a learning rate of 1e3 in one run the other keeps every bit."""
     final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
     assert same(lane(final, 0), lane(whole, 0))
     rows = rows_of([trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2))], "parameter_shift")
