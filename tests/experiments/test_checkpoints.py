@@ -42,9 +42,6 @@ def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
         assert (arrays[name].dtype, arrays[name].shape) == (array.dtype, array.shape)
         assert arrays[name].tobytes() == array.tobytes()
     assert names(tmp_path) == ["000003.npz", "000004.npz"]
-
-
-def test_nothing_is_loaded_if_nothing_was_saved(tmp_path):
     assert loaded(tmp_path / "absent") == (None, [])
 
 

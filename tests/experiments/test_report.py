@@ -38,15 +38,10 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert record["truth_theta"] == TRUTH
 
 
-def test_report_round_trip(tmp_path):
+def test_report_round_trip_and_format_1(tmp_path):
     report = make_report(make_rows(), figures={"scores.png": "Scores"}, notes=["A note."], extra={"more": [1, 2]})
     write_report(tmp_path, report)
     assert load_report(tmp_path) == report == load_report(tmp_path / "report.json")
-
-
-def test_reports_of_format_1_load(tmp_path):
-    report = make_report(make_rows())
-    write_report(tmp_path, report)
     record = json.loads((tmp_path / "report.json").read_text())
     del record["format"], record["tags"]
     (tmp_path / "report.json").write_text(json.dumps(record))

@@ -13,22 +13,18 @@ from experiments.runner.command import read
 from experiments.runner.run_record import FILE, OtherRun, recorded
 
 
-def silent(line):
-    pass
-
-
 def record(folder):
     return json.loads((folder / FILE).read_text())
 
 
-def finish(folder, config, say=silent):
+def finish(folder, config, say=print):
     with recorded(folder, config, say):
         assert record(folder)["state"] == "unfinished"
     assert record(folder)["state"] == "finished"
 
 
 def interrupt(folder, config, error=KeyboardInterrupt):
-    with pytest.raises(error), recorded(folder, config, silent):
+    with pytest.raises(error), recorded(folder, config, print):
         raise error
 
 
