@@ -73,7 +73,8 @@ def unbegun(name: str, *arguments: str) -> Run:
     said = mock.patch.object(sys, "argv", [module, *arguments])
     with begun, said, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            import_module(module).main()
+            package = (ROOT / "experiments" / name).is_dir()
+            import_module(f"{module}.__main__" if package else module).main()
         except SystemExit as stop:
             return Run([module, *arguments], int(stop.code or 0), out.getvalue(), err.getvalue())
     raise AssertionError("the command did not end by itself")
