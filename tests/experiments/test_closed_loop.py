@@ -134,7 +134,6 @@ def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(fli
     assert not rows["oracle"]["crashed"]
 
 
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     """The folder after one run of the command, with an old option name."""
