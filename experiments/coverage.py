@@ -21,7 +21,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.tables import Table, print_tables, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
-from experiments.runner.progress import PartLine
+from experiments.runner.progress import Line
 from hybrid_jax import rotation
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
@@ -119,11 +119,11 @@ def coverage(config: Config, console: Console) -> Results:
     drags = {"exact physics": 0.0, "unknown drag": config.drag}
     cases = list(itertools.product(drags, config.noise_on))
     parts, done = _parts(config), itertools.count(1)
-    with PartLine(NAME, console, len(cases) * len(parts)) as line:
+    with Line(NAME, console) as line:
 
         def one(case: str, noise_on: str, keys: PRNGKeyArray) -> Repeat:
             found = jax.device_get(_repeats(config, noise_on == "all", drags[case], keys))
-            line.show(next(done))
+            line.show_parts(next(done), len(cases) * len(parts))
             return found
 
         found = [[one(*case, keys) for keys in parts] for case in cases]

@@ -1,6 +1,6 @@
-"""Compiling is most of what a run of the tests does: programs are not optimised, and kept for all processes.
+"""Tests spend most of their time compiling: programs are compiled without optimisation and shared by all processes.
 
-`XLA_FLAGS= pytest` has them optimised, as users have.
+`XLA_FLAGS= pytest` compiles them as users do.
 """
 
 import os
@@ -11,14 +11,14 @@ from importlib.metadata import version
 
 import pytest
 
-# All are read when JAX is imported, which must not happen here; the others are as `runtime.configure` sets them.
+# JAX reads these when it is imported, so it must not be imported here. The last three are as in `runtime.configure`.
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 KEEP_ALL = {
     "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES": "none",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
-# A third of the time to compile. XLA ends a process that gives it a flag which it does not know.
+# A third of the time to compile. XLA aborts on a flag that it does not know.
 QUICK = "--xla_backend_optimization_level=0"
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
     QUICK += " --xla_cpu_use_fusion_emitters=false"
@@ -34,7 +34,7 @@ def pytest_configure(config):
 
 @pytest.fixture
 def heard():
-    """Ctrl-C is heard, here and by what is started, also where pytest is a background job, which ignores it."""
+    """SIGINT acts here and in subprocesses, also where pytest is a background job, which ignores it."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)

@@ -1,8 +1,7 @@
 """Whole commands in their smallest preset, as a user starts them.
 
-What continuous integration has already run it leaves in the folder that HYBRID_JAX_SMOKE names, in one folder for each
-group of commands that share their cache: `out`, `cache`, and for each command its code.txt, out.txt and err.txt. Tests
-look at that instead of running it all again.
+.ci/run runs most of them first. It names their folder in HYBRID_JAX_SMOKE, with a subfolder for each group of commands
+that share a cache: `out`, `cache`, and for each command code.txt, out.txt and err.txt. Tests use these if they exist.
 """
 
 import contextlib
@@ -24,12 +23,12 @@ Run = subprocess.CompletedProcess
 
 
 def command(name: str, *options: str, folder: Path, out: Path | None = None) -> Run:
-    """An experiment in its smallest preset, its cache and, by default, its results in a folder."""
+    """Run an experiment in its smallest preset, with its cache and, by default, its results in a folder."""
     return python(f"experiments.{name}", *smallest(*options, folder=folder, out=out))
 
 
 def smallest(*options: str, folder: Path, out: Path | None = None) -> list[str]:
-    """The options of an experiment in its smallest preset, all it leaves in a folder."""
+    """The options of `command`."""
     out = folder / "out" if out is None else out
     preset = [] if "--preset" in options else ["--preset", "smoke"]
     return [*preset, "--out", str(out), "--cache", str(folder / "cache"), *options]
@@ -42,46 +41,47 @@ def python(module: str, *options: str) -> Run:
 
 
 def experiments(group: str, *names: str, folder: Path, options: Sequence[str] = ()) -> list[Run]:
-    """Experiments one after the other with one cache: run now in the folder, or copied there as they were left."""
+    """Experiments one after the other with one cache: run now in the folder, or copied there from .ci/run."""
     if LEFT is None:
         return [command(name, *options, folder=folder) for name in names]
     shutil.copytree(Path(LEFT) / group, folder, dirs_exist_ok=True)
-    return [told(folder, f"experiments.{name}") for name in names]
+    return [_finished(folder, f"experiments.{name}") for name in names]
 
 
 def benchmarks(folder: Path, *options: str) -> tuple[Run, dict[str, dict[str, Any]]]:
-    """All benchmarks: what they said, and their reports by name; run now in the folder, or as they were left."""
+    """All benchmarks: their output, and their reports by name; run now in the folder, or copied there from .ci/run."""
     if LEFT is None:
         run = python("benchmarks", "--preset", "smoke", "--out", str(folder / "all.json"), *options)
         assert run.returncode == 0, run.stderr
     else:
         shutil.copytree(Path(LEFT) / "benchmarks", folder, dirs_exist_ok=True)
-        run = told(folder, "benchmarks")
+        run = _finished(folder, "benchmarks")
     reports = json.loads((folder / "all.json").read_text())["benchmarks"]
     return run, {report["benchmark"]: report for report in reports}
 
 
-def told(folder: Path, module: str) -> Run:
-    """What a command said that continuous integration ran in a folder."""
+def _finished(folder: Path, module: str) -> Run:
+    """The exit code and output of a command that .ci/run ran in a folder."""
     code, out, err = ((folder / f"{module}.{part}.txt").read_text() for part in ("code", "out", "err"))
     return Run([module], int(code), out, err)
 
 
 def unbegun(name: str, *arguments: str) -> Run:
-    """What an experiment says, in this process, whose options end it before it sets anything up."""
+    """Run an experiment in this process whose options end it before it sets anything up."""
     module, out, err = f"experiments.{name}", io.StringIO(), io.StringIO()
-    begun = mock.patch("experiments.runner.command.configure", side_effect=AssertionError("the command has begun"))
+    begun = mock.patch("experiments.runner.command.configure", side_effect=AssertionError("work has begun"))
     said = mock.patch.object(sys, "argv", [module, *arguments])
     with begun, said, contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
         try:
-            import_module(module).main()
+            package = (ROOT / "experiments" / name).is_dir()
+            import_module(f"{module}.__main__" if package else module).main()
         except SystemExit as stop:
             return Run([module, *arguments], int(stop.code or 0), out.getvalue(), err.getvalue())
-    raise AssertionError("the command has ended without a word")
+    raise AssertionError("the command did not end by itself")
 
 
 def refused(run: Run, name: str) -> str:
-    """The one line on stderr with which a command ended that refuses its input, with exit code 2."""
+    """The one line on stderr of a command that refused its input with exit code 2."""
     assert run.returncode == 2, run.stderr
     lines = run.stderr.strip().splitlines()
     assert len(lines) == 1, run.stderr

@@ -3,13 +3,12 @@
 python -m experiments.closed_loop --help
 """
 
-import sys
 from collections.abc import Mapping, Sequence
 
 from rich.console import Console
 
 from experiments.closed_loop.ablation import train_networks, unnormalised, variants
-from experiments.closed_loop.config import ABLATED, PRESETS, RENAMED, ClosedLoopConfig
+from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
 from experiments.closed_loop.flown import Flown, flown
 from experiments.closed_loop.models import (
     Trained,
@@ -26,7 +25,6 @@ from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.paper.solved import constant_disturbance, needed_disturbance
 from experiments.runner import command
-from experiments.runner.renamed import renamed_options
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
@@ -121,7 +119,7 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
 def main() -> None:
     """The command line."""
     about = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."
-    command.run(NAME, about, experiment, renamed_options(sys.argv[1:], RENAMED), presets=PRESETS)
+    command.run(NAME, about, experiment, presets=PRESETS)
 
 
 if __name__ == "__main__":

@@ -140,5 +140,3 @@ PRESETS = {
         away_references=("hover",), invariant_hidden=8, invariant_norm="batch", ablation=("statistics",), calls=20,
     ),
 }  # fmt: skip
-RENAMED = {f"--safe-{field.name[10:]}".replace("_", "-"): f"--{field.name}".replace("_", "-")
-           for field in fields(ClosedLoopConfig) if field.name.startswith("invariant_")}  # fmt: skip

@@ -16,29 +16,20 @@ class Inconclusive(Exception):
 
 @dataclass(frozen=True)
 class Claim(Generic[Evidence]):
-    """A hypothesis.
+    """A hypothesis, and a function that decides it.
 
-    Attributes:
-        id: short name, such as "C1".
-        text: the hypothesis and its definition.
-        predicate: from the evidence, whether it holds and the numbers behind that; raises `Inconclusive` if the
-            evidence cannot decide.
+    The predicate returns whether the evidence supports the hypothesis and the numbers behind that; it raises
+    `Inconclusive` if the evidence cannot decide.
     """
 
-    id: str
+    id: str  # such as "C1"
     text: str
     predicate: Callable[[Evidence], tuple[bool, str]]
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a claim.
-
-    Attributes:
-        id, text: of the claim.
-        holds: None if the results are inconclusive.
-        measured: the numbers, or why they are inconclusive.
-    """
+    """The outcome of a claim: `holds` is None if the results are inconclusive, and `measured` then says why."""
 
     id: str
     text: str
@@ -48,15 +39,14 @@ class Verdict:
 
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
     """The verdict on each claim."""
-
-    def one(claim: Claim[Evidence]) -> Verdict:
+    verdicts = []
+    for claim in claims:
         try:
             holds, measured = claim.predicate(evidence)
+            verdicts.append(Verdict(claim.id, claim.text, bool(holds), measured))
         except Inconclusive as why:
-            return Verdict(claim.id, claim.text, None, str(why))
-        return Verdict(claim.id, claim.text, bool(holds), measured)
-
-    return [one(claim) for claim in claims]
+            verdicts.append(Verdict(claim.id, claim.text, None, str(why)))
+    return verdicts
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
@@ -79,18 +69,13 @@ def from_json(record: Mapping[str, Any]) -> list[Verdict]:
     Raises:
         ValueError: an entry is malformed; names it.
     """
-    found = [_verdict(f"claims[{i}]", item) for i, item in enumerate(record["claims"])]
-    for index, item in enumerate(record.get("not_judged", [])):
-        given = item if isinstance(item, dict) else {}
-        undecided = {"id": given.get("id"), "text": given.get("text", ""), "holds": None, "measured": given.get("why")}
-        found.append(_verdict(f"not_judged[{index}]", undecided))
+    decided, undecided = ("id", "text", "holds", "measured"), ("id", "text", "why")
+    found = []
+    for key, names in (("claims", decided), ("not_judged", undecided)):
+        for index, item in enumerate(record.get(key, [])):
+            given = {"text": "", **item} if isinstance(item, dict) else {}  # old reports lack the text of a claim
+            wrong = [n for n in names if not isinstance(given.get(n), bool if n == "holds" else str)]
+            if wrong or len(given) > len(names):
+                raise ValueError(f"{key}[{index}] must hold {', '.join(names)}: true or false, else text")
+            found.append(Verdict(given["id"], given["text"], given.get("holds"), given[names[-1]]))
     return sorted(found, key=lambda verdict: (len(verdict.id), verdict.id))
-
-
-def _verdict(name: str, item: Any) -> Verdict:
-    kinds = {"id": str, "text": str, "holds": bool | None, "measured": str}
-    if not isinstance(item, dict) or item.keys() != kinds.keys():
-        raise ValueError(f"{name}: a claim must be an object of id, text, holds, measured")
-    if not all(isinstance(item[key], kind) for key, kind in kinds.items()):
-        raise ValueError(f"{name}: holds must be true or false and the rest text")
-    return Verdict(**item)

@@ -44,23 +44,14 @@ LONG_NUMBER = 0.05  # numbers up to this need room on an axis
 HALF_LINE = 0.3  # half the height of a line in a panel: of a mean's bar, and of the band of its seeds
 FLOOR_LABEL = "floor: error that no model here can see"
 
-_Limits = tuple[float, float]
-
 
 class Line(NamedTuple):
-    """A line of an error panel.
-
-    Attributes:
-        name: label.
-        errors: of each seed, not finite where it failed.
-        colour: of dots and bar.
-        marked: legend label of a vertical line through the mean, or empty for none.
-    """
+    """A line of an error panel."""
 
     name: str
-    errors: np.ndarray
+    errors: np.ndarray  # of each seed, not finite where it failed
     colour: str
-    marked: str = ""
+    marked: str = ""  # legend label of a vertical line through the mean
 
 
 def colour(model: str) -> str:
@@ -95,12 +86,7 @@ def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[s
 def legend_below(
     figure: Figure, title: str = "", meaning: str = "", columns: int = 3, entries: Mapping[str, Artist] | None = None
 ) -> Figure:
-    """Title above all panels, and below them one legend for what any of them labels, each label once.
-
-    Args:
-        meaning: heading of the legend.
-        entries: label → handle of further entries, which stand first.
-    """
+    """Title above all panels, and below them one legend of all their labels after `entries`, headed `meaning`."""
     shown = dict(entries or {})
     for axes in figure.axes:
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
@@ -111,11 +97,7 @@ def legend_below(
 
 
 def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0) -> None:
-    """Draw a line for each way to do a thing, the first on top.
-
-    Args:
-        floor: an error that no model at hand can get below; 0 if there is none.
-    """
+    """Draw the lines, the first on top, and the error that no model can get below (`floor`), if it is not 0."""
     limits = _limits([line.errors for line in lines], floor)
     axes.set(xscale="log", xlim=limits, ylim=(len(lines) - 0.4, -0.6), title=title)
     axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
@@ -130,11 +112,7 @@ def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.
 
 
 def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
-    """The title and legend of error panels.
-
-    Args:
-        failed: whether an error that is not finite is left out of a mean.
-    """
+    """The title and legend of error panels; `failed`: whether a mean leaves out an error that is not finite."""
     bar = {"color": "0.3", "marker": "|", "markersize": 12, "markeredgewidth": 2.2, "linestyle": ""}
     entries = {
         "a seed": Line2D([], [], color="0.3", alpha=0.55, marker="o", markersize=4, linestyle=""),
@@ -153,7 +131,7 @@ def tick_errors(axis: Axis, low: float, high: float) -> None:
     axis.set_minor_formatter(NullFormatter())
 
 
-def _limits(errors: Iterable[np.ndarray], floor: float) -> _Limits:
+def _limits(errors: Iterable[np.ndarray], floor: float) -> tuple[float, float]:
     """Around all errors within LARGEST_RATIO of the smallest mean, so that one failed run does not flatten the rest."""
     drawn = [values[(values > 1 / DRAWABLE) & (values < DRAWABLE)] for values in errors]
     means = [values.mean() for values in drawn if len(values)]
@@ -164,7 +142,7 @@ def _limits(errors: Iterable[np.ndarray], floor: float) -> _Limits:
     return near.min() / PADDING, near.max() * PADDING
 
 
-def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: _Limits) -> float:
+def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float]) -> float:
     """A dot for each seed and a bar for the mean of the finite ones, which is returned; errors outside are marked."""
     low, high = limits
     finite = values < DRAWABLE

@@ -114,7 +114,7 @@ class Results:
         """Mean, standard deviation and more of a column; see `numbers`."""
         return spread(self.numbers(column, missing))
 
-    def paired(self, other: "Results", column: Column, over: str = "seed") -> tuple[np.ndarray, np.ndarray]:
+    def paired(self, other: "Results", column: Column) -> tuple[np.ndarray, np.ndarray]:
         """The numbers of a column here, and of the rows with the same seeds in another table.
 
         A table of one row, such as that of a model that was not trained, is paired with every seed.
@@ -122,13 +122,13 @@ class Results:
         Raises:
             ValueError: a seed that the other table lacks.
         """
-        theirs = dict(zip(other[over], other.numbers(column), strict=True))
+        theirs = dict(zip(other["seed"], other.numbers(column), strict=True))
         if len(other) == 1:
             return self.numbers(column), np.full(len(self), *theirs.values())
-        lacking = [seed for seed in self[over] if seed not in theirs]
+        lacking = [seed for seed in self["seed"] if seed not in theirs]
         if lacking:
-            raise ValueError(f"other must hold the same {over}s, {lacking[0]} is missing")
-        return self.numbers(column), np.array([theirs[seed] for seed in self[over]])
+            raise ValueError(f"other must hold the same seeds, {lacking[0]} is missing")
+        return self.numbers(column), np.array([theirs[seed] for seed in self["seed"]])
 
     def to_csv(self) -> str:
         """CSV. Nested columns become one column per entry: theta.Ix is `Ix`, an interval of it `Ix_low` and `Ix_high`.
@@ -136,7 +136,7 @@ class Results:
         A number that is not finite is `null`; a cell is empty where a row has no such number.
         """
         nested = {name for row in self.rows for name, value in row.items() if isinstance(value, dict)}
-        ends = {name for name in nested for row in self.rows for v in (row.get(name) or {}).values() if _is_pair(v)}
+        ends = {name for name in nested for row in self.rows if any(map(_is_pair, (row.get(name) or {}).values()))}
         flat = [_flat(row, ends) for row in self.rows]
         names = list(dict.fromkeys(name for row in flat for name in row if name not in nested))
         text = io.StringIO()
@@ -153,16 +153,13 @@ class Results:
         return found
 
 
-def from_csv(text: str, tags: Sequence[str] = ()) -> Results:
-    """Read what `to_csv` wrote; nested columns stay flat. Its `to_csv` is the same text.
-
-    Raises:
-        ValueError: a line has too many or too few cells, or as `Results`.
-    """
-    header, *lines = csv.reader(io.StringIO(text))
-    if any(len(line) != len(header) for line in lines):
-        raise ValueError(f"each line of the CSV must have {len(header)} cells")
-    return Results([{n: _value(c) for n, c in zip(header, line, strict=True) if c} for line in lines], tags)
+def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """The values of nested mappings, by their names joined with `between`."""
+    for name, value in tree.items():
+        if isinstance(value, Mapping):
+            yield from leaves(value, between, f"{prefix}{name}{between}")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def _at(row: Row, path: str) -> Any:
@@ -175,21 +172,15 @@ def _at(row: Row, path: str) -> Any:
 def _flat(row: Row, intervals: Container[str]) -> dict[str, Any]:
     """Column → value; nested columns by the names of their entries, those of intervals by the names of the ends."""
     found: dict[str, Any] = {}
-    for name, value in row.items():
-        own = _entries("", value, name in intervals) if isinstance(value, dict) else {name: value}
-        # The first of one name stands: an interval that is None in every row must not hide its parameter.
-        found |= {key: each for key, each in own.items() if key not in found}
+    for column, value in row.items():
+        for name, each in leaves(value, " ") if isinstance(value, dict) else [(column, value)]:
+            if isinstance(value, dict) and column in intervals:
+                own = dict(zip((f"{name}_low", f"{name}_high"), each or (None, None), strict=True))
+            else:
+                own = {name: each}
+            # The first of one name stands: an interval that is None in every row must not hide its parameter.
+            found |= {key: cell for key, cell in own.items() if key not in found}
     return found
-
-
-def _entries(name: str, value: Any, pairs: bool) -> dict[str, Any]:
-    if isinstance(value, dict):
-        parts = [_entries(f"{name} {inner}".strip(), each, pairs) for inner, each in value.items()]
-        return {key: each for part in parts for key, each in part.items()}
-    if pairs:
-        low, high = value or (None, None)
-        return {f"{name}_low": low, f"{name}_high": high}
-    return {name: value}
 
 
 def _is_pair(value: Any) -> bool:
@@ -198,15 +189,3 @@ def _is_pair(value: Any) -> bool:
 
 def _cell(value: Any) -> str:
     return _NOT_FINITE if value is None else repr(value) if isinstance(value, float) else str(value)
-
-
-def _value(cell: str) -> Any:
-    if cell in (_NOT_FINITE, "True", "False"):
-        return {_NOT_FINITE: None, "True": True, "False": False}[cell]
-    for kind in (int, float):
-        try:
-            if _cell(number := kind(cell)) == cell:
-                return number
-        except ValueError:
-            continue
-    return cell

@@ -25,9 +25,9 @@ class Spread(NamedTuple):
 class Interval(NamedTuple):
     """An estimate and the ends of its confidence interval, NaN where the seeds cannot bound it."""
 
-    value: float
-    low: float
-    high: float
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
 
 
 def spread(values: Sequence[float] | np.ndarray) -> Spread:
@@ -51,7 +51,7 @@ def mean_difference(first: Sequence[float], second: Sequence[float], level: floa
     one, other = _finite(first, second)
     value = float(np.mean(one - other)) if len(one) else math.nan
     if len(one) < 2:
-        return Interval(value, math.nan, math.nan)
+        return Interval(value)
     if np.ptp(one - other) == 0:  # the test has no statistic
         return Interval(value, value, value)
     low, high = ttest_rel(one, other).confidence_interval(level)
@@ -73,17 +73,17 @@ def share_of_gap(
     start, end, best = _finite(before, after, reachable)
     closed, gap = start - end, start - best
     if len(gap) == 0 or gap.mean() <= 0:
-        return Interval(math.nan, math.nan, math.nan)
+        return Interval()
     value = float(closed.mean() / gap.mean())
     if len(gap) < 2:
-        return Interval(value, math.nan, math.nan)
+        return Interval(value)
     t = float(stdtrit(len(gap) - 1, (1 + level) / 2))
     covariance = np.cov(closed, gap) * t**2 / len(gap)
     a = gap.mean() ** 2 - covariance[1, 1]
     b = closed.mean() * gap.mean() - covariance[0, 1]
     c = closed.mean() ** 2 - covariance[0, 0]
     if a <= 0:
-        return Interval(value, math.nan, math.nan)
+        return Interval(value)
     half = math.sqrt(max(b * b - a * c, 0.0))
     return Interval(value, float((b - half) / a), float((b + half) / a))
 

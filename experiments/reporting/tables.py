@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from typing import Any, NamedTuple
 
 from rich.console import Console
@@ -27,12 +28,10 @@ class Table(NamedTuple):
 def tabulate(
     title: str, groups: Mapping[Any, Results], columns: Mapping[str, Cell], header: Sequence[str] = ("model",)
 ) -> Table:
-    """A line per group of rows, a column per function of its rows.
+    """A line per group of rows, by its label or tuple of labels; a column per function of a group, by its title.
 
     Args:
-        groups: label → rows; the label is text, or a tuple of texts for several leading columns.
-        columns: title → text of a group.
-        header: titles of the leading columns.
+        header: titles of the labels' columns.
     """
     lines = [
         (*(label if isinstance(label, tuple) else (label,)), *(text(rows) for text in columns.values()))
@@ -48,18 +47,13 @@ def cross_table(
     text: Cell,
     corner: str = "model",
 ) -> Table:
-    """A line and a column per group of rows, a cell for what is in both.
-
-    Args:
-        lines: label → rows.
-        columns: title → tags that select the rows of the column.
-    """
+    """A line per group of rows, by its label; a column per selection by tags, by its title; a cell for each pair."""
 
     def cell(rows: Results, tags: Mapping[str, Any]) -> str:
         own = rows.where(**tags)
         return text(own) if len(own) else EMPTY
 
-    return tabulate(title, lines, {name: lambda r, t=tags: cell(r, t) for name, tags in columns.items()}, (corner,))
+    return tabulate(title, lines, {name: partial(cell, tags=tags) for name, tags in columns.items()}, (corner,))
 
 
 def spread_text(values: Spread, form: str = ".3g", std_form: str = "", what: str = "not finite") -> str:

@@ -21,16 +21,12 @@ FIRST_COST = 0.05  # s to save a checkpoint, before it is measured
 
 
 class Checkpoints:
-    """Checkpoints of one sweep; the last two are kept.
-
-    Args:
-        folder: of this sweep alone; created by the first save.
-    """
+    """The last two checkpoints of one sweep, in a folder of its own."""
 
     def __init__(self, folder: Path):
         self._folder = folder
 
-    def save(self, arrays: Arrays, about: Any) -> None:
+    def save(self, about: Any, arrays: Arrays) -> None:
         """Write the next checkpoint, then delete all but the last two.
 
         Args:
@@ -39,48 +35,42 @@ class Checkpoints:
         Raises:
             OSError: it cannot be written, for example because the disk is full; earlier checkpoints are intact.
         """
-        numbers = self._numbers()
-        save_archive(self._path(max(numbers, default=0) + 1), FORMAT, about, arrays)
-        for number in numbers[: 1 - KEPT]:
-            self._path(number).unlink()
+        paths = self._paths()
+        number = 1 + max((int(path.stem) for path in paths), default=0)
+        save_archive(self._folder / f"{number:06d}.npz", FORMAT, about, arrays)
+        for path in paths[: 1 - KEPT]:
+            path.unlink()
 
-    def load(self, say: Callable[[str], None]) -> tuple[dict[str, np.ndarray], Any] | None:
-        """The arrays and `about` of the newest intact checkpoint; None if there is none.
+    def load(self, say: Callable[[str], None]) -> tuple[Any, dict[str, np.ndarray]] | None:
+        """`about` and the arrays of the newest intact checkpoint; None if there is none.
 
         Args:
             say: receives one line for each damaged checkpoint; the file is renamed, not deleted.
         """
-        for number in reversed(self._numbers()):
-            path = self._path(number)
+        for path in reversed(self._paths()):
             try:
-                about, arrays = load_archive(path, FORMAT)
-                return arrays, about
+                return load_archive(path, FORMAT)
             except ValueError as error:
                 say(f"{error}; renamed to {path.rename(backup_path(path, 'damaged')).name}")
-        if any(path.is_dir() for path in self._folder.glob("*")):  # written by orbax, before FORMAT
+        if any(path.is_dir() for path in self._folder.glob("*")):  # an earlier version wrote a folder for each
             renamed = self._folder.rename(backup_path(self._folder, "before"))
             say(f"{self._folder}: checkpoints of an earlier version, moved to {renamed.name}; this stage starts anew")
         return None
 
     def delete(self) -> None:
         """Delete all checkpoints, once the finished sweep is saved elsewhere; renamed files stay."""
-        for path in (*map(self._path, self._numbers()), *self._folder.glob(".*.part")):
+        for path in (*self._paths(), *self._folder.glob(".*.part")):
             path.unlink()
         if self._folder.exists() and not any(self._folder.iterdir()):
             self._folder.rmdir()
 
-    def _numbers(self) -> list[int]:
-        return sorted(int(path.stem) for path in self._folder.glob("*.npz") if path.stem.isdecimal())
-
-    def _path(self, number: int) -> Path:
-        return self._folder / f"{number:06d}.npz"
+    def _paths(self) -> list[Path]:
+        """From the oldest to the newest."""
+        return sorted(path for path in self._folder.glob("*.npz") if path.stem.isdecimal())
 
 
 class Autosave:
     """Save a sweep between blocks, within its share of the time, and whenever a signal is pending.
-
-    Attributes:
-        saving: seconds spent on saving.
 
     Args:
         spent: seconds that earlier runs spent on the sweep.
@@ -88,15 +78,11 @@ class Autosave:
     """
 
     def __init__(self, checkpoints: Checkpoints, signals: DeferredSignals, name: str, spent: float, share: float):
-        self._checkpoints, self._signals, self._name, self._spent, self._share = (
-            checkpoints,
-            signals,
-            name,
-            spent,
-            share,
-        )
-        self._began, self._cost, self.saving = time.perf_counter(), FIRST_COST, 0.0
+        self._checkpoints, self._signals, self._name = checkpoints, signals, name
+        self._spent, self._share = spent, share
+        self._began, self._cost = time.perf_counter(), FIRST_COST
         self._unsaved: FitState | None = None
+        self.saving = 0.0  # s spent on saving
 
     def seconds(self) -> float:
         """Time spent on the sweep so far, earlier runs included."""
@@ -115,7 +101,7 @@ class Autosave:
             return
         began = time.perf_counter()
         about = {"name": self._name, "seconds": self.seconds(), "versions": versions(*PACKAGES)}
-        self._checkpoints.save(named_leaves(self._unsaved), about)
+        self._checkpoints.save(about, named_leaves(self._unsaved))
         self._cost = time.perf_counter() - began
         self.saving += self._cost
         self._unsaved = None

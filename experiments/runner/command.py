@@ -1,11 +1,13 @@
 """The command line of all experiments: options, presets, one-line errors, exit codes."""
 
+import argparse
 import contextlib
 import io
 import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -20,11 +22,9 @@ from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
 Options = TypeVar("Options")
-BAD_INPUT, INTERRUPTED, TERMINATED = 2, 130, 143
-
-
-class Terminated(KeyboardInterrupt):
-    """SIGTERM: handled as an interrupt, with its own exit code."""
+BAD_INPUT = 2  # exit code; that of a signal is 128 + its number
+# How options begin, old → new. Old names are accepted for one version; --help does not list them.
+RENAMED = {"--guess-off": "--perturbed-by", "--safe-": "--invariant-", "--no-safe-": "--no-invariant-"}
 
 
 def run(
@@ -43,30 +43,23 @@ def run(
         arguments: of the command line; by default the process's own.
         presets: the choices of --preset by name, all of the class that `experiment` takes; "paper" is the default.
     """
-    arguments = sys.argv[1:] if arguments is None else list(arguments)
-    try:
-        config = read(name, about, arguments, presets)
+    given = sys.argv[1:] if arguments is None else arguments
+    fresh = " without --fresh" if "--fresh" in given else ""
+    with _exit_codes(name, f"interrupted; the same command{fresh} goes on from here"):
+        config = read(name, about, given, presets)
         check_folder("--out", config.out)
         configure(config.cache)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
-        signal.signal(signal.SIGTERM, _terminate)
-        quiet = not hosts.is_main_process()  # only process 0 prints and writes
-        console, folder = Console(stderr=True, quiet=quiet), config.out / name
-        say = partial(console.print, highlight=False, soft_wrap=True)
+        signal.signal(signal.SIGTERM, _interrupt)
+        main = hosts.is_main_process()  # it alone prints and writes
+        console, folder = Console(stderr=True, quiet=not main), config.out / name
         with contextlib.ExitStack() as stack:
-            if hosts.is_main_process():
+            if main:
                 stack.enter_context(locked(folder))
+                say = partial(console.print, highlight=False, soft_wrap=True)
                 stack.enter_context(recorded(folder, config, say))
             experiment(config, console)
-    except (ValueError, OSError) as error:
-        message = str(error) if isinstance(error, OtherRun) else " ".join(str(error).split())
-        print(f"{name}: {message}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt as stop:
-        fresh = " without --fresh" if "--fresh" in arguments else ""
-        print(f"{name}: interrupted; the same command{fresh} goes on from here", file=sys.stderr)
-        sys.exit(TERMINATED if isinstance(stop, Terminated) else INTERRUPTED)
 
 
 def call(
@@ -77,65 +70,45 @@ def call(
     Args:
         kind: a dataclass of the options; its docstring is the description.
     """
-    try:
+    with _exit_codes(name, "interrupted, nothing was written"):
         command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
-    except (ValueError, OSError, ImportError) as error:
-        print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except KeyboardInterrupt:
-        print(f"{name}: interrupted, nothing was written", file=sys.stderr)
-        sys.exit(INTERRUPTED)
 
 
-@contextlib.contextmanager
-def locked(folder: Path) -> Iterator[None]:
-    """Hold the lock of an output folder. It is released with the process, however that ends.
-
-    Raises:
-        ValueError: another run holds it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / ".lock", timeout=0)
-    try:
-        lock.acquire()
-    except Timeout:
-        raise ValueError(f"--out: another run is writing to {folder}; wait for it, or choose another folder") from None
-    try:
-        yield
-    finally:
-        lock.release()
-
-
-def _terminate(signal_number, frame) -> None:
-    raise Terminated
-
-
-def read(name: str, about: str, arguments: list[str], presets: Mapping[str, Run]) -> Run:
+def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
     """The configuration given by a command line: a preset, changed by the other options.
 
     Raises:
         ValueError: an unknown preset, or options that do not fit together.
     """
-    preset = presets[_preset(arguments, presets)]
-    kind = type(preset)
+    arguments = [_renamed(argument) for argument in arguments]
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--preset", nargs="?", default=Run.preset, const="")
+    chosen = parser.parse_known_args(arguments)[0].preset
+    if chosen not in presets:
+        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
+    kind = type(presets[chosen])
     description = "\n\n".join([about, *(each.__doc__ or "" for each in kind.__mro__ if issubclass(each, Run))])
-    output = io.StringIO()
+    program, output = f"python -m experiments.{name}", io.StringIO()
     try:
         with contextlib.redirect_stderr(output):
-            return tyro.cli(
-                kind, prog=f"python -m experiments.{name}", description=description, args=arguments, default=preset
-            )
+            return tyro.cli(kind, prog=program, description=description, args=arguments, default=presets[chosen])
     except SystemExit as stop:
         if not stop.code:
             raise  # --help
         raise ValueError(f"{_message(output.getvalue())}; see --help") from None
 
 
-def _message(box: str) -> str:
-    """The text in the first part of the box that tyro draws around an error."""
-    lines = [line.strip("│ ") for line in box.splitlines()]
-    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰"))]
-    return " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+def locked(folder: Path) -> AbstractContextManager:
+    """Hold the lock of an output folder, which is created. It is released with the process, however that ends.
+
+    Raises:
+        ValueError: another run holds it.
+    """
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        return FileLock(folder / ".lock", timeout=0).acquire()
+    except Timeout:
+        raise ValueError(f"--out: another run is writing to {folder}; wait for it, or choose another folder") from None
 
 
 def check_folder(option: str, folder: Path) -> None:
@@ -153,12 +126,38 @@ def check_folder(option: str, folder: Path) -> None:
         raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
 
 
-def _preset(arguments: list[str], presets: Mapping[str, Run]) -> str:
-    for i, argument in enumerate(arguments):
-        name, _, value = argument.partition("=")
-        if name == "--preset":
-            chosen = value or next(iter(arguments[i + 1 :]), "")
-            if chosen not in presets:
-                raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
-            return chosen
-    return Run.preset
+@contextlib.contextmanager
+def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
+    """End the process with one line on stderr and an exit code on bad input and on a signal."""
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        message = str(error) if isinstance(error, OtherRun) else " ".join(str(error).split())
+        print(f"{name}: {message}", file=sys.stderr)
+        sys.exit(BAD_INPUT)
+    except KeyboardInterrupt as stop:
+        print(f"{name}: {interrupted}", file=sys.stderr)
+        sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
+
+
+def _renamed(argument: str) -> str:
+    """An argument under its new name, with a line on stderr if it was given under an old one."""
+    option, equals, value = argument.partition("=")
+    name = option.replace("_", "-")
+    for old, new in RENAMED.items():
+        if name.startswith(old):
+            now = new + name.removeprefix(old)
+            print(f"{option} is now {now}; the old name will be removed in the next version", file=sys.stderr)
+            return f"{now}{equals}{value}"
+    return argument
+
+
+def _message(box: str) -> str:
+    """The text in the first part of the box that tyro draws around an error."""
+    lines = [line.strip("│ ") for line in box.splitlines()]
+    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰"))]
+    return " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+
+
+def _interrupt(number: int, frame) -> None:
+    raise KeyboardInterrupt(number)

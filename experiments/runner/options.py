@@ -63,11 +63,8 @@ class Run:
 def check_numbers(prefix: str, options: Any) -> None:
     """Check every number of a dataclass whose type has a rule, such as `Count`, `tuple[Positive, ...]`, `Count | None`.
 
-    Args:
-        prefix: of the options' names on the command line, such as "--" or "--rates.".
-
     Raises:
-        ValueError: the first number that its rule refuses, by its name on the command line.
+        ValueError: the first number that its rule refuses, by its name on the command line, which begins with `prefix`.
     """
     for name, hint in get_type_hints(type(options), include_extras=True).items():
         option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
@@ -84,20 +81,12 @@ def _rules(hint: Any) -> list[Any]:
 
 
 def distinct(option: str, names: Sequence[str]) -> None:
-    """Check an option that lists names.
-
-    Raises:
-        ValueError: no names, or one twice.
-    """
+    """Raise ValueError if an option lists no names, or one twice."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
 
 
 def factors(option: str, value: tuple[float, float]) -> None:
-    """Check an option that is a range of factors.
-
-    Raises:
-        ValueError: not two finite numbers above 0, the lower one first.
-    """
+    """Raise ValueError unless an option is two finite factors above 0, the lower one first."""
     if not 0 < value[0] < value[1] < math.inf:
         raise ValueError(f"{option} must be two factors, low < high, above 0, got {value}")

@@ -15,9 +15,9 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class PrecompilePool(AbstractContextManager):
-    """A pool of named compile jobs, started in the order given, one per core at a time.
+    """Named compile jobs, started in the order given, one per core at a time.
 
-    A distributed run ignores the jobs: its processes must compile collective programs in the same order.
+    A distributed run ignores them: its processes must compile collective programs in the same order.
     """
 
     def __init__(self, jobs: Mapping[str, Callable[[], object]]):

@@ -17,9 +17,9 @@ class Line(AbstractContextManager):
     """One line about a stage, updated by `say`."""
 
     def __init__(self, name: str, console: Console):
-        self._name, self._console = name, console
+        self._name, self._console, self._began = name, console, time.perf_counter()
         self._live = Live(Text(f"{name}: compiling"), console=console, transient=True) if console.is_terminal else None
-        self._due = time.perf_counter() + FIRST
+        self._due = self._began + FIRST
 
     def __enter__(self) -> Self:
         if self._live is not None:
@@ -39,37 +39,21 @@ class Line(AbstractContextManager):
             self._due = time.perf_counter() + INTERVAL
             self._console.print(line, highlight=False, soft_wrap=True)
 
-
-class SweepLine(Line):
-    """The progress of a sweep."""
-
-    def show(self, progress: Progress) -> None:
-        """Show the progress; called after each block."""
-        self.say(describe(progress))
-
-
-class PartLine(Line):
-    """The progress of work in a known number of parts."""
-
-    def __init__(self, name: str, console: Console, parts: int):
-        super().__init__(name, console)
-        self._parts, self._began = parts, time.perf_counter()
-
-    def show(self, done: int) -> None:
+    def show_parts(self, done: int, parts: int) -> None:
         """Show the number of finished parts and the time left, if the others take as long."""
         elapsed = time.perf_counter() - self._began
-        left = elapsed / done * (self._parts - done)
-        self.say(f"{done} of {self._parts} parts, {clock(elapsed)} elapsed, {clock(left)} left")
+        left = elapsed / done * (parts - done)
+        self.say(f"{done} of {parts} parts, {clock(elapsed)} elapsed, {clock(left)} left")
 
-
-def describe(progress: Progress) -> str:
-    """Active runs, best loss, elapsed time, and bounds of the time left."""
-    low, high = (progress.seconds * left / max(progress.epochs, 1) for left in (progress.at_least, progress.at_most))
-    share = progress.active / progress.lanes  # stopped runs cost nothing
-    return (
-        f"{progress.active} of {progress.lanes} runs active, epoch {progress.epochs}, best validation loss "
-        f"{progress.best:.3g}, {clock(progress.seconds)} elapsed, {clock(low * share)} to {clock(high * share)} left"
-    )
+    def show_sweep(self, progress: Progress) -> None:
+        """Show active runs, best loss, elapsed time, and bounds of the time left."""
+        share = progress.active / progress.lanes  # stopped runs cost nothing
+        epoch = share * progress.seconds / max(progress.epochs, 1)
+        self.say(
+            f"{progress.active} of {progress.lanes} runs active, epoch {progress.epochs}, best validation loss "
+            f"{progress.best:.3g}, {clock(progress.seconds)} elapsed, "
+            f"{clock(epoch * progress.at_least)} to {clock(epoch * progress.at_most)} left"
+        )
 
 
 def clock(seconds: float) -> str:

@@ -7,14 +7,15 @@ from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
 
+from experiments.reporting.results import leaves
 from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
 
 FILE = "run.json"
+HINT = "  --fresh starts anew and moves it aside; another --out leaves it as it is"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
-ANEW = "--fresh starts anew and moves it aside"
 
 
 class OtherRun(ValueError):
@@ -31,25 +32,24 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
         ValueError: the record or a given file of flights cannot be read.
     """
-    record = describe(config)
+    path, record = folder / FILE, describe(config)
     if config.fresh:
         _move_aside(folder, say)
-    found = read_json(folder / FILE) if (folder / FILE).exists() else {}
-    goes_on = found.get("state") == "unfinished"
-    if goes_on:
+    found = read_json(path) if path.exists() else {}
+    if found.get("state") == "unfinished":
         require_same(f"{folder}: holds an unfinished run, begun {found['started']}", found, record)
         record["started"] = found["started"]
         say(f"{folder}: goes on with the run begun {found['started']}")
-    _write(folder, record, "unfinished")
+    write_atomic(path, json_text(record | {"state": "unfinished"}))
     try:
         yield
     except ValueError:
         if found:
-            write_atomic(folder / FILE, json_text(found))
+            write_atomic(path, json_text(found))
         else:
-            (folder / FILE).unlink()
+            path.unlink()
         raise
-    _write(folder, record, "finished")
+    write_atomic(path, json_text(record | {"state": "finished"}))
 
 
 def describe(config: Run) -> dict[str, Any]:
@@ -70,18 +70,14 @@ def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> N
     Raises:
         OtherRun: they differ; the message begins with `what` and has a line `field: old → new` per difference.
     """
-    before, now = (_flat({name: each.get(name, {}) for name in FIXED}) for each in (old, new))
+    before, now = (dict(leaves({name: each.get(name, {}) for name in FIXED}, ".")) for each in (old, new))
     lines = [
         f"  {name}: {before.get(name, 'absent')} → {now.get(name, 'absent')}"
         for name in sorted(before.keys() | now.keys())
         if before.get(name) != now.get(name)
     ]
     if lines:
-        raise OtherRun("\n".join([f"{what}, that differs:", *lines, f"  {ANEW}; another --out leaves it as it is"]))
-
-
-def _write(folder: Path, record: Mapping[str, Any], state: str) -> None:
-    write_atomic(folder / FILE, json_text({**record, "state": state}))
+        raise OtherRun("\n".join([f"{what}, that differs:", *lines, HINT]))
 
 
 def _move_aside(folder: Path, say: Callable[[str], None]) -> None:
@@ -101,10 +97,3 @@ def _sha256(path: Path) -> str:
             return hashlib.file_digest(file, "sha256").hexdigest()
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
-
-
-def _flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for name, value in tree.items():
-        flat |= _flat(value, f"{prefix}{name}.") if isinstance(value, Mapping) else {f"{prefix}{name}": value}
-    return flat

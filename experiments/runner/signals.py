@@ -16,10 +16,10 @@ class DeferredSignals(AbstractContextManager):
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        handlers = {int(number): signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
-        self._before = {number: handler for number, handler in handlers.items() if callable(handler)}
-        for number in self._before:
-            signal.signal(number, self._note)
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(handler := signal.getsignal(number)):
+                self._before[number] = handler
+                signal.signal(number, self._note)
         return self
 
     def __exit__(self, kind, error, trace) -> None:
@@ -35,14 +35,11 @@ class DeferredSignals(AbstractContextManager):
 
     def raise_pending(self) -> None:
         """Call the original handler of a signal that has arrived; the handler raises."""
-        if self._first is not None:
-            self._act(self._first)
+        number, self._first = self._first, None
+        if number is not None:
+            self._before[number](number, None)
 
     def _note(self, number: int, frame) -> None:
-        if self._first is not None:
-            self._act(number)
-        self._first = number
-
-    def _act(self, number: int) -> None:
-        self._first = None
-        self._before[number](number, None)
+        again, self._first = self.pending, number
+        if again:
+            self.raise_pending()

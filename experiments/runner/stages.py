@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.runner.checkpoint import Autosave, Checkpoints
 from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
-from experiments.runner.progress import PartLine, SweepLine, clock
+from experiments.runner.progress import Line, clock
 from experiments.runner.run_record import require_same
 from experiments.runner.signals import DeferredSignals
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
@@ -33,10 +33,6 @@ Result = TypeVar("Result")
 class Stages:
     """The stages of an experiment: cached training sweeps, and the time that each stage took.
 
-    Attributes:
-        seconds: by stage.
-        reused: names of the sweeps that came from the cache.
-
     Args:
         folder: of the cache.
         console: shows progress.
@@ -46,8 +42,8 @@ class Stages:
 
     def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
         self._folder, self._console, self._share, self._fresh = folder, console, saving, fresh
-        self.seconds: dict[str, float] = {}
-        self.reused: list[str] = []
+        self.seconds: dict[str, float] = {}  # by stage
+        self.reused: list[str] = []  # sweeps that came from the cache
         self._ran = self._saving = 0.0
 
     def run(
@@ -59,10 +55,7 @@ class Stages:
         data: Dataset,
         min_capacity: tuple[int, int] = (0, 0),
     ) -> FitState:
-        """The final states of a sweep on the train and validation splits of a dataset.
-
-        Args:
-            min_capacity: see `sweep`; it does not affect the result.
+        """The final states of a sweep on the train and validation splits of a dataset; see `sweep`.
 
         Raises:
             OtherRun: the sweep was begun by other versions of the libraries.
@@ -71,31 +64,49 @@ class Stages:
         """
         finished = self._folder / f"{_stem(name)}-{_identity(states, plans, settings, data)[:16]}.npz"
         begun = finished.with_suffix(".begun")
+        checkpoints = Checkpoints(begun)
         if self._fresh and hosts.is_main_process():
             self._back_up(finished, begun)
-        checkpoints = Checkpoints(begun)
 
         def look() -> tuple[tuple[bool, float], Arrays]:
-            done = finished.exists()
-            found, spent = _load(finished, states) if done else self._resume(name, states, checkpoints, begun)
-            return (done, spent), named_leaves(found)
+            """Whether the sweep is finished, the seconds spent on it, and its states."""
+            if finished.exists():
+                about, arrays = load_archive(finished, FORMAT)
+                return (True, about["seconds"]), arrays
+            if (found := checkpoints.load(self._say)) is None:
+                return (False, 0.0), named_leaves(states)
+            require_same(f"{begun}: was begun with versions", found[0], {"versions": versions(*PACKAGES)})
+            return (False, found[0]["seconds"]), found[1]
 
-        (done, spent), leaves = hosts.from_first(look)
-        states = with_leaves(states, leaves, "process 0")
+        (done, spent), arrays = hosts.from_first(look)
+        states = with_leaves(states, arrays, finished if done else begun)
         if done:
             self.seconds[name] = spent
             self.reused.append(name)
             self._say(f"{name}: {summary(states)}, as found in the cache")
             return states
-        with DeferredSignals() as signals:
+        if spent:
+            self._say(f"{name}: goes on where it was interrupted, at epoch {states.epoch.max()}, after {clock(spent)}")
+        with DeferredSignals() as signals, Line(name, self._console) as line:
             autosave = Autosave(checkpoints, signals, name, spent, self._share)
-            states = self._sweep(name, states, plans, settings, data, min_capacity, autosave)
+
+            def on_block(states: FitState, progress: Progress) -> None:
+                line.show_sweep(progress)
+                autosave.after_block(states)
+
+            splits = data.splits["train"], data.splits["validation"]
+            try:
+                states = sweep(states, plans, *splits, settings, min_capacity=min_capacity, on_block=on_block)
+            except hosts.PeerLost:
+                autosave.save_last_block()
+                raise
             self.seconds[name] = autosave.seconds()
             if hosts.is_main_process():
                 about = {"name": name, "seconds": self.seconds[name], "versions": versions(*FINISHED_BY)}
                 save_archive(finished, FORMAT, about, named_leaves(states))
                 checkpoints.delete()
-        self._ran, self._saving = self._ran + autosave.seconds() - spent, self._saving + autosave.saving
+        self._ran += self.seconds[name] - spent
+        self._saving += autosave.saving
         self._say(f"{name}: {summary(states)}, {clock(self.seconds[name])}")
         return states
 
@@ -108,14 +119,12 @@ class Stages:
 
     def parts(self, name: str, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
         """The results of jobs run one after the other, with progress, as one timed stage."""
-        with PartLine(name, self._console, len(jobs)) as line:
-
-            def one(number: int, job: Callable[[], Result]) -> Result:
-                result = job()
-                line.show(number)
-                return result
-
-            return self.timed(name, lambda: [one(number, job) for number, job in enumerate(jobs, 1)])
+        results: list[Result] = []
+        with Line(name, self._console) as line:
+            for job in jobs:
+                results.append(self.timed(name, job))
+                line.show_parts(len(results), len(jobs))
+        return results
 
     def knows(self, name: str) -> bool:
         """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
@@ -123,40 +132,17 @@ class Stages:
 
     def notes(self) -> list[str]:
         """Remarks on the times in `seconds`."""
-        found = ", ".join(self.reused)
-        reused = [f"Taken from the cache, with the seconds of the run that made them: {found}."] if found else []
-        saved = [f"Saving checkpoints took {self._saving / self._ran:.2%} of the sweeps' time."] if self._ran else []
-        return reused + saved
+        notes = []
+        if self.reused:
+            notes.append(f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}.")
+        if self._ran:
+            notes.append(f"Saving checkpoints took {self._saving / self._ran:.2%} of the sweeps' time.")
+        return notes
 
     def _back_up(self, finished: Path, begun: Path) -> None:
         stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
         for path in [begun] * begun.exists() + [finished] * stale:
             self._say(f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}")
-
-    def _resume(self, name: str, start: FitState, checkpoints: Checkpoints, begun: Path) -> tuple[FitState, float]:
-        """The states to continue from, and the seconds already spent on them."""
-        found = checkpoints.load(self._say)
-        if found is None:
-            return start, 0.0
-        arrays, about = found
-        require_same(f"{begun}: was begun with versions", about, {"versions": versions(*PACKAGES)})
-        states, spent = with_leaves(start, arrays, begun), about["seconds"]
-        self._say(f"{name}: goes on where it was interrupted, at epoch {states.epoch.max()}, after {clock(spent)}")
-        return states, spent
-
-    def _sweep(self, name, states, plans, settings, data: Dataset, min_capacity, autosave: Autosave) -> FitState:
-        with SweepLine(name, self._console) as line:
-
-            def on_block(states: FitState, progress: Progress) -> None:
-                line.show(progress)
-                autosave.after_block(states)
-
-            splits = data.splits["train"], data.splits["validation"]
-            try:
-                return sweep(states, plans, *splits, settings, min_capacity=min_capacity, on_block=on_block)
-            except hosts.PeerLost:
-                autosave.save_last_block()
-                raise
 
     def _say(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
@@ -187,8 +173,3 @@ def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Data
     # Array leaves do not include a field's static data, such as the vehicle or the scaling of inputs.
     fixed = [RECIPE, *shared, describe(states.field), content_hash(data)]
     return digest(fixed, named_leaves({"start": states, "plan": plans}))
-
-
-def _load(path: Path, like: FitState) -> tuple[FitState, float]:
-    about, arrays = load_archive(path, FORMAT)
-    return with_leaves(like, arrays, path), about["seconds"]

@@ -23,7 +23,6 @@ from experiments.closed_loop.scenarios import PATHS, Scenario
 from experiments.closed_loop.timing import use_one_core
 from experiments.closed_loop.true_model import true_field
 from experiments.reporting.results import Results
-from experiments.runner.renamed import renamed_options
 from hybrid_jax.control import Controller, fly, performance, sample
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
@@ -133,14 +132,6 @@ def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(fli
     # Plans have steps of 0.05 s, the simulation of 0.01 s.
     assert abs(rows["oracle"]["excess"]) < 0.02
     assert not rows["oracle"]["crashed"]
-
-
-def test_old_option_names_are_translated(capsys):
-    names = {"--safe-hidden": "--invariant-hidden", "--safe-linear": "--invariant-linear"}
-    given = ["--safe-hidden", "8", "--safe_hidden=8", "--no-safe-linear", "--seconds", "--safe"]
-    expected = ["--invariant-hidden", "8", "--invariant-hidden=8", "--no-invariant-linear", "--seconds", "--safe"]
-    assert renamed_options(given, names) == expected
-    assert len(capsys.readouterr().err.splitlines()) == 3
 
 
 @pytest.fixture(scope="module")

@@ -1,41 +1,43 @@
-"""An unfinished run goes on as itself or not at all; nothing of it is deleted."""
+"""An unfinished run goes on as itself or not at all; nothing of it is deleted. Old option names are accepted."""
 
 import json
 from dataclasses import replace
 
 import pytest
 
-from experiments.paper.config import SMOKE
+from experiments.ablation import PRESETS as ABLATION
+from experiments.closed_loop.config import PRESETS as CLOSED_LOOP
+from experiments.comparison import PRESETS as COMPARISON
+from experiments.paper.config import PRESETS, SMOKE
+from experiments.runner.command import read
 from experiments.runner.run_record import FILE, OtherRun, recorded
-
-
-def silent(line):
-    pass
 
 
 def record(folder):
     return json.loads((folder / FILE).read_text())
 
 
+def finish(folder, config, say=print):
+    with recorded(folder, config, say):
+        assert record(folder)["state"] == "unfinished"
+    assert record(folder)["state"] == "finished"
+
+
 def interrupt(folder, config, error=KeyboardInterrupt):
-    with pytest.raises(error), recorded(folder, config, silent):
+    with pytest.raises(error), recorded(folder, config, print):
         raise error
 
 
 def test_a_finished_run_gives_way_to_any_other(tmp_path):
-    with recorded(tmp_path, SMOKE, silent):
-        assert record(tmp_path)["state"] == "unfinished"
-    assert record(tmp_path)["state"] == "finished"
-    with recorded(tmp_path, replace(SMOKE, seeds=2), silent):
-        pass
+    finish(tmp_path, SMOKE)
+    finish(tmp_path, replace(SMOKE, seeds=2))
     assert record(tmp_path)["config"]["seeds"] == 2
 
 
 def test_an_unfinished_run_goes_on_and_says_so(tmp_path):
     interrupt(tmp_path, SMOKE)
     begun, said = record(tmp_path), []
-    with recorded(tmp_path, replace(SMOKE, saving=0.5, cache=tmp_path), said.append):
-        pass
+    finish(tmp_path, replace(SMOKE, saving=0.5, cache=tmp_path), said.append)
     assert said == [f"{tmp_path}: goes on with the run begun {begun['started']}"]
     assert record(tmp_path) == begun | {"state": "finished"}
 
@@ -44,8 +46,8 @@ def test_another_configuration_is_refused_field_by_field(tmp_path):
     interrupt(tmp_path, SMOKE)
     before = record(tmp_path)
     other = replace(SMOKE, seeds=2, rates=replace(SMOKE.rates, physics=0.5))
-    with pytest.raises(OtherRun) as refused, recorded(tmp_path, other, silent):
-        pass
+    with pytest.raises(OtherRun) as refused:
+        finish(tmp_path, other)
     assert str(refused.value).splitlines() == [
         f"{tmp_path}: holds an unfinished run, begun {before['started']}, that differs:",
         "  config.rates.physics: 0.01 → 0.5",
@@ -63,11 +65,8 @@ def test_flights_are_known_by_their_content(tmp_path):
     flights.rename(tmp_path / "moved.npz")
     interrupt(out, replace(SMOKE, source_flights=tmp_path / "moved.npz"))
     flights.write_bytes(b"two")
-    with (
-        pytest.raises(OtherRun, match=r"flights\.source_flights: 7692c3ad\S+ → 3fc4ccfe\S+"),
-        recorded(out, given, silent),
-    ):
-        pass
+    with pytest.raises(OtherRun, match=r"flights\.source_flights: 7692c3ad\S+ → 3fc4ccfe\S+"):
+        finish(out, given)
 
 
 def test_another_version_is_refused(tmp_path, monkeypatch):
@@ -77,8 +76,8 @@ def test_another_version_is_refused(tmp_path, monkeypatch):
     about.parent.mkdir()
     about.write_text("Metadata-Version: 2.1\nName: numpy\nVersion: 99.0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    with pytest.raises(OtherRun, match=r"versions\.numpy: \S+ → 99\.0"), recorded(tmp_path / "out", SMOKE, silent):
-        pass
+    with pytest.raises(OtherRun, match=r"versions\.numpy: \S+ → 99\.0"):
+        finish(tmp_path / "out", SMOKE)
 
 
 def test_fresh_moves_all_aside_but_the_lock(tmp_path):
@@ -95,6 +94,20 @@ def test_fresh_moves_all_aside_but_the_lock(tmp_path):
     first = min(tmp_path.glob("out.before-*"), key=lambda path: (len(path.name), path.name))
     assert record(first) == before
     assert (first / "models" / "one.npz").read_bytes() == b"mine"
+
+
+@pytest.mark.parametrize("presets", [PRESETS, COMPARISON, ABLATION, CLOSED_LOOP])
+def test_old_option_names_are_accepted_but_not_listed(presets, capsys):
+    assert read("name", "about", ["--preset", "smoke", "--guess_off=0.2"], presets).perturbed_by == 0.2
+    assert capsys.readouterr().err.startswith("--guess_off is now --perturbed-by; ")
+    with pytest.raises(SystemExit):
+        read("name", "about", ["--help"], presets)
+    assert "guess-off" not in capsys.readouterr().out
+
+
+def test_old_option_names_of_the_closed_loop_are_accepted():
+    found = read("name", "about", ["--preset", "smoke", "--safe-hidden", "9", "--no-safe-linear"], CLOSED_LOOP)
+    assert (found.invariant_hidden, found.invariant_linear) == (9, False)
 
 
 def test_bad_input_begins_no_run_and_ends_none(tmp_path):

@@ -1,4 +1,4 @@
-"""Many sweeps in one process take no more memory than a few."""
+"""Memory stays flat over many sweeps in one process."""
 
 import gc
 import os
@@ -18,12 +18,12 @@ from hybrid_jax.training.fitting import make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 PAGE = os.sysconf("SC_PAGE_SIZE") if hasattr(os, "sysconf") else 0
-SWEEPS, WARM = 200, 40  # what is cached and what the allocator keeps has settled after so many
+SWEEPS, WARM = 200, 40  # caches and the allocator have settled after WARM sweeps
 GROWTH = 1.05
 
 
 def resident():
-    """Memory of this process in bytes, after what nobody refers to is gone."""
+    """Memory of this process in bytes, after garbage collection."""
     gc.collect()
     return int(Path("/proc/self/statm").read_text().split()[1]) * PAGE
 
@@ -44,7 +44,7 @@ def soak(sizes):
 
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
 def test_memory_is_flat_after_the_warm_up():
-    """In a process of its own, two shapes in turn."""
+    """In a separate process, with two shapes in turn."""
     paths = "import sys; sys.path[:0] = ['tests', 'tests/experiments']"
     code = f"{paths}; from test_soak import soak; print(*soak([10, 15]))"
     root = Path(__file__).parents[2]
@@ -54,8 +54,8 @@ def test_memory_is_flat_after_the_warm_up():
     assert last < GROWTH * warm, f"{warm / 2**20:.0f} MiB, then {last / 2**20:.0f} MiB"
 
 
-def test_programs_of_old_shapes_are_let_go():
-    """Shapes that never come again would each leave a compiled program behind."""
+def test_programs_of_old_shapes_are_freed():
+    """Otherwise each shape would leave a compiled program behind."""
     settings = Settings(batch_size=7)
     kept = [weakref.ref(_block(settings, 1, 2, (shape,))) for shape in range(PROGRAMS + 1)]
     gc.collect()  # a map and its compiled function refer to each other

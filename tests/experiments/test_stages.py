@@ -1,4 +1,4 @@
-"""A sweep is run once, is not lost when interrupted, and is found again only by what it was."""
+"""A sweep is run once, survives an interrupt, and is found again only by what determines it."""
 
 import signal
 from dataclasses import replace
@@ -11,7 +11,8 @@ from rich.console import Console
 
 from experiments.paper.lanes import rows_of, trained
 from experiments.paper.tables import run_notes
-from experiments.runner.progress import SweepLine
+from experiments.runner.progress import Line
+from experiments.runner.run_record import OtherRun
 from experiments.runner.stages import Stages
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
@@ -25,12 +26,8 @@ STATES = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, lengt
 PLANS = stack([make_run_config(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rate in (0.03, 0.01)])
 
 
-def stages(folder):
-    return Stages(folder, Console(quiet=True))
-
-
-def run(folder, states=STATES, plans=PLANS, settings=SETTINGS, data=DATA):
-    found = stages(folder)
+def run(folder, states=STATES, plans=PLANS, settings=SETTINGS, data=DATA, fresh=False):
+    found = Stages(folder, Console(quiet=True), fresh=fresh)
     return found.run("a sweep", states, plans, settings, data), found
 
 
@@ -49,34 +46,53 @@ def same(one, other):
     return one.keys() == other.keys() and all(np.array_equal(one[name], other[name]) for name in one)
 
 
-def test_a_finished_sweep_is_found_not_run(folder, whole):
+def test_a_finished_sweep_is_loaded(folder, whole):
     again, found = run(folder)
     assert found.reused == ["a sweep"]
     assert same(again, whole)
 
 
-@pytest.mark.usefixtures("heard")
-def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
+def interrupt(folder, monkeypatch):
+    """Send SIGINT during the second block of epochs; returns the epochs after each block."""
     seen = []
 
-    def interrupt(self, progress):
+    def show_sweep(self, progress):
         seen.append(progress.epochs)
         if len(seen) == 2:
             signal.raise_signal(signal.SIGINT)
 
     with monkeypatch.context() as patch:
-        patch.setattr(SweepLine, "show", interrupt)
+        patch.setattr(Line, "show_sweep", show_sweep)
         with pytest.raises(KeyboardInterrupt):
-            run(tmp_path)
+            run(folder)
+    return seen
+
+
+@pytest.mark.usefixtures("heard")
+def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
+    seen, later = interrupt(tmp_path, monkeypatch), []
     assert [path.name.endswith(".begun") for path in tmp_path.iterdir()] == [True]  # the block was finished, and saved
-    later = []
-    with monkeypatch.context() as patch:
-        patch.setattr(SweepLine, "show", lambda self, progress: later.append(progress.epochs))
-        resumed, found = run(tmp_path)
-    assert later[0] > seen[0]  # it did not start anew
+    monkeypatch.setattr(Line, "show_sweep", lambda self, progress: later.append(progress.epochs))
+    resumed, found = run(tmp_path)
+    assert later[0] > seen[1]  # it did not start anew
     assert found.reused == []
     assert same(resumed, whole)
     assert not list(tmp_path.glob("*.begun"))
+
+
+@pytest.mark.usefixtures("heard")
+def test_a_sweep_begun_by_another_version_is_refused_and_fresh_runs_it_anew(tmp_path, whole, monkeypatch):
+    """A package of another version number stands before the installed one, as after an upgrade."""
+    interrupt(tmp_path, monkeypatch)
+    (begun,) = tmp_path.glob("*.begun")
+    about = tmp_path / "upgrade" / "jax-99.0.dist-info" / "METADATA"
+    about.parent.mkdir(parents=True)
+    about.write_text("Metadata-Version: 2.1\nName: jax\nVersion: 99.0\n")
+    monkeypatch.syspath_prepend(about.parents[1])
+    with pytest.raises(OtherRun, match=r"was begun with versions(.|\n)*  versions\.jax: \S+ → 99\.0\n"):
+        run(tmp_path)
+    assert same(run(tmp_path, fresh=True)[0], whole)
+    assert list(tmp_path.glob(f"{begun.name}.before-*/*"))
 
 
 @pytest.mark.parametrize(
@@ -93,8 +109,8 @@ def test_anything_else_is_another_sweep(folder, whole, other):
     assert run(folder, **other)[1].reused == []
 
 
-def test_a_diverged_lane_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
-    """A learning rate of 1e3 in one lane: the other keeps every bit."""
+def test_a_diverged_run_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
+    """With a learning rate of 1e3 in one run the other keeps every bit."""
     final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
     assert same(lane(final, 0), lane(whole, 0))
     rows = rows_of([trained("physics_only", "fine_tuned", (20, 20), (0, 1), final, np.ones(2))], "parameter_shift")
