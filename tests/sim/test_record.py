@@ -9,7 +9,7 @@ from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import record as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import Flights, fly, gone_wrong
-from hybrid_jax.sim.record import SplitSpec, Tally, cut, make_dataset, record
+from hybrid_jax.sim.record import SplitSpec, Tally, cut, make_dataset
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 
@@ -136,11 +136,12 @@ def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatc
         return flights
 
     monkeypatch.setattr(recording, "fly", numbered)
-    windows, tallies = record(SOURCE, {"a": SplitSpec(300, 10), "b": SplitSpec(150, 20)}, jax.random.key(0))
-    numbers = {name: set(split.x0[:, 0].tolist()) for name, split in windows.items()}
+    dataset = make_dataset(SOURCE, {"a": SplitSpec(300, 10), "b": SplitSpec(150, 20)}, seed=0)
+    numbers = {name: set(split.x0[:, 0].tolist()) for name, split in dataset.splits.items()}
     assert not numbers["a"] & numbers["b"]
-    assert len({tuple(key) for key in flown}) == len(flown) == (tallies["a"].flights + tallies["b"].flights) // 64
-    starts = [(row[0], round(float(row[1]), 3)) for row in windows["a"].x0.tolist()]
+    flights = sum(tally["flights"] for tally in dataset.metadata["tallies"].values())
+    assert len({tuple(key) for key in flown}) == len(flown) == flights // 64
+    starts = [(row[0], round(float(row[1]), 3)) for row in dataset.splits["a"].x0.tolist()]
     assert len(set(starts)) == 300
     assert {start for _, start in starts} == {0.0, 1.0, 2.0, 3.0}
 
@@ -150,7 +151,7 @@ def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken.states[:, 3, 2] = np.nan
     monkeypatch.setattr(recording, "fly", lambda *_: broken)
     with pytest.raises(ValueError, match="domain source: none of 64 flights"):
-        record(SOURCE, {"train": SplitSpec(1, 10)}, jax.random.key(0))
+        make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0)
 
 
 @pytest.mark.parametrize(("windows", "steps"), [(0, 10), (5, 0), (5, 1101)])
