@@ -19,7 +19,6 @@ import os
 os.environ["SCIPY_ARRAY_API"] = "1"  # crazyflow asks for it, before anything imports SciPy
 
 import contextlib
-from collections.abc import Callable
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -42,7 +41,10 @@ OURS, OURS_WITH_FORCES, BY_HAND, CRAZYFLOW = "ours", "ours, with forces", "by ha
 REMEDY = "pip install crazyflow==0.4.0, in an environment whose jax is not 0.10.2"
 # Ours makes q a unit again after each step, by hand it drifts by the error of RK4, 1e-10 over 100 steps.
 AGREEMENT = 1e-8
-
+COMPARED = {
+    BY_HAND: (OURS, "ours / by hand"),
+    CRAZYFLOW: (OURS_WITH_FORCES, "ours with forces / crazyflow, another vehicle"),
+}
 
 PRESETS = {
     "smoke": environment.Preset((8,), steps=10, turns=2),
@@ -50,13 +52,8 @@ PRESETS = {
 }
 
 
-def compile_by_hand(x0: np.ndarray, u: np.ndarray) -> tuple[Call, float]:
-    """A call that flies them all, and the seconds it took to trace and compile."""
-    return compiled(jax.vmap(partial(plain.rk4, partial(derivative, IRIS))), x0, u)
-
-
 def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
-    """The same for crazyflow's default vehicle, hovering at 1 m but for 5 % of its rotor speeds."""
+    """crazyflow's default vehicle, hovering at 1 m but for 5 % of its rotor speeds."""
     from crazyflow.control import Control
     from crazyflow.control.transform import motor_force2rotor_vel
     from crazyflow.sim import Sim
@@ -75,18 +72,14 @@ def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
         data = advance(rotor_vel_control(data, held), 1)
         return data, (data.states.pos, data.states.quat, data.states.vel, data.states.ang_vel)
 
-    def fly(data, commands):
-        return jax.lax.scan(step, data, commands)[1]
-
-    return compiled(fly, data.replace(states=states), commands)
+    return compiled(lambda *flight: jax.lax.scan(step, *flight)[1], data.replace(states=states), commands)
 
 
 def measure_batch(batch: int, preset: environment.Preset) -> dict[str, Any]:
-    """Agreement, compile seconds and steps per second for one batch size."""
     x0, u = make_flights(batch, preset.steps)
-    programs: dict[str, tuple[Callable, float]] = {
+    programs: dict[str, tuple[Call, float]] = {
         OURS: environment.compile_ours((), x0, u),
-        BY_HAND: compile_by_hand(x0, u),
+        BY_HAND: compiled(jax.vmap(partial(plain.rk4, partial(derivative, IRIS))), x0, u),
     }
     if installed("crazyflow"):
         programs[OURS_WITH_FORCES] = environment.compile_ours((drag, ground_effect), x0, u)
@@ -101,16 +94,11 @@ def measure_batch(batch: int, preset: environment.Preset) -> dict[str, Any]:
         "difference": difference,
         "compile_seconds": {name: seconds for name, (_, seconds) in programs.items()},
         "steps_per_second": {name: batch * preset.steps / taken for name, taken in times.medians().items()},
-        "rival_over_ours": {
-            rival: times.ratio(rival, ours)
-            for rival, ours in ((BY_HAND, OURS), (CRAZYFLOW, OURS_WITH_FORCES))
-            if rival in calls
-        },
+        "rival_over_ours": {rival: times.ratio(rival, COMPARED[rival][0]) for rival in COMPARED if rival in calls},
     }
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    """The measurements for reading."""
     table = Table("flights", "", "steps/s", "compile [s]", "differs by", title=f"steps of {DT} s per second")
     for row in rows:
         compared = {BY_HAND: f"{row['difference']:.0e}", CRAZYFLOW: "another vehicle: not compared"}
@@ -122,19 +110,14 @@ def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
     return table
 
 
-def ratios_of(row: dict[str, Any]) -> list[Ratio]:
-    """Our speed over the rivals'; no reach is asked for."""
-    comparisons = {BY_HAND: "ours / by hand", CRAZYFLOW: "ours with forces / crazyflow, another vehicle"}
-    task = f"steps/s on one core, {row['batch']} flights"
-    return [Ratio(f"{task}: {comparisons[rival]}", value) for rival, value in row["rival_over_ours"].items()]
-
-
 def measure(preset: environment.Preset) -> Findings:
-    """Every batch size; the ratios are those of the last."""
+    """Every batch size; the ratios are those of the last; no reach is asked for."""
     with jax.enable_x64(True):
         rows = [measure_batch(batch, preset) for batch in preset.batches]
     absent = [] if installed("crazyflow") else [skipped(CRAZYFLOW, REMEDY)]
-    return Findings([*rows, *absent], [table_of(rows, absent)], ratios_of(rows[-1]))
+    task = f"steps/s on one core, {rows[-1]['batch']} flights"
+    ratios = [Ratio(f"{task}: {COMPARED[rival][1]}", value) for rival, value in rows[-1]["rival_over_ours"].items()]
+    return Findings([*rows, *absent], [table_of(rows, absent)], ratios)
 
 
 if __name__ == "__main__":
