@@ -14,7 +14,7 @@ from benchmarks.__main__ import PEERS
 from benchmarks.peers import installed
 from benchmarks.rigid_body_by_hand import derivative
 from benchmarks.subjects import make_flights, untrained
-from benchmarks.training_peers import BY_HAND, COMPILED, PRESETS, RIVALS, TORCHDIFFEQ, ThreeEighths
+from benchmarks.training_peers import BY_HAND, COMPILED, RIVALS, TORCHDIFFEQ, ThreeEighths
 from hybrid_jax.dynamics.base import Hybrid as OurHybrid
 from hybrid_jax.dynamics.base import train_batch
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -91,7 +91,3 @@ def test_the_rule_of_torchdiffeq_is_of_fourth_order_and_another():
         errors = [np.abs(end(ThreeEighths(), steps) - truth).max() for steps in (8, 16)]
         assert 3.7 < np.log2(errors[0] / errors[1]) < 4.6
         assert np.abs(end(ThreeEighths(), 8) - end(RK4(), 8)).max() > 1e-6  # far above rounding
-
-
-def test_the_preset_that_is_reported_times_each_call_ten_times():
-    assert PRESETS["full"].turns >= 10

@@ -136,7 +136,7 @@ def _linear(equation: JaxprEqn, inputs: list[Value]) -> Column:
         matrix = jax.jacfwd(of_one)(zeros[i]).reshape(-1, zeros[i].size)
         return ca.mtimes(ca.sparsify(ca.DM(np.asarray(matrix))), _column(inputs[i]))
 
-    return reduce(add, map(part, data))
+    return reduce(lambda a, b: a + b, map(part, data))
 
 
 def _folded(value: Value, axes: Sequence[int], fold: Callable) -> Column:

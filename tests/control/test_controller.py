@@ -149,13 +149,6 @@ def test_vmap_equals_single_calls(still):
         np.testing.assert_allclose(found.cost[i], plan.cost, rtol=5e-3)
 
 
-def test_unit_quaternion_switches_the_normalisation():
-    long = jnp.zeros(13).at[3].set(1.1)
-    u = jnp.full(4, 600.0)
-    assert np.linalg.norm(advance(BODY, long, u, 0.05)[3:7]) == pytest.approx(1.0, rel=1e-6)
-    assert np.linalg.norm(advance(BODY, long, u, 0.05, unit_quaternion=False)[3:7]) > 1.09
-
-
 @pytest.mark.parametrize(
     ("wrong", "said"),
     [

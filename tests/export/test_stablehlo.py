@@ -87,18 +87,18 @@ def test_another_system_has_other_sizes(path):
     close(load_program(path)(np.ones(2), np.ones(1)), field(jnp.ones(2), jnp.ones(1)))
 
 
-@pytest.mark.parametrize("shapes", [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], ids=str)
-def test_shapes_that_are_not_the_program_s_are_refused(shapes, path):
-    export_field(path, body())
-    with pytest.raises(ValueError, match=r"x \(13,\) and u \(4,\) expected, got"):
-        load_program(path)(*map(np.ones, shapes))
-
-
-@pytest.mark.parametrize("shapes", [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], ids=str)
-def test_shapes_that_are_no_batch_are_refused(shapes, path):
-    export_field(path, body(), batched=True)
-    with pytest.raises(ValueError, match=r"x \(b, 13\) and u \(b, 4\) expected, got"):
-        load_program(path)(*map(np.ones, shapes))
+@pytest.mark.parametrize(
+    ("batched", "shapes", "said"),
+    [
+        (False, [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], r"x \(13,\) and u \(4,\) expected"),
+        (True, [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], r"x \(b, 13\) and u \(b, 4\) expected"),
+    ],
+)
+def test_shapes_that_are_not_the_program_s_are_refused(batched, shapes, said, path):
+    export_field(path, body(), batched=batched)
+    for x, u in shapes:
+        with pytest.raises(ValueError, match=f"{said}, got"):
+            load_program(path)(np.ones(x), np.ones(u))
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.sweep.lanes import LaneMap, lane, stack
 from hybrid_jax.sweep.training import evaluate, sweep
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
@@ -153,39 +153,23 @@ def test_a_diverged_lane_changes_no_bit_of_another(width, final):
     assert np.isfinite(wild.best.log_length).all()
 
 
-def test_stopped_lanes_are_run_no_more():
-    seen = []
-
-    def note(states, progress):
-        seen.append((progress.active, states.epoch.copy()))
-
-    swept(starts(), [plan(cap=1), plan(cap=20, minimum=20), plan(cap=20, minimum=20)], width=1,
-          block_seconds=1e-9, on_block=note)  # fmt: skip
-    active, epochs = zip(*seen, strict=True)
-    assert active[0] == 2
-    assert active[-1] == 0
-    assert all(each[0] == 1 for each in epochs)
-    assert epochs[-1].tolist() == [1, 20, 20]
-    assert len(seen) > 3
-
-
-def test_stopped_lanes_cost_no_step(monkeypatch):
+def test_stopped_lanes_are_run_no_more(monkeypatch):
     """Only the active lanes are handed to the compiled block."""
-    from hybrid_jax.sweep import training as module
-
-    handed = []
-
-    run = module.LaneMap.__call__
+    handed, epochs, run = [], [], LaneMap.__call__
 
     def counting(self, lanes, shared, costs, active):
         handed.append(list(active))
         return run(self, lanes, shared, costs, active)
 
-    monkeypatch.setattr(module.LaneMap, "__call__", counting)
-    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9)
+    monkeypatch.setattr(LaneMap, "__call__", counting)
+    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9,
+          on_block=lambda states, progress: epochs.append(states.epoch.tolist()))  # fmt: skip
     assert handed[1] == [0, 1, 2]  # the first call only compiles
     assert handed[2] == [1, 2]
     assert handed[-1] == [2]
+    assert len(epochs) > 3
+    assert {each[0] for each in epochs} == {1}
+    assert epochs[-1] == [1, 9, 20]
 
 
 def test_a_sweep_whose_lanes_have_all_stopped_is_left_as_it_is(final):
