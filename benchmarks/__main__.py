@@ -35,11 +35,7 @@ class Options:
 
 
 def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
-    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`.
-
-    Raises:
-        RuntimeError: it failed, for example because two programs do not compute the same.
-    """
+    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`."""
     with TemporaryDirectory() as folder:
         report = Path(folder) / f"{name}.json"
         command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]

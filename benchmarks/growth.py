@@ -1,13 +1,10 @@
 """How do time and memory grow with seeds, with windows, with the horizon and with the width of the network?
 
-Seeds: one epoch of so many lanes, each of 100 windows, on all devices. Windows: one epoch of one lane over so many
-windows, which are copied to the devices in this time too. Horizon and width: one gradient step on 100 windows. The
+Seeds and windows: one epoch on all devices, copies included. Horizon and width: one gradient step on 100 windows. The
 slope is that of log time against log number between the two largest: 1 means that twice as much takes twice as long.
-Memory is what a program asks for beside its arguments, from its compilation; for lanes and windows, what they hold
-themselves.
-
-smoke: the network alone, two small numbers each. full: the hybrid, 1 to 1000 seeds, 1e3 to 1e6 windows, 10 to 1000
-steps, 16 to 1024 hidden units, in some five minutes.
+Memory is what a program needs besides its arguments; for seeds and windows, the arguments.
+smoke: the network alone, two small numbers each. full: the hybrid, up to 1000 seeds, 1e6 windows, 1000 steps and 1024
+hidden units, in some five minutes.
 """
 
 import math

@@ -1,10 +1,8 @@
 """How fast is a flight log read, with all its checks, beside `numpy.loadtxt` on the same file?
 
-The log is a CSV of one flight whose numbers have nine digits, as a logger of float32 writes them. Both programs return
-the same numbers, which is checked before they are timed in turns. `read_csv` also finds the columns by name, counts the
-fields of every row, and refuses what cannot be a flight. A million rows are then read once, and the memory that this
-takes is traced in a pass of its own.
-
+The log is a CSV of one flight whose numbers have nine digits. Both programs must return the same numbers and are timed
+in turns. `read_csv` also finds the columns by name, counts the fields of a row, and refuses what cannot be a flight.
+A million rows are then read once, and the memory that this takes is traced in a pass of its own.
 smoke: a thousand rows. full: a hundred thousand in turns and a million once, about forty seconds.
 """
 

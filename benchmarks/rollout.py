@@ -1,9 +1,9 @@
 """What does going through diffrax cost, against a hand-written scan?
 
-Three programs predict the same windows with the same hybrid, RK4 and held inputs; only the integrator differs:
-`hybrid_jax.rollout` (diffrax solver steps in a scan), a hand-written RK4 in a `lax.scan`, and one
-`diffrax.diffeqsolve` an interval. So do their gradients with respect to the hybrid's parameters. Then: how many windows
-of 1 s are predicted in a second, by `rollout_batch`, which works on columns, and by `rollout` under `vmap`?
+Three programs predict the same windows with the same hybrid, RK4 and held inputs: `hybrid_jax.rollout` (diffrax solver
+steps in a scan), a hand-written RK4 in a `lax.scan`, and one `diffrax.diffeqsolve` an interval. So do their gradients
+with respect to the parameters. Then: how many windows of 1 s are predicted in a second, by `rollout_batch`, which works
+on columns, and by `rollout` under `vmap`?
 """
 
 from collections.abc import Callable

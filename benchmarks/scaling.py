@@ -1,9 +1,8 @@
 """Weak scaling: as many lanes for each device, on more devices and in more processes. Does an epoch take as long?
 
-A sweep of hybrids, as an experiment runs it, in processes of its own: one device held to one core, one device that may
-use what it likes, all cores as devices of one process, and as many processes of one device, which have to tell each
-other of every block. What is timed are epochs between two blocks, exchanges and the host's loop included; imports,
-joining and compiling are apart. All places take turns; after the first turn programs are found in a cache.
+A sweep of hybrids in processes of its own: one device held to one core, one that may use all, all cores as devices
+of one process, and as many processes of one device. Timed are epochs between two blocks, exchanges and the host's loop
+included; imports, joining and compiling are apart. All places take turns; after the first, programs come from a cache.
 """
 
 import json

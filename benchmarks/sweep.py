@@ -1,13 +1,9 @@
 """Which width of a chunk of lanes is best on this backend, and what do lanes cost that have stopped?
 
-Lanes are models of the paper's protocol that train as in `hybrid_jax.sweep`. Measured is the cost of one epoch of one
-lane, for chunks of several widths, for one lane up to all, on one device and on all. Copies to and from the devices are
-part of it, and a chunk that is not full costs as much as a full one. The best width for all lanes on all devices is
-what `hybrid_jax.sweep.lanes.WIDTH` should say. Then the same few lanes train alone, and among others that have
-stopped. The results of all programs are compared before anything is timed.
-
-On a CPU one device is not one core: its larger operations spread over all cores that the process may use. For the cost
-on one core set it with taskset.
+Lanes train as in `hybrid_jax.sweep`. Measured is an epoch of one lane, copies included, for chunks of several widths,
+for one lane up to all, on one device and on all; `hybrid_jax.sweep.lanes.WIDTH` should be the best width for all lanes
+on all devices. Then a few lanes train alone, and among others that have stopped. Results must agree. On a CPU a device
+is not one core: its larger operations use all cores; set one core with taskset.
 """
 
 from collections.abc import Callable
@@ -20,7 +16,7 @@ import numpy as np
 from rich.table import Table
 
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_runs
-from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch, table
+from benchmarks.timing import Findings, Ratio, Times, agree, in_turns, run, stopwatch
 from hybrid_jax.sweep.lanes import WIDTH, LaneMap, lane
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState
@@ -152,9 +148,8 @@ def measure(preset: Preset) -> Findings:
     last = [row for row in rows if (row["devices"], row["lanes"]) == (rows[-1]["devices"], rows[-1]["lanes"])]
     best = min(last, key=lambda row: row["seconds_per_lane_epoch"])["width"]
     choice = {"backend": jax.default_backend(), "best_width": best, "default_width": default_width(preset)}
-    heads = dict(zip(("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH"), choice, strict=True))
-    chosen = {head: (lambda row, name=name: str(row[name])) for head, name in heads.items()}
-    widths = table("all lanes on all devices", [choice], chosen)
+    widths = Table("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH", title="all lanes on all devices")
+    widths.add_row(*map(str, choice.values()))
     idle = Ratio("a stopped lane / an active one", stopped["stopped_share"], at_most=STOPPED)
     ratios = [*ratios_of(preset, times, choice["default_width"], best), idle]
     return Findings([*rows, stopped, choice], [table_of(rows), widths], ratios)

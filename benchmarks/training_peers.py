@@ -1,17 +1,10 @@
-"""How long does a gradient step take, against the paper's stack and against PyTorch written for speed, core for core?
+"""How long does a gradient step take, against the paper's stack and PyTorch written for speed, on one core?
 
-A step is 100 windows of 10 intervals of 0.01 s: RK4, batch normalisation, regulariser, gradient, Adam with the
-protocol's rates, running statistics. Ours is `training.gradient_step`. The rivals start from our parameters: PyTorch
-with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; and the same with its loss, unrolled, under
-`torch.compile`. Loss, gradient and running statistics are compared before anything is timed. torchdiffeq's rk4 is the
-3/8 rule, so it is compared with our step by the 3/8 rule, to the same tolerance, and timed against our usual one, which
-takes as many evaluations. All on one core and one thread, in turns; the seconds of the first call, in which PyTorch
-compiles, are apart.
-
-Training is steps in a row, and so is a turn: ours in one compiled loop, as the library trains, the rivals in a Python
-loop, which is all that they have. A lone step between the others' turns finds its caches cold, and costs twice as much.
-
-smoke: fewer intervals, and `torch.compile` traces but generates no code. full: some five minutes, most of it compiling.
+The step is that of training_step.py. Rivals start from our parameters: PyTorch with torchdiffeq, one interval after
+another; PyTorch with an RK4 by hand; the same with its loss under `torch.compile`. Loss, gradient and running
+statistics must agree; torchdiffeq's rk4 is the 3/8 rule, so it is compared with our step by that rule. A turn is steps
+in a row, as in training: ours in one compiled loop, the rivals in a Python loop. The first call, in which PyTorch
+compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes, most of it compiling.
 """
 
 # PyTorch is of the extra `peers`.

@@ -1,12 +1,10 @@
 """How long does one gradient step take, against the same step written plainly, and against what the machine could do?
 
-A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. Ours
-is `training.gradient_step`. The plain one is what its mathematics reads like: one sample at a time under `vmap`, batch
-statistics by `pmean` over its axis, an RK4 by hand, and every derivative by autodiff. Loss, gradient and running
-statistics are compared before anything is timed, ours also with itself in double precision. The yardstick is a large
-float32 matrix product in the same turns; it uses all cores that the process may use, a step hardly more than one: set
-one core with taskset to compare the two. A user's own fields have no form for a batch; they must not be slower than
-plain.
+A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. The
+plain one is one sample at a time under `vmap`, batch statistics by `pmean`, an RK4 by hand, derivatives by autodiff.
+Both must agree, ours also with itself in double precision. The yardstick is a large float32 matrix product in the same
+turns; it uses all cores, a step hardly more than one: set one core with taskset to compare the two. A user's own fields
+have no form for a batch; they must not be slower than plain.
 """
 
 from collections.abc import Callable

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax.rotation import body_z, conjugate, from_axis_angle, multiply, normalise
-from hybrid_jax.sim.forces import Parameters
+from hybrid_jax.rotation import Vector, body_z, conjugate, from_axis_angle, multiply, normalise
+from hybrid_jax.sim.forces import Parameters, Scalar
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
 from hybrid_jax.vehicle import IRIS, Vehicle
 
@@ -98,7 +98,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
     return Plan(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
 
 
-def _shorten(velocity: Float[Array, "4"], fastest: Float[Array, "3"]) -> Float[Array, "4"]:
+def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
     """Keep the direction in the plane and limit the speed in it, the climb and the turn."""
     speed = jnp.linalg.norm(velocity[:2]) + 1e-9
     plane = velocity[:2] * jnp.minimum(1.0, fastest[0] / speed)
@@ -137,8 +137,8 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 
 
 def act(
-    integral: Float[Array, "3"], x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
-) -> tuple[Float[Array, "3"], Input]:
+    integral: Vector, x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
+) -> tuple[Vector, Input]:
     """One decision: rotor speeds [rad/s] in [0, max_speed] for the current entry of the plan.
 
     `integral` is that of the position error [m/s², world], passed in and returned.
@@ -160,16 +160,14 @@ def act(
     return integral, _allocate(thrust, torque, nominal, max_speed)
 
 
-def _flare(wanted: Float[Array, ""], altitude: Float[Array, ""], climb: Float[Array, ""], scale: Scale):
+def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
     """At least the vertical acceleration [m/s²] that stops the descent above ground, once that exceeds GENTLE."""
     sink = jnp.minimum(climb, 0.0)
     needed = sink**2 / (2 * jnp.maximum(altitude - CLEARANCE * scale.length, 0.03 * scale.length))
     return jnp.where(needed > GENTLE * scale.acceleration, jnp.maximum(wanted, needed), wanted)
 
 
-def _limit_tilt(
-    lift: Float[Array, "3"], altitude: Float[Array, ""], gravity: Float[Array, ""], scale: Scale
-) -> Float[Array, "3"]:
+def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -> Vector:
     """Limit the commanded acceleration [m/s², world] to upward thrust and to tilts that keep rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
@@ -178,9 +176,7 @@ def _limit_tilt(
     return jnp.concatenate([lift[:2] * factor, up[None]])
 
 
-def _angular_acceleration(
-    x: State, lift: Float[Array, "3"], heading: Float[Array, ""], scale: Scale
-) -> Float[Array, "3"]:
+def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale) -> Vector:
     """The angular acceleration [rad/s², body] that turns thrust towards lift and the nose towards heading [rad]."""
     yaw = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
     dx, dy, dz = lift / jnp.linalg.norm(lift)
@@ -191,7 +187,7 @@ def _angular_acceleration(
     return jnp.array(np.array(RATE_GAIN) / scale.time) * (rates - x[BODY_RATES])
 
 
-def _allocate(thrust: Float[Array, ""], torque: Float[Array, "3"], nominal: Parameters, max_speed: float) -> Input:
+def _allocate(thrust: Scalar, torque: Vector, nominal: Parameters, max_speed: float) -> Input:
     """Rotor speeds [rad/s] that give a thrust [N] and a torque [N m, body], clipped to what a rotor can do."""
     k, x, y = nominal.thrust_coefficient, nominal.rotor_positions[:, 0], nominal.rotor_positions[:, 1]
     mixer = jnp.stack([k * jnp.ones(4), k * y, -k * x, nominal.torque_coefficient * nominal.spin])

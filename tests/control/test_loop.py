@@ -12,6 +12,7 @@ import hybrid_jax as hj
 from hybrid_jax.control import (
     Controller,
     Flight,
+    OpenLoopCosts,
     add_body_rates,
     advance,
     figure_eight,
@@ -20,8 +21,10 @@ from hybrid_jax.control import (
     low_pass,
     open_loop_costs,
     performance,
+    relative_cost_error,
     sample,
 )
+from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.dynamics.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
@@ -112,6 +115,20 @@ def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
     exact, windy = (costs(alone(wind, reference, reference[0], 0.0)[0], wind) for wind in (np.zeros(6), WIND))
     np.testing.assert_allclose(exact.actual, exact.predicted, rtol=0.01)
     assert (windy.actual > 5.0 * windy.predicted).all()
+
+
+def test_relative_cost_error_is_bounded_near_zero():
+    costs = OpenLoopCosts(jnp.array([1.0, 3.0]), jnp.array([1.0, 3.0]))
+    assert relative_cost_error(costs, CONTROLLER) == 0
+    higher = OpenLoopCosts(costs.predicted, 1.1 * costs.actual)
+    assert relative_cost_error(higher, CONTROLLER) == pytest.approx(0.1, rel=1e-5)
+    # The denominator is at least the cost of an offset of 5 mm.
+    reference = sample(hover(), CONTROLLER, 0.01)[:20]
+    floor = plan_cost(CONTROLLER.weights, reference, reference.at[:, 1].add(0.005), jnp.zeros((20, 4)))
+    small = OpenLoopCosts(jnp.array([0.0, 0.0]), jnp.array([0.1 * floor, 0.0]))
+    assert relative_cost_error(small, CONTROLLER) == pytest.approx(0.05, rel=1e-4)
+    with pytest.raises(ValueError, match="distance must be"):
+        relative_cost_error(costs, CONTROLLER, 0.0)
 
 
 def still(periods=4):

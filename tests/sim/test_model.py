@@ -77,8 +77,5 @@ def test_no_renderer_is_one_line_that_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(ValueError, match="libosmesa6 or libegl1") as refusal:
         picture(tmp_path / "vehicle.png")
     assert "\n" not in str(refusal.value)
-
-
-def test_a_picture_must_be_a_png(tmp_path):
     with pytest.raises(ValueError, match=r"\.png"):
         picture(tmp_path / "vehicle.jpg")
