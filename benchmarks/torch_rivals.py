@@ -44,16 +44,25 @@ class RigidBody(nn.Module):
     def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         """ẋ (b, 13) for x (b, 13), u (b, 4)."""
         q, v, omega = x[:, 3:7], x[:, 7:10], x[:, 10:13]
-        ix, iy, thrust = (self.nominal * self.log_ratios.exp()).unbind()
+        ix, iy, k = (self.nominal * self.log_ratios.exp()).unbind()
         inertia = torch.stack([ix, iy, self.iz])
-        wrench = (u * u) @ self.mixer * torch.stack([thrust, thrust, thrust, self.torque_coefficient])
-        w, i, j, k = q.unbind(dim=1)
-        up = torch.stack([2 * (i * k + w * j), 2 * (j * k - w * i), w * w - i * i - j * j + k * k], dim=1)
-        real, axis = q[:, :1], q[:, 1:]
-        rotation = torch.cat([-(axis * omega).sum(1, True), real * omega + torch.linalg.cross(axis, omega)], dim=1)
-        acceleration = wrench[:, :1] / self.mass * up + self.gravity
+        wrench = (u * u) @ self.mixer * torch.stack([k, k, k, self.torque_coefficient])
+        acceleration = wrench[:, :1] / self.mass * body_z(q) + self.gravity
         turning = (wrench[:, 1:] - torch.linalg.cross(omega, inertia * omega)) / inertia
-        return torch.cat([v, 0.5 * rotation, acceleration, turning], dim=1)
+        return torch.cat([v, quaternion_derivative(q, omega), acceleration, turning], dim=1)
+
+
+def body_z(q: torch.Tensor) -> torch.Tensor:
+    """The direction of thrust (b, 3) in the world frame for q (b, 4)."""
+    w, x, y, z = q.unbind(dim=1)
+    return torch.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z], dim=1)
+
+
+def quaternion_derivative(q: torch.Tensor, omega: torch.Tensor) -> torch.Tensor:
+    """½ q ⊗ [0, ω] (b, 4)."""
+    w, axis = q[:, :1], q[:, 1:]
+    real = -(axis * omega).sum(dim=1, keepdim=True)
+    return 0.5 * torch.cat([real, w * omega + torch.linalg.cross(axis, omega)], dim=1)
 
 
 class Network(nn.Module):

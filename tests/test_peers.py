@@ -1,7 +1,6 @@
 """Rivals are timed where they are installed and named where they are not; how fast they are, nobody asks here."""
 
 import sys
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -12,14 +11,11 @@ from smoke import benchmarks
 
 from benchmarks.__main__ import PEERS
 from benchmarks.peers import installed
-from benchmarks.plain import rigid_body as by_hand
 from benchmarks.subjects import make_flights, untrained
 from benchmarks.training_peers import BY_HAND, COMPILED, RIVALS, TORCHDIFFEQ, ThreeEighths
 from hybrid_jax.dynamics.base import Hybrid as OurHybrid
 from hybrid_jax.dynamics.base import train_batch
-from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.integrate import RK4, rollout
-from hybrid_jax.vehicle import IRIS
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +64,6 @@ def test_the_field_of_the_rivals_is_ours():
     ours = train_batch(field, jnp.asarray(x.T), jnp.asarray(u[:, 0].T)).T
     theirs = Hybrid(field)(tensor(x), tensor(u[:, 0])).detach().numpy()
     np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-6 * np.abs(ours).max())
-
-
-def test_the_equations_by_hand_are_those_of_the_rigid_body():
-    with jax.enable_x64(True):
-        x, u = map(jnp.asarray, make_flights(20, 1))
-        found = jax.vmap(partial(by_hand, IRIS))(x, u[:, 0])
-        np.testing.assert_allclose(found, rigid_body(IRIS)(x.T, u[:, 0].T).T, rtol=1e-10, atol=1e-10)
 
 
 def test_the_rule_of_torchdiffeq_is_of_fourth_order_and_another():

@@ -94,6 +94,12 @@ def test_every_lane_comes_to_its_own_end(final):
     assert (final.epoch <= 12).all()
 
 
+def compilations(caplog):
+    """How many programs of sweeps were compiled under jax.log_compiles."""
+    messages = [record.getMessage() for record in caplog.records]
+    return sum("Finished XLA compilation" in message and "jit(run)" in message for message in messages)
+
+
 def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     blocks = []
     own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
@@ -101,9 +107,8 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
         for _ in range(2):
             sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, block_seconds=1e-9,
                   on_block=lambda states, progress: blocks.append(progress))  # fmt: skip
-    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert len(blocks) > 3
-    assert sum("run" in message for message in compiled) == 1
+    assert compilations(caplog) == 1
 
 
 def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
@@ -116,12 +121,8 @@ def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
             sweep(*few, VALIDATION, own, width=1, min_capacity=capacity),
         ]
         errors = [evaluate(each.best, VALIDATION, 2, own, capacity[0]) for each in shared]
-    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
-    assert sum("jit(run)" in message for message in compiled) == 2  # one to train, one to test
-    apart = [
-        sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1),
-        sweep(*few, VALIDATION, own, width=1),
-    ]
+    assert compilations(caplog) == 2  # one to train, one to test
+    apart = [swept(starts(), PLANS, settings=own, width=1), sweep(*few, VALIDATION, own, width=1)]
     for one, other, error in zip(shared, apart, errors, strict=True):
         np.testing.assert_array_equal(one.epoch, other.epoch)
         np.testing.assert_allclose(one.field.log_length, other.field.log_length, rtol=0, atol=1e-6)
@@ -200,6 +201,9 @@ def test_evaluate_is_the_error_of_each_lane(final):
 def test_plans_that_do_not_fit_the_data_are_refused(size):
     with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
         swept(starts(), [*PLANS[:2], plan(n_train=size)])
+    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
+    with pytest.raises(ValueError, match="n_train=40"):
+        swept(starts(), short)
 
 
 @pytest.mark.parametrize(("place", "index"), [(0, 40), (39, -1)])
@@ -208,12 +212,6 @@ def test_subsets_that_point_outside_the_data_are_refused(place, index):
     wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
     with pytest.raises(ValueError, match=f"subset holds {index}"):
         swept(starts(), [PLANS[0], wrong, PLANS[2]])
-
-
-def test_subsets_shorter_than_n_train_are_refused():
-    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
-    with pytest.raises(ValueError, match="n_train=40"):
-        swept(starts(), short)
 
 
 def test_bad_data_are_refused_by_name():
