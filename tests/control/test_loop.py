@@ -50,7 +50,7 @@ def reference_of(name):
     return sample(PATHS[name], CONTROLLER, 2.0)
 
 
-@pytest.mark.parametrize(("name", "allowed"), zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True))
+@pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
 def test_true_model_tracks_the_reference(name, allowed):
     """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
     _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0)
