@@ -2,7 +2,6 @@
 
 import subprocess
 import sys
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -11,7 +10,7 @@ from typing import Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from benchmarks.timing import BAD_INPUT, Ratio, check_folder, ratio_table
+from benchmarks.timing import BAD_INPUT, Ratio, check_file, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 
 Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
@@ -36,11 +35,7 @@ class Options:
 
 
 def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
-    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`.
-
-    Raises:
-        RuntimeError: it failed, for example because two programs do not compute the same.
-    """
+    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`."""
     with TemporaryDirectory() as folder:
         report = Path(folder) / f"{name}.json"
         command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]
@@ -52,36 +47,27 @@ def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
         return read_json(report)
 
 
-def ratios_of(reports: Sequence[dict[str, Any]]) -> list[Ratio]:
-    """The ratios of all reports, prefixed by the benchmark."""
-    return [
-        Ratio(f"{report['benchmark']}: {ratio['what']}", ratio["value"], ratio["at_most"], ratio["at_least"])
-        for report in reports
-        for ratio in report["ratios"]
-    ]
-
-
-def absences(reports: Sequence[dict[str, Any]]) -> list[str]:
-    """A line for each library that a benchmark skipped, with the command that installs it."""
-    rows = [(report["benchmark"], row) for report in reports for row in report["rows"]]
-    return [f"{name}: {row['rival']}: {row['skipped']}" for name, row in rows if "skipped" in row]
-
-
 def main() -> None:
     """The command line. Exit code 2 and one line on stderr for bad input, 1 if a benchmark fails."""
     options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
     try:
-        if options.out is not None:
-            check_folder("--out", options.out.parent)
+        check_file("--out", options.out)
         names = options.only + (PEERS if options.peers else ())
         reports = [measured(name, options.preset, options.out) for name in names]
     except (ValueError, RuntimeError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, ValueError) else 1)
     console = Console()
-    console.print(ratio_table(ratios_of(reports)))
-    for line in absences(reports):
-        console.print(line, markup=False)
+    ratios = [
+        Ratio(f"{report['benchmark']}: {ratio['what']}", ratio["value"], ratio["at_most"], ratio["at_least"])
+        for report in reports
+        for ratio in report["ratios"]
+    ]
+    console.print(ratio_table(ratios))
+    for report in reports:
+        for row in report["rows"]:
+            if "skipped" in row:
+                console.print(f"{report['benchmark']}: {row['rival']}: {row['skipped']}", markup=False)
     if options.out is not None:
         write_atomic(options.out, json_text({"benchmarks": reports}))
 

@@ -13,9 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rich.table import Table
-
-from benchmarks.timing import Findings, Ratio, run, run_together
+from benchmarks.timing import Findings, Ratio, run, run_together, table
 from hybrid_jax.runtime import PROGRAMS
 
 COLD, CACHED = 15.0, 2.0  # s, to reach
@@ -61,11 +59,7 @@ def waited(stages: list[tuple[str, float, float]]) -> float:
 
 
 def measure_run(preset: Preset, cache: Path, folder: Path) -> dict[str, Any]:
-    """One run of the experiment.
-
-    Raises:
-        RuntimeError: it failed.
-    """
+    """One run of the experiment."""
     probe = folder / "probe.json"
     arguments = [f"experiments.{preset.experiment}", "--preset", "smoke", "--out", str(folder), "--cache", str(cache)]
     command = ["-c", PROBE.replace("MODULE", repr(arguments[0])), *arguments[1:], *preset.options]
@@ -96,15 +90,15 @@ def measure(preset: Preset) -> Findings:
         Ratio(f"seconds for all programs of {preset.experiment}, from nothing", cold, at_most=COLD),
         Ratio("the same with the cache", cached, at_most=CACHED),
     ]
-    return Findings(rows, [table_of(rows)], ratios)
+    return Findings(rows, [table(f"programs of {preset.experiment}", rows, COLUMNS)], ratios)
 
 
-def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The runs for reading."""
-    table = Table("", "programs", "waited for them [s]", "whole run [s]", title=f"programs of {rows[0]['experiment']}")
-    for row in rows:
-        table.add_row(row["case"], str(row["programs"]), f"{row['waited_seconds']:.1f}", f"{row['run_seconds']:.1f}")
-    return table
+COLUMNS = {
+    "": lambda row: row["case"],
+    "programs": lambda row: str(row["programs"]),
+    "waited for them [s]": lambda row: f"{row['waited_seconds']:.1f}",
+    "whole run [s]": lambda row: f"{row['run_seconds']:.1f}",
+}
 
 
 if __name__ == "__main__":

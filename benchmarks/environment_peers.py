@@ -1,14 +1,9 @@
 """How many steps a second does our environment make, against rigid-body JAX written by hand and against crazyflow?
 
-By hand: the same vehicle without drag and ground effect, its Newton–Euler equations written out, RK4 in a `lax.scan`
-under `vmap`. It shows what MJX costs, which takes any body and any force; its flights are compared with ours before
-anything is timed. crazyflow: a simulator with models of its own, which knows neither our vehicle nor ground effect. So
-it flies another vehicle, a small Crazyflie whose rotors take time to speed up, with drag: as many flights by RK4 from
-rotor speeds held over each step, but of another model, so that speed can be compared and results can not. One step is
-0.01 s of one vehicle in float64. All on one core, in turns, medians; compilation is timed apart.
-
-crazyflow 0.4.0 refuses jax 0.10.2, so it is no part of the extra `peers`; beside another jax it is timed.
-smoke: one tiny batch. full: batches of 64 and 1000 flights.
+By hand: the same vehicle without drag and ground effect, RK4 in a `lax.scan` under `vmap`; its flights must agree with
+ours. crazyflow simulates a Crazyflie with drag and rotor dynamics, so only speeds can be compared. One step is 0.01 s
+of one vehicle in float64, all on one core; compilation is timed apart. crazyflow 0.4.0 refuses jax 0.10.2, so it is not
+in the extra `peers`. smoke: one tiny batch. full: batches of 64 and 1000 flights.
 """
 
 # crazyflow is rarely installed.
@@ -19,7 +14,6 @@ import os
 os.environ["SCIPY_ARRAY_API"] = "1"  # crazyflow asks for it, before anything imports SciPy
 
 import contextlib
-from collections.abc import Callable
 from functools import partial
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -32,17 +26,18 @@ from rich.table import Table
 
 from benchmarks import environment, plain
 from benchmarks.peers import installed, keep_to_one_core, skipped
-from benchmarks.rigid_body_by_hand import derivative
 from benchmarks.subjects import DT, make_flights
-from benchmarks.timing import Call, Findings, Ratio, agree, compiled, in_turns, run
+from benchmarks.timing import Call, Findings, Ratio, compiled, run
 from hybrid_jax.sim.forces import drag, ground_effect
 from hybrid_jax.vehicle import IRIS
 
 OURS, OURS_WITH_FORCES, BY_HAND, CRAZYFLOW = "ours", "ours, with forces", "by hand", "crazyflow"
 REMEDY = "pip install crazyflow==0.4.0, in an environment whose jax is not 0.10.2"
-# Ours makes q a unit again after each step, by hand it drifts by the error of RK4, 1e-10 over 100 steps.
-AGREEMENT = 1e-8
-
+AGREEMENT = 1e-8  # ours makes q a unit again after each step, by hand it drifts by the error of RK4
+COMPARED = {
+    BY_HAND: (OURS, "ours / by hand"),
+    CRAZYFLOW: (OURS_WITH_FORCES, "ours with forces / crazyflow, another vehicle"),
+}
 
 PRESETS = {
     "smoke": environment.Preset((8,), steps=10, turns=2),
@@ -50,13 +45,8 @@ PRESETS = {
 }
 
 
-def compile_by_hand(x0: np.ndarray, u: np.ndarray) -> tuple[Call, float]:
-    """A call that flies them all, and the seconds it took to trace and compile."""
-    return compiled(jax.vmap(partial(plain.rk4, partial(derivative, IRIS))), x0, u)
-
-
 def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
-    """The same for crazyflow's default vehicle, hovering at 1 m but for 5 % of its rotor speeds."""
+    """crazyflow's default vehicle, hovering at 1 m but for 5 % of its rotor speeds."""
     from crazyflow.control import Control
     from crazyflow.control.transform import motor_force2rotor_vel
     from crazyflow.sim import Sim
@@ -75,42 +65,24 @@ def compile_crazyflow(flights: int, steps: int) -> tuple[Call, float]:
         data = advance(rotor_vel_control(data, held), 1)
         return data, (data.states.pos, data.states.quat, data.states.vel, data.states.ang_vel)
 
-    def fly(data, commands):
-        return jax.lax.scan(step, data, commands)[1]
-
-    return compiled(fly, data.replace(states=states), commands)
+    return compiled(lambda *flight: jax.lax.scan(step, *flight)[1], data.replace(states=states), commands)
 
 
 def measure_batch(batch: int, preset: environment.Preset) -> dict[str, Any]:
-    """Agreement, compile seconds and steps per second for one batch size."""
     x0, u = make_flights(batch, preset.steps)
-    programs: dict[str, tuple[Callable, float]] = {
+    programs: dict[str, tuple[Call, float]] = {
         OURS: environment.compile_ours((), x0, u),
-        BY_HAND: compile_by_hand(x0, u),
+        BY_HAND: compiled(jax.vmap(partial(plain.rk4, partial(plain.rigid_body, IRIS))), x0, u),
     }
     if installed("crazyflow"):
         programs[OURS_WITH_FORCES] = environment.compile_ours((drag, ground_effect), x0, u)
         programs[CRAZYFLOW] = compile_crazyflow(batch, preset.steps)
-    calls = {name: call for name, (call, _) in programs.items()}
-    results = {name: jax.block_until_ready(call()) for name, call in calls.items()}
-    difference = agree("flights of ours and by hand", results[OURS], results[BY_HAND], AGREEMENT)
-    times = in_turns(calls, preset.turns)
-    return {
-        "batch": batch,
-        "steps": preset.steps,
-        "difference": difference,
-        "compile_seconds": {name: seconds for name, (_, seconds) in programs.items()},
-        "steps_per_second": {name: batch * preset.steps / taken for name, taken in times.medians().items()},
-        "rival_over_ours": {
-            rival: times.ratio(rival, ours)
-            for rival, ours in ((BY_HAND, OURS), (CRAZYFLOW, OURS_WITH_FORCES))
-            if rival in calls
-        },
-    }
+    row, times = environment.time_programs(programs, batch, preset, (OURS, BY_HAND), AGREEMENT)
+    ratios = {rival: times.ratio(rival, ours) for rival, (ours, _) in COMPARED.items() if rival in programs}
+    return row | {"rival_over_ours": ratios}
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    """The measurements for reading."""
     table = Table("flights", "", "steps/s", "compile [s]", "differs by", title=f"steps of {DT} s per second")
     for row in rows:
         compared = {BY_HAND: f"{row['difference']:.0e}", CRAZYFLOW: "another vehicle: not compared"}
@@ -122,19 +94,14 @@ def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
     return table
 
 
-def ratios_of(row: dict[str, Any]) -> list[Ratio]:
-    """Our speed over the rivals'; no reach is asked for."""
-    comparisons = {BY_HAND: "ours / by hand", CRAZYFLOW: "ours with forces / crazyflow, another vehicle"}
-    task = f"steps/s on one core, {row['batch']} flights"
-    return [Ratio(f"{task}: {comparisons[rival]}", value) for rival, value in row["rival_over_ours"].items()]
-
-
 def measure(preset: environment.Preset) -> Findings:
-    """Every batch size; the ratios are those of the last."""
+    """Every batch size; the ratios are those of the last; no reach is asked for."""
     with jax.enable_x64(True):
         rows = [measure_batch(batch, preset) for batch in preset.batches]
     absent = [] if installed("crazyflow") else [skipped(CRAZYFLOW, REMEDY)]
-    return Findings([*rows, *absent], [table_of(rows, absent)], ratios_of(rows[-1]))
+    task = f"steps/s on one core, {rows[-1]['batch']} flights"
+    ratios = [Ratio(f"{task}: {COMPARED[rival][1]}", value) for rival, value in rows[-1]["rival_over_ours"].items()]
+    return Findings([*rows, *absent], [table_of(rows, absent)], ratios)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,10 @@
 """How do time and memory grow with seeds, with windows, with the horizon and with the width of the network?
 
-Seeds: one epoch of so many lanes, each of 100 windows, on all devices. Windows: one epoch of one lane over so many
-windows, which are copied to the devices in this time too. Horizon and width: one gradient step on 100 windows. The
+Seeds and windows: one epoch on all devices, copies included. Horizon and width: one gradient step on 100 windows. The
 slope is that of log time against log number between the two largest: 1 means that twice as much takes twice as long.
-Memory is what a program asks for beside its arguments, from its compilation; for lanes and windows, what they hold
-themselves.
-
-smoke: the network alone, two small numbers each. full: the hybrid, 1 to 1000 seeds, 1e3 to 1e6 windows, 10 to 1000
-steps, 16 to 1024 hidden units, in some five minutes.
+Memory is what a program needs besides its arguments; for seeds and windows, the arguments.
+smoke: the network alone, two small numbers each. full: the hybrid, up to 1000 seeds, 1e6 windows, 1000 steps and 1024
+hidden units, in some five minutes.
 """
 
 import math
@@ -21,10 +18,9 @@ import jax
 import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.figure import Figure
-from rich.table import Table
 
 from benchmarks.subjects import BATCH, SETTINGS, Model, make_windows, training_run, training_runs
-from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run
+from benchmarks.timing import Call, Findings, compiled_with_memory, repeated, run, table
 from hybrid_jax.sweep.lanes import LaneMap
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import gradient_step
@@ -35,31 +31,21 @@ VALIDATION = 100
 
 @dataclass(frozen=True)
 class Preset:
-    """The numbers to measure at, each rising, and how long a call may be repeated.
-
-    Attributes:
-        turns: repetitions of a call at the most.
-        budget: seconds after which a call is repeated no more, beyond the third time.
-    """
+    """The numbers to measure at, each rising, and how long a call may be repeated."""
 
     model: Model
     seeds: tuple[int, ...]
     windows: tuple[int, ...]
     steps: tuple[int, ...]
     hidden: tuple[int, ...]
-    turns: int
-    budget: float
+    turns: int  # repetitions of a call at the most
+    budget: float  # seconds after which a call is repeated no more, beyond the third time
 
 
 PRESETS = {
     "full": Preset(
-        "hybrid",
-        (1, 10, 100, 1000),
-        (1_000, 10_000, 100_000, 1_000_000),
-        (10, 30, 100, 300, 1000),
-        (16, 64, 256, 1024),
-        10,
-        10.0,
+        *("hybrid", (1, 10, 100, 1000), (1_000, 10_000, 100_000, 1_000_000)),
+        *((10, 30, 100, 300, 1000), (16, 64, 256, 1024), 10, 10.0),
     ),
     "smoke": Preset("no_physics", (1, 2), (100, 200), (2, 4), (4, 8), turns=2, budget=1.0),
 }
@@ -75,7 +61,8 @@ def epoch_of(model: Model, seeds: int, windows: int) -> Case:
 
     mapped, lanes = LaneMap(epoch), training_runs(model, seeds, windows)
     shared = many_windows(windows), many_windows(VALIDATION)
-    return lambda: mapped(lanes, shared, [1.0] * seeds, range(seeds)), bytes_of((lanes, shared))
+    held = sum(leaf.nbytes for leaf in jax.tree.leaves((lanes, shared)) if eqx.is_array(leaf))
+    return lambda: mapped(lanes, shared, [1.0] * seeds, range(seeds)), held
 
 
 def many_windows(count: int) -> Trajectories:
@@ -90,11 +77,6 @@ def step_of(model: Model, steps: int, hidden: int) -> Case:
     arguments = state.field, state.adam, plan, make_windows(BATCH, steps)
     call, _, needed = compiled_with_memory(partial(gradient_step, settings=SETTINGS), *arguments)
     return call, needed
-
-
-def bytes_of(tree) -> int:
-    """What the arrays of a tree hold."""
-    return sum(leaf.nbytes for leaf in jax.tree.leaves(tree) if eqx.is_array(leaf))
 
 
 AXES: dict[str, tuple[str, Callable[[Model, int], Case]]] = {
@@ -123,14 +105,13 @@ def slope(before: dict[str, Any], after: dict[str, Any]) -> float:
     return math.log(after["seconds"] / before["seconds"]) / math.log(after["number"] / before["number"])
 
 
-def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The measurements for reading."""
-    table = Table("", "", "s", "slope", "MiB", title="growth")
-    for row in rows:
-        grown = "" if row["slope"] is None else f"{row['slope']:.2f}"
-        size = f"{row['number']:,} {LABELS[row['axis']]}"
-        table.add_row(row["work"], size, f"{row['seconds']:.4g}", grown, f"{row['bytes'] / 2**20:,.1f}")
-    return table
+COLUMNS = {
+    "": lambda row: row["work"],
+    " ": lambda row: f"{row['number']:,} {LABELS[row['axis']]}",
+    "s": lambda row: f"{row['seconds']:.4g}",
+    "slope": lambda row: "" if row["slope"] is None else f"{row['slope']:.2f}",
+    "MiB": lambda row: f"{row['bytes'] / 2**20:,.1f}",
+}
 
 
 def figure_of(rows: list[dict[str, Any]]) -> Figure:
@@ -154,7 +135,7 @@ def figure_of(rows: list[dict[str, Any]]) -> Figure:
 def measure(preset: Preset) -> Findings:
     """Every axis in turn."""
     rows = [row for axis in AXES for row in measure_axis(axis, preset)]
-    return Findings(rows, [table_of(rows)], figure=figure_of(rows))
+    return Findings(rows, [table("growth", rows, COLUMNS)], figure=figure_of(rows))
 
 
 if __name__ == "__main__":

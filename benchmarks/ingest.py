@@ -1,10 +1,8 @@
 """How fast is a flight log read, with all its checks, beside `numpy.loadtxt` on the same file?
 
-The log is a CSV of one flight whose numbers have nine digits, as a logger of float32 writes them. Both programs return
-the same numbers, which is checked before they are timed in turns. `read_csv` also finds the columns by name, counts the
-fields of every row, and refuses what cannot be a flight. A million rows are then read once, and the memory that this
-takes is traced in a pass of its own.
-
+The log is a CSV of one flight whose numbers have nine digits. Both programs must return the same numbers and are timed
+in turns. `read_csv` also finds the columns by name, counts the fields of a row, and refuses what cannot be a flight.
+A million rows are then read once, and the memory that this takes is traced in a pass of its own.
 smoke: a thousand rows. full: a hundred thousand in turns and a million once, about forty seconds.
 """
 
@@ -52,7 +50,6 @@ def write_flight(path: Path, rows: int) -> None:
 
 
 def numbers_of(log: FlightLog) -> np.ndarray:
-    """What a log holds, in the order of its file."""
     return np.column_stack([log.t, log.x, log.u])
 
 
@@ -81,16 +78,6 @@ def measure_once(path: Path, rows: int) -> dict[str, Any]:
     return {"rows": rows, "seconds": seconds, "bytes": kept, "peak_bytes": peak}
 
 
-def table_of(both: dict[str, Any], once: dict[str, Any]) -> Table:
-    """The measurements for reading."""
-    table = Table("rows", "rows/s", "× loadtxt", "peak [MiB]", "numbers [MiB]", title="a CSV log is read and checked")
-    speed = both["rows_per_second"]["read_csv"]
-    table.add_row(f"{both['rows']:,}", f"{speed:,.0f}", f"{both['times_loadtxt']:.2f}", "", "")
-    memory = (f"{once[name] / 2**20:.0f}" for name in ("peak_bytes", "bytes"))
-    table.add_row(f"{once['rows']:,}", f"{once['rows'] / once['seconds']:,.0f}", "", *memory)
-    return table
-
-
 def measure(preset: Preset) -> Findings:
     """Both in turns, then the long log once."""
     with TemporaryDirectory() as folder:
@@ -99,12 +86,17 @@ def measure(preset: Preset) -> Findings:
         both = measure_both(path, preset)
         write_flight(path, preset.most)
         once = measure_once(path, preset.most)
+    made = Table("rows", "rows/s", "× loadtxt", "peak [MiB]", "numbers [MiB]", title="a CSV log is read and checked")
+    speed = both["rows_per_second"]["read_csv"]
+    made.add_row(f"{both['rows']:,}", f"{speed:,.0f}", f"{both['times_loadtxt']:.2f}", "", "")
+    memory = (f"{once[name] / 2**20:.0f}" for name in ("peak_bytes", "bytes"))
+    made.add_row(f"{once['rows']:,}", f"{once['rows'] / once['seconds']:,.0f}", "", *memory)
     million = once["seconds"] * MILLION / once["rows"]
     ratios = [
         Ratio("read_csv / loadtxt", both["times_loadtxt"]),
         Ratio(f"seconds a million rows, from {once['rows']:,}", million, at_most=REACH),
     ]
-    return Findings([both, once], [table_of(both, once)], ratios)
+    return Findings([both, once], [made], ratios)
 
 
 if __name__ == "__main__":

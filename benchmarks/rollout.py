@@ -1,9 +1,9 @@
 """What does going through diffrax cost, against a hand-written scan?
 
-Three programs predict the same windows with the same hybrid, RK4 and held inputs; only the integrator differs:
-`hybrid_jax.rollout` (diffrax solver steps in a scan), a hand-written RK4 in a `lax.scan`, and one
-`diffrax.diffeqsolve` an interval. So do their gradients with respect to the hybrid's parameters. Then: how many windows
-of 1 s are predicted in a second, by `rollout_batch`, which works on columns, and by `rollout` under `vmap`?
+Three programs predict the same windows with the same hybrid, RK4 and held inputs: `hybrid_jax.rollout` (diffrax solver
+steps in a scan), a hand-written RK4 in a `lax.scan`, and one `diffrax.diffeqsolve` an interval. So do their gradients
+with respect to the parameters. Then: how many windows of 1 s are predicted in a second, by `rollout_batch`, which works
+on columns, and by `rollout` under `vmap`?
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from rich.table import Table
 
 from benchmarks.plain import rk4
 from benchmarks.subjects import DT, make_windows, untrained
-from benchmarks.timing import Findings, Ratio, agree, compiled, in_turns, run
+from benchmarks.timing import Findings, Ratio, agree, compile_all, in_turns, run, table
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import RK4, rollout, rollout_batch
 from hybrid_jax.trajectories import Trajectories
@@ -64,7 +64,6 @@ INTEGRATORS: dict[str, Callable] = {
 
 
 def prediction(integrate: Callable, field: AbstractVectorField, windows: Trajectories):
-    """The states of all windows."""
     return jax.vmap(partial(integrate, field))(windows.x0, windows.u)
 
 
@@ -83,10 +82,8 @@ WORK = {"prediction": prediction, "gradient": gradient}
 
 
 def measure_case(work: str, steps: int, preset: Preset) -> dict[str, Any]:
-    """All integrators on one task: compile seconds, agreement, median seconds."""
     arguments = untrained("hybrid"), make_windows(preset.windows, steps)
-    programs = {name: compiled(partial(WORK[work], way), *arguments) for name, way in INTEGRATORS.items()}
-    calls = {name: call for name, (call, _) in programs.items()}
+    calls, compiling = compile_all({name: partial(WORK[work], way) for name, way in INTEGRATORS.items()}, *arguments)
     hand = calls["by_hand"]()
     differences = {name: agree(f"{work}s of {name}", call(), hand, AGREEMENT[work]) for name, call in calls.items()}
     times = in_turns(calls, preset.turns)
@@ -95,21 +92,20 @@ def measure_case(work: str, steps: int, preset: Preset) -> dict[str, Any]:
         "windows": preset.windows,
         "steps": steps,
         "difference": differences,
-        "compile_seconds": {name: seconds for name, (_, seconds) in programs.items()},
+        "compile_seconds": compiling,
         "seconds": times.medians(),
         "times_by_hand": {name: times.ratio(name, "by_hand") for name in calls},
     }
 
 
 def measure_forward(preset: Preset) -> dict[str, Any]:
-    """Windows of 1 s predicted per second, as columns and one by one."""
     arguments = untrained("hybrid"), make_windows(preset.windows, 100)
 
     def columns(field, windows):
         return rollout_batch(field, windows.x0, windows.u, DT)
 
-    one_by_one = partial(prediction, INTEGRATORS["hybrid_jax"])
-    calls = {"rollout_batch": compiled(columns, *arguments)[0], "rollout, vmapped": compiled(one_by_one, *arguments)[0]}
+    ways = {"rollout_batch": columns, "rollout, vmapped": partial(prediction, INTEGRATORS["hybrid_jax"])}
+    calls, _ = compile_all(ways, *arguments)
     agree("predictions as columns", calls["rollout_batch"](), calls["rollout, vmapped"](), AGREEMENT["prediction"])
     seconds = in_turns(calls, preset.turns).medians()
     speeds = {name: preset.windows / taken for name, taken in seconds.items()}
@@ -117,41 +113,29 @@ def measure_forward(preset: Preset) -> dict[str, Any]:
 
 
 def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The integrators for reading."""
     heads = ("work", "steps", "integrator", "ms", "× by hand", "compile [s]", "differs by")
-    table = Table(*heads, title="the same hybrid")
+    made = Table(*heads, title="the same hybrid")
     for row in rows:
         for name, seconds in row["seconds"].items():
             ratio, compiling, difference = (row[k][name] for k in ("times_by_hand", "compile_seconds", "difference"))
             numbers = f"{1e3 * seconds:.2f}", f"{ratio:.3f}", f"{compiling:.1f}", f"{difference:.0e}"
-            table.add_row(row["work"], str(row["steps"]), name, *numbers)
-    return table
-
-
-def forward_table(row: dict[str, Any]) -> Table:
-    """The speed of prediction for reading."""
-    table = Table("", "windows/s", title=f"forward prediction of 1 s, {row['windows']} windows")
-    for name, speed in row["windows_per_second"].items():
-        table.add_row(name, f"{speed:,.0f}")
-    return table
-
-
-def ratios_of(row: dict[str, Any]) -> list[Ratio]:
-    """Ours and diffeqsolve's time over that by hand; the reach is asked of our predictions."""
-    task = f"{row['work']}, {row['steps']} steps"
-    ours, solve = row["times_by_hand"]["hybrid_jax"], row["times_by_hand"]["diffeqsolve"]
-    return [
-        Ratio(f"{task}: hybrid_jax / by hand", ours, at_most=REACH),
-        Ratio(f"{task}: diffeqsolve / by hand", solve),
-    ]
+            made.add_row(row["work"], str(row["steps"]), name, *numbers)
+    return made
 
 
 def measure(preset: Preset) -> Findings:
-    """Every case, then the speed of prediction."""
+    """Every case, then the speed of prediction; the reach is asked of ours."""
     rows = [measure_case(work, steps, preset) for work, steps in preset.cases]
     forward = measure_forward(preset)
-    ratios = [ratio for row in rows for ratio in ratios_of(row)]
-    return Findings([*rows, forward], [table_of(rows), forward_table(forward)], ratios)
+    columns = {"": lambda pair: pair[0], "windows/s": lambda pair: f"{pair[1]:,.0f}"}
+    title = f"forward prediction of 1 s, {preset.windows} windows"
+    speeds = table(title, [*forward["windows_per_second"].items()], columns)
+    ratios = [
+        Ratio(f"{row['work']}, {row['steps']} steps: {name} / by hand", row["times_by_hand"][name], at_most)
+        for row in rows
+        for name, at_most in (("hybrid_jax", REACH), ("diffeqsolve", None))
+    ]
+    return Findings([*rows, forward], [table_of(rows), speeds], ratios)
 
 
 if __name__ == "__main__":

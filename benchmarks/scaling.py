@@ -1,9 +1,8 @@
 """Weak scaling: as many lanes for each device, on more devices and in more processes. Does an epoch take as long?
 
-A sweep of hybrids, as an experiment runs it, in processes of its own: one device held to one core, one device that may
-use what it likes, all cores as devices of one process, and as many processes of one device, which have to tell each
-other of every block. What is timed are epochs between two blocks, exchanges and the host's loop included; imports,
-joining and compiling are apart. All places take turns; after the first turn programs are found in a cache.
+A sweep of hybrids in processes of its own: one device held to one core, one that may use all, all cores as devices
+of one process, and as many processes of one device. Timed are epochs between two blocks, exchanges and the host's loop
+included; imports, joining and compiling are apart. All places take turns; after the first, programs come from a cache.
 """
 
 import json
@@ -17,15 +16,10 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from rich.table import Table
-
-from benchmarks.timing import Findings, Ratio, run, run_together
+from benchmarks.timing import Findings, Ratio, run, run_together, table
 from hybrid_jax.runtime import configure, cores
 
 REACH = 1.8 / 2  # of each further device: what a second core is to add
-
-
-APART = "imports", "joining", "first_block", "compiled_first_block"
 
 
 @dataclass(frozen=True)
@@ -102,21 +96,13 @@ def timed_epochs(place: Place, preset: Preset) -> tuple[float, float]:
 
 
 def seconds_at(place: Place, preset: Preset, cache: str) -> dict[str, float]:
-    """The seconds that process 0 of a place measured.
-
-    Raises:
-        RuntimeError: a process failed.
-    """
-    shared = {"place": asdict(place), "preset": asdict(preset), "address": free_address(), "cache": cache}
-    orders = [json.dumps(shared | {"process": i}) for i in range(place.processes)]
-    return json.loads(run_together(str(place), [["-c", PROCESS, order] for order in orders])[0].splitlines()[-1])
-
-
-def free_address() -> str:
-    """Where process 0 can be met."""
+    """The seconds that process 0 of a place measured."""
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        return f"127.0.0.1:{free.getsockname()[1]}"
+        address = f"127.0.0.1:{free.getsockname()[1]}"
+    shared = {"place": asdict(place), "preset": asdict(preset), "address": address, "cache": cache}
+    orders = [json.dumps(shared | {"process": i}) for i in range(place.processes)]
+    return json.loads(run_together(str(place), [["-c", PROCESS, order] for order in orders])[0].splitlines()[-1])
 
 
 def places() -> list[Place]:
@@ -127,37 +113,21 @@ def places() -> list[Place]:
 
 
 def row_of(place: Place, seen: Sequence[dict[str, float]], preset: Preset) -> dict[str, Any]:
-    """What is reported of a place."""
     medians = {name: statistics.median(one[name] for one in seen) for name in seen[0]}
     medians["compiled_first_block"] = seen[0]["first_block"]  # the others find its programs
     lanes = preset.lanes * place.processes * place.devices
     return {"place": str(place), **asdict(place), "lanes": lanes, "windows": preset.windows, "seconds": medians}
 
 
-def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The places for reading."""
-    heads = (
-        "processes × devices",
-        "lanes",
-        "epoch of all [ms]",
-        "imports [s]",
-        "joining [s]",
-        "first block [s]",
-        "compiled [s]",
-    )
-    table = Table(*heads, title="weak scaling")
-    for row in rows:
-        seconds = row["seconds"]
-        apart = (f"{seconds[name]:.1f}" for name in APART)
-        table.add_row(row["place"], str(row["lanes"]), f"{1e3 * seconds['epoch']:.1f}", *apart)
-    return table
-
-
-def ratio_of(row: dict[str, Any], alone: dict[str, Any]) -> Ratio:
-    """How many times the lanes of one device a place trains in the same time."""
-    more = row["lanes"] / alone["lanes"]
-    value = more * alone["seconds"]["epoch"] / row["seconds"]["epoch"]
-    return Ratio(f"lanes of {row['place']} over those of {alone['place']}", value, at_least=REACH * more)
+COLUMNS = {
+    "processes × devices": lambda row: row["place"],
+    "lanes": lambda row: str(row["lanes"]),
+    "epoch of all [ms]": lambda row: f"{1e3 * row['seconds']['epoch']:.1f}",
+    "imports [s]": lambda row: f"{row['seconds']['imports']:.1f}",
+    "joining [s]": lambda row: f"{row['seconds']['joining']:.1f}",
+    "first block [s]": lambda row: f"{row['seconds']['first_block']:.1f}",
+    "compiled [s]": lambda row: f"{row['seconds']['compiled_first_block']:.1f}",
+}
 
 
 def measure(preset: Preset) -> Findings:
@@ -168,8 +138,15 @@ def measure(preset: Preset) -> Findings:
             for place, found in seen.items():
                 found.append(seconds_at(place, preset, cache))
     rows = [row_of(place, found, preset) for place, found in seen.items()]
-    ratios = [ratio_of(row, rows[0]) for row in rows if row["lanes"] > rows[0]["lanes"]]
-    return Findings(rows, [table_of(rows)], ratios)
+    alone, ratios = rows[0], []
+    for row in rows:
+        if (more := row["lanes"] / alone["lanes"]) > 1:
+            # How many times the lanes of one device a place trains in the same time.
+            value = more * alone["seconds"]["epoch"] / row["seconds"]["epoch"]
+            ratios.append(
+                Ratio(f"lanes of {row['place']} over those of {alone['place']}", value, at_least=REACH * more)
+            )
+    return Findings(rows, [table("weak scaling", rows, COLUMNS)], ratios)
 
 
 if __name__ == "__main__":

@@ -1,13 +1,9 @@
 """Which width of a chunk of lanes is best on this backend, and what do lanes cost that have stopped?
 
-Lanes are models of the paper's protocol that train as in `hybrid_jax.sweep`. Measured is the cost of one epoch of one
-lane, for chunks of several widths, for one lane up to all, on one device and on all. Copies to and from the devices are
-part of it, and a chunk that is not full costs as much as a full one. The best width for all lanes on all devices is
-what `hybrid_jax.sweep.lanes.WIDTH` should say. Then the same few lanes train alone, and among others that have
-stopped. The results of all programs are compared before anything is timed.
-
-On a CPU one device is not one core: its larger operations spread over all cores that the process may use. For the cost
-on one core set it with taskset.
+Lanes train as in `hybrid_jax.sweep`. Measured is an epoch of one lane, copies included, for chunks of several widths,
+for one lane up to all, on one device and on all; `hybrid_jax.sweep.lanes.WIDTH` should be the best width for all lanes
+on all devices. Then a few lanes train alone, and among others that have stopped. Results must agree. On a CPU a device
+is not one core: its larger operations use all cores; set one core with taskset.
 """
 
 from collections.abc import Callable
@@ -34,19 +30,13 @@ CLOSE = 1.05  # the default width's cost over the best width's
 
 @dataclass(frozen=True)
 class Preset:
-    """What is swept over, what a lane does in an epoch, and turns.
-
-    Attributes:
-        one_device: whether to measure on one device too, not only on all.
-        lanes: how many train, in rising order; every program is made for the last.
-        active: how many train among stopped ones.
-    """
+    """What is swept over, what a lane does in an epoch, and turns."""
 
     model: Model
-    one_device: bool
+    one_device: bool  # whether to measure on one device too, not only on all
     widths: tuple[int, ...]
-    lanes: tuple[int, ...]
-    active: int
+    lanes: tuple[int, ...]  # how many train, in rising order; every program is made for the last
+    active: int  # how many train among stopped ones
     n_train: int
     validation: int
     turns: int
@@ -74,18 +64,17 @@ def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Progra
 
 
 def losses(states: FitState):
-    """What programs must agree on: each lane's losses after the epoch."""
+    """What programs must agree on."""
     return states.train_loss, states.best_mse
 
 
 def make_programs(preset: Preset) -> tuple[dict[Place, Program], dict[Place, float]]:
-    """A program for each place, and the seconds of each one's first run, most of them compilation.
-
-    Raises:
-        Disagreement: a lane's losses depend on which of them it ran in.
-    """
-    total, programs, seconds, first = preset.lanes[-1], {}, {}, None
-    for place in places_of(preset):
+    """A program for each place, and the seconds of each one's first run, most of them compilation."""
+    every, total = jax.local_device_count(), preset.lanes[-1]
+    devices = sorted({1, every}) if preset.one_device else [every]
+    widths = sorted({*preset.widths, default_width(preset)})
+    programs, seconds, first = {}, {}, None
+    for place in ((number, width) for number in devices for width in widths):
         program = programs[place] = make_program(preset, total, *place)
         states, seconds[place] = stopwatch(lambda program=program: program(total))
         first = states if first is None else first
@@ -93,34 +82,9 @@ def make_programs(preset: Preset) -> tuple[dict[Place, Program], dict[Place, flo
     return programs, seconds
 
 
-def places_of(preset: Preset) -> list[Place]:
-    """All numbers of devices times all widths, a backend's default width among them."""
-    every = jax.local_device_count()
-    devices = sorted({1, every}) if preset.one_device else [every]
-    widths = sorted({*preset.widths, default_width(preset)})
-    return [(number, width) for number in devices for width in widths]
-
-
 def default_width(preset: Preset) -> int:
     """The width that a sweep takes unasked: a backend without a measured one takes all lanes at once."""
     return WIDTH.get(jax.default_backend(), preset.lanes[-1])
-
-
-def measure_cells(preset: Preset, programs: dict[Place, Program], compiling: dict[Place, float]):
-    """The cost of a lane's epoch for every number of devices, width and number of lanes, as rows and as times."""
-    calls = {(*place, lanes): partial(program, lanes) for place, program in programs.items() for lanes in preset.lanes}
-    times = in_turns(calls, preset.turns)
-    rows = [
-        {
-            "devices": devices,
-            "width": width,
-            "lanes": lanes,
-            "seconds_per_lane_epoch": seconds / lanes,
-            "first_run_seconds": compiling[devices, width],
-        }
-        for (devices, width, lanes), seconds in times.medians().items()
-    ]
-    return rows, times
 
 
 def measure_stopped(preset: Preset, among: Program) -> dict[str, Any]:
@@ -135,24 +99,18 @@ def measure_stopped(preset: Preset, among: Program) -> dict[str, Any]:
     return {"active": preset.active, "stopped": stopped, "seconds": times.medians(), "stopped_share": share}
 
 
-def best_width(rows: list[dict[str, Any]]) -> int:
-    """The cheapest for most lanes on most devices."""
-    last = [row for row in rows if (row["devices"], row["lanes"]) == (rows[-1]["devices"], rows[-1]["lanes"])]
-    return min(last, key=lambda row: row["seconds_per_lane_epoch"])["width"]
-
-
 def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The cells for reading: a line for each width, a column for each number of lanes."""
+    """A line for each width, a column for each number of lanes."""
     counts = sorted({row["lanes"] for row in rows})
     heads = ("devices", "width", *(f"{count} lane{'s'[: count > 1]}" for count in counts), "first run [s]")
-    table = Table(*heads, title="ms per lane and epoch")
+    made = Table(*heads, title="ms per lane and epoch")
     lines: dict[Place, list[dict[str, Any]]] = {}
     for row in rows:
         lines.setdefault((row["devices"], row["width"]), []).append(row)
     for (devices, width), line in lines.items():
         costs = (f"{1e3 * row['seconds_per_lane_epoch']:.1f}" for row in line)
-        table.add_row(str(devices), str(width), *costs, f"{line[0]['first_run_seconds']:.1f}")
-    return table
+        made.add_row(str(devices), str(width), *costs, f"{line[0]['first_run_seconds']:.1f}")
+    return made
 
 
 def ratios_of(preset: Preset, times: Times, width: int, best: int) -> list[Ratio]:
@@ -174,15 +132,27 @@ def ratios_of(preset: Preset, times: Times, width: int, best: int) -> list[Ratio
 def measure(preset: Preset) -> Findings:
     """Widths, then stopped lanes."""
     programs, compiling = make_programs(preset)
-    rows, times = measure_cells(preset, programs, compiling)
+    calls = {(*place, lanes): partial(program, lanes) for place, program in programs.items() for lanes in preset.lanes}
+    times = in_turns(calls, preset.turns)
+    rows = [
+        {
+            "devices": devices,
+            "width": width,
+            "lanes": lanes,
+            "seconds_per_lane_epoch": seconds / lanes,
+            "first_run_seconds": compiling[devices, width],
+        }
+        for (devices, width, lanes), seconds in times.medians().items()
+    ]
     stopped = measure_stopped(preset, programs[jax.local_device_count(), default_width(preset)])
-    best = best_width(rows)
+    last = [row for row in rows if (row["devices"], row["lanes"]) == (rows[-1]["devices"], rows[-1]["lanes"])]
+    best = min(last, key=lambda row: row["seconds_per_lane_epoch"])["width"]
     choice = {"backend": jax.default_backend(), "best_width": best, "default_width": default_width(preset)}
-    table = Table("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH", title="all lanes on all devices")
-    table.add_row(*map(str, choice.values()))
+    widths = Table("backend", "best width", "hybrid_jax.sweep.lanes.WIDTH", title="all lanes on all devices")
+    widths.add_row(*map(str, choice.values()))
     idle = Ratio("a stopped lane / an active one", stopped["stopped_share"], at_most=STOPPED)
     ratios = [*ratios_of(preset, times, choice["default_width"], best), idle]
-    return Findings([*rows, stopped, choice], [table_of(rows), table], ratios)
+    return Findings([*rows, stopped, choice], [table_of(rows), widths], ratios)
 
 
 if __name__ == "__main__":

@@ -4,6 +4,7 @@ Calls that are compared take turns, so that load on the machine affects all of t
 of two calls is the median of the ratios within each turn. Set the cores with taskset.
 """
 
+import math
 import os
 import statistics
 import subprocess
@@ -61,9 +62,8 @@ class Ratio:
         """Whether the bounds hold; None without bounds."""
         if self.at_most is None and self.at_least is None:
             return None
-        return (self.at_most is None or self.value <= self.at_most) and (
-            self.at_least is None or self.value >= self.at_least
-        )
+        low, high = (-math.inf if self.at_least is None else self.at_least), self.at_most
+        return low <= self.value <= (math.inf if high is None else high)
 
 
 @dataclass(frozen=True)
@@ -113,8 +113,7 @@ def in_turns(calls: Mapping[Any, Call], turns: int) -> Times:
 
 def compiled(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
     """A call of the compiled function on device arrays, and the seconds of tracing and compiling."""
-    call, seconds, _ = compiled_with_memory(function, *arguments)
-    return call, seconds
+    return compiled_with_memory(function, *arguments)[:2]
 
 
 def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float, int]:
@@ -122,6 +121,14 @@ def compiled_with_memory(function: Callable[..., PyTree], *arguments: PyTree) ->
     arguments = jax.device_put(arguments)
     program, seconds = stopwatch(lambda: jax.jit(function).lower(*arguments).compile())
     return lambda: program(*arguments), seconds, program.memory_analysis().temp_size_in_bytes
+
+
+def compile_all(
+    functions: Mapping[str, Callable[..., PyTree]], *arguments: PyTree
+) -> tuple[dict[str, Call], dict[str, float]]:
+    """`compiled` for each function: the calls and the seconds, by name."""
+    programs = {name: compiled(function, *arguments) for name, function in functions.items()}
+    return {name: call for name, (call, _) in programs.items()}, {name: taken for name, (_, taken) in programs.items()}
 
 
 def repeated(call: Call, turns: int, budget: float) -> float:
@@ -148,11 +155,7 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
 
 
 def run_together(what: str, commands: Sequence[Sequence[str]], variables: Mapping[str, str] | None = None) -> list[str]:
-    """Run Python processes at the same time; the standard output of each.
-
-    Args:
-        commands: the arguments of each interpreter.
-        variables: of their environment; by default those of this process.
+    """Run Python processes, given their arguments, at the same time; the standard output of each.
 
     Raises:
         RuntimeError: a process failed; the end of its standard error.
@@ -170,7 +173,9 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
     """The command line: measure a preset, print, write. Bad input ends in one line on stderr and exit code 2."""
     options = tyro.cli(Options, prog=f"python -m benchmarks.{name}", description=about)
     try:
-        _check(options, presets)
+        if options.preset not in presets:
+            raise ValueError(f"--preset must be one of {', '.join(presets)}, got {options.preset!r}")
+        check_file("--out", options.out)
     except ValueError as error:
         _end(name, error, BAD_INPUT)
     began = time.perf_counter()
@@ -182,67 +187,14 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
             findings = measure(presets[options.preset])
         except Disagreement as error:
             _end(name, error, DISAGREEMENT)
-    _print(findings, Console())
-    if options.out is not None:
-        report = _report(name, options.preset, findings, time.perf_counter() - began)
-        write_atomic(options.out, json_text(report))
-        if findings.figure is not None:
-            findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
-            findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
-
-
-def check_folder(option: str, folder: Path) -> None:
-    """Create a folder and check that it can be written, before work begins.
-
-    Raises:
-        ValueError: it cannot be created or written.
-    """
-    probe = folder / f".writable.{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
-
-
-def _check(options: Options, presets: Mapping[str, Any]) -> None:
-    if options.preset not in presets:
-        raise ValueError(f"--preset must be one of {', '.join(presets)}, got {options.preset!r}")
+    seconds, console = time.perf_counter() - began, Console()
+    for printed in [*findings.tables, *([ratio_table(findings.ratios)] if findings.ratios else [])]:
+        console.print(printed)
     if options.out is None:
         return
-    if options.out.is_dir():
-        raise ValueError(f"--out {options.out}: is a folder, a file is needed")
-    check_folder("--out", options.out.parent)
-
-
-def _end(name: str, error: Exception, code: int):
-    print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
-    sys.exit(code)
-
-
-def _print(findings: Findings, console: Console) -> None:
-    for table in findings.tables:
-        console.print(table)
-    if findings.ratios:
-        console.print(ratio_table(findings.ratios))
-
-
-def ratio_table(ratios: Sequence[Ratio]) -> Table:
-    """Ratios and their bounds."""
-    table = Table("ratio", "", "reach", "", title=f"on {cores()} cores")
-    for ratio in ratios:
-        bounds = (("≤", ratio.at_most), ("≥", ratio.at_least))
-        reach = ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
-        verdict = {None: "", True: "reached", False: "not reached"}[ratio.holds]
-        table.add_row(ratio.what, f"{ratio.value:.3g}", reach, verdict)
-    return table
-
-
-def _report(name: str, preset: str, findings: Findings, seconds: float) -> dict[str, Any]:
-    return {
+    report = {
         "benchmark": name,
-        "preset": preset,
+        "preset": options.preset,
         "environment": {
             "date": datetime.now(UTC).isoformat(timespec="seconds"),
             "versions": versions(*PACKAGES),
@@ -253,3 +205,56 @@ def _report(name: str, preset: str, findings: Findings, seconds: float) -> dict[
         "rows": findings.rows,
         "ratios": [asdict(ratio) | {"holds": ratio.holds} for ratio in findings.ratios],
     }
+    write_atomic(options.out, json_text(report))
+    if findings.figure is not None:
+        findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
+        findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
+
+
+def check_file(option: str, file: Path | None) -> None:
+    """Create the folder of a file to write and check that it can be written, before work begins.
+
+    Raises:
+        ValueError: the file is a folder, or its folder cannot be created or written.
+    """
+    if file is None:
+        return
+    if file.is_dir():
+        raise ValueError(f"{option} {file}: is a folder, a file is needed")
+    probe = file.parent / f".writable.{os.getpid()}"
+    try:
+        file.parent.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{option} {file.parent}: cannot be written: {error.strerror}") from error
+
+
+def _end(name: str, error: Exception, code: int):
+    print(f"{name}: {' '.join(str(error).split())}", file=sys.stderr)
+    sys.exit(code)
+
+
+def table(title: str, rows: Sequence[Any], columns: Mapping[str, Callable[[Any], str]]) -> Table:
+    """Rows for reading; each column is named by its head and made of a row."""
+    made = Table(*columns, title=title)
+    for row in rows:
+        made.add_row(*(cell(row) for cell in columns.values()))
+    return made
+
+
+def ratio_table(ratios: Sequence[Ratio]) -> Table:
+    """Ratios and their bounds."""
+
+    def reach(ratio: Ratio) -> str:
+        bounds = (("≤", ratio.at_most), ("≥", ratio.at_least))
+        return ", ".join(f"{sign} {bound:g}" for sign, bound in bounds if bound is not None)
+
+    verdicts = {None: "", True: "reached", False: "not reached"}
+    columns = {
+        "ratio": lambda ratio: ratio.what,
+        "": lambda ratio: f"{ratio.value:.3g}",
+        "reach": reach,
+        " ": lambda ratio: verdicts[ratio.holds],
+    }
+    return table(f"on {cores()} cores", ratios, columns)

@@ -1,8 +1,7 @@
 """The gradient step of `hybrid_jax.training` as a PyTorch user writes it: batch first, autograd, `torch.optim.Adam`.
 
-The integrator is a choice. `torchdiffeq`, the paper's own, solves one interval after another, because its inputs are
-held; what it calls rk4 is the 3/8 rule, which costs the same four evaluations and differs from the classical method by
-the fifth power of the step. `by_hand` is the classical method in a loop.
+`torchdiffeq`, the paper's own integrator, solves one interval after another, because its inputs are held; what it calls
+rk4 is the 3/8 rule, of the same cost and order as the classical method, which `by_hand` is in a loop.
 """
 
 # PyTorch and torchdiffeq are of the extra `peers`.

@@ -1,17 +1,10 @@
-"""How long does a gradient step take, against the paper's stack and against PyTorch written for speed, core for core?
+"""How long does a gradient step take, against the paper's stack and PyTorch written for speed, on one core?
 
-A step is 100 windows of 10 intervals of 0.01 s: RK4, batch normalisation, regulariser, gradient, Adam with the
-protocol's rates, running statistics. Ours is `training.gradient_step`. The rivals start from our parameters: PyTorch
-with torchdiffeq, one interval after another; PyTorch with an RK4 by hand; and the same with its loss, unrolled, under
-`torch.compile`. Loss, gradient and running statistics are compared before anything is timed. torchdiffeq's rk4 is the
-3/8 rule, so it is compared with our step by the 3/8 rule, to the same tolerance, and timed against our usual one, which
-takes as many evaluations. All on one core and one thread, in turns; the seconds of the first call, in which PyTorch
-compiles, are apart.
-
-Training is steps in a row, and so is a turn: ours in one compiled loop, as the library trains, the rivals in a Python
-loop, which is all that they have. A lone step between the others' turns finds its caches cold, and costs twice as much.
-
-smoke: fewer intervals, and `torch.compile` traces but generates no code. full: some five minutes, most of it compiling.
+The step is that of training_step.py. Rivals start from our parameters: PyTorch with torchdiffeq, one interval after
+another; PyTorch with an RK4 by hand; the same with its loss under `torch.compile`. Loss, gradient and running
+statistics must agree; torchdiffeq's rk4 is the 3/8 rule, so it is compared with our step by that rule. A turn is steps
+in a row, as in training: ours in one compiled loop, the rivals in a Python loop. The first call, in which PyTorch
+compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes, most of it compiling.
 """
 
 # PyTorch is of the extra `peers`.
@@ -79,14 +72,11 @@ class ThreeEighths(diffrax.AbstractERK):
 
 @dataclass(frozen=True)
 class Steps:
-    """One program: a call that makes steps in a row, what a first step came to, and the seconds it took to compile.
+    """One program."""
 
-    PyTorch's seconds are those of its first step, which compiles.
-    """
-
-    call: Call
-    result: dict[str, Any]
-    seconds: float
+    call: Call  # makes steps in a row
+    result: dict[str, Any]  # of a first step
+    seconds: float  # of compiling; of PyTorch's first step, which compiles
 
 
 def missing(preset: Preset) -> list[dict[str, Any]]:
@@ -101,18 +91,13 @@ def missing(preset: Preset) -> list[dict[str, Any]]:
 
 
 def our_first(subject: tuple, solver: diffrax.AbstractSolver) -> dict[str, Any]:
-    """What our first step comes to by some integrator."""
+    """The result of our first step by some integrator."""
     step = partial(gradient_step, settings=replace(SETTINGS, solver=solver))
     field, adam, value = compiled(step, *subject)[0]()
     physics, network, running = adam.mu.physics, adam.mu.residual, field.residual.norm.running
-    moment = {
-        "physics.log_ratios": jnp.stack([physics.log_ratios[name] for name in LEARNED]),
-        "network.weight_in": network.weight_in,
-        "network.gain": network.norm.gain,
-        "network.shift": network.norm.shift,
-        "network.weight_out": network.weight_out,
-        "network.bias_out": network.bias_out,
-    }
+    moment = {f"network.{name}": getattr(network, name) for name in ("weight_in", "weight_out", "bias_out")}
+    moment |= {f"network.{name}": getattr(network.norm, name) for name in ("gain", "shift")}
+    moment["physics.log_ratios"] = jnp.stack([physics.log_ratios[name] for name in LEARNED])
     return {"loss": value, "first_moment": moment, "mean": running.mean, "variance": running.variance}
 
 
@@ -138,35 +123,24 @@ def rival_steps(subject: tuple, preset: Preset, names: Sequence[str]) -> dict[st
     from benchmarks import torch_rivals
 
     torch.set_num_threads(1)
-    integrators = {TORCHDIFFEQ: torch_rivals.by_torchdiffeq}
     field, _, plan, windows = subject
+
+    def in_a_row(step: Call) -> None:
+        for _ in range(preset.in_a_row):
+            step()
+
     steps = {}
     for name in names:
-        training = torch_rivals.Training(
-            field,
-            plan.rates,
-            float(plan.regulariser_weight),
-            windows,
-            integrators.get(name, torch_rivals.by_hand),
-            preset.backend if name == COMPILED else None,
-        )
+        integrate = torch_rivals.by_torchdiffeq if name == TORCHDIFFEQ else torch_rivals.by_hand
+        backend = preset.backend if name == COMPILED else None
+        training = torch_rivals.Training(field, plan.rates, float(plan.regulariser_weight), windows, integrate, backend)
         value, seconds = stopwatch(training)
-        steps[name] = Steps(partial(in_python, training, preset.in_a_row), training.result(value), seconds)
+        steps[name] = Steps(partial(in_a_row, training), training.result(value), seconds)
     return steps
 
 
-def in_python(step: Call, times: int) -> None:
-    """Make steps in a row."""
-    for _ in range(times):
-        step()
-
-
 def prepare(preset: Preset, names: Sequence[str]) -> tuple[dict[str, Steps], dict[str, float]]:
-    """Our steps and those of the rivals that are named, each warm, and by how much each rival differs from ours.
-
-    Raises:
-        Disagreement: it is too much.
-    """
+    """Our steps and those of the rivals that are named, each warm, and by how much each rival differs from ours."""
     state, plan = training_run("hybrid", preset.windows)
     subject = state.field, state.adam, plan, make_windows(preset.windows, preset.intervals)
     ours = our_steps(subject, preset.in_a_row)
@@ -183,7 +157,6 @@ def prepare(preset: Preset, names: Sequence[str]) -> tuple[dict[str, Steps], dic
 
 
 def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times, preset: Preset) -> dict[str, Any]:
-    """What is reported of a program."""
     seconds = times.median(name) / preset.in_a_row
     return {
         "program": name,
@@ -199,7 +172,6 @@ def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times,
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    """The programs for reading."""
     table = Table("", "ms", "windows/s", "× ours", "compile [s]", "differs by", title="a gradient step, one core")
     for row in rows:
         speed = f"{1e3 * row['seconds']:.2f}", f"{row['windows_per_second']:,.0f}", f"{row['times_ours']:.2f}"

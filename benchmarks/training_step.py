@@ -1,12 +1,10 @@
 """How long does one gradient step take, against the same step written plainly, and against what the machine could do?
 
-A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. Ours
-is `training.gradient_step`. The plain one is what its mathematics reads like: one sample at a time under `vmap`, batch
-statistics by `pmean` over its axis, an RK4 by hand, and every derivative by autodiff. Loss, gradient and running
-statistics are compared before anything is timed, ours also with itself in double precision. The yardstick is a large
-float32 matrix product in the same turns; it uses all cores that the process may use, a step hardly more than one: set
-one core with taskset to compare the two. A user's own fields have no form for a batch; they must not be slower than
-plain.
+A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. The
+plain one is one sample at a time under `vmap`, batch statistics by `pmean`, an RK4 by hand, derivatives by autodiff.
+Both must agree, ours also with itself in double precision. The yardstick is a large float32 matrix product in the same
+turns; it uses all cores, a step hardly more than one: set one core with taskset to compare the two. A user's own fields
+have no form for a batch; they must not be slower than plain.
 """
 
 from collections.abc import Callable
@@ -19,13 +17,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
-from rich.table import Table
 
 from benchmarks import plain
 from benchmarks.operations import count_operations
 from benchmarks.own_fields import OwnField, own_field, own_windows
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_run
-from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run
+from benchmarks.timing import Call, Findings, Ratio, Times, agree, compile_all, compiled, in_turns, run, table
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.training.fitting import gradient_step, make_run_config, start
 from hybrid_jax.training.objective import Settings
@@ -69,12 +66,6 @@ def compare(what: str, ours, theirs, tolerance: float = AGREEMENT) -> float:
     return agree(what, comparable(ours), comparable(theirs), tolerance)
 
 
-def matrix_product(size: int) -> Call:
-    """A square float32 product of 2 size³ operations."""
-    a = np.random.default_rng(0).normal(size=(size, size)).astype(np.float32)
-    return compiled(jnp.matmul, a, a)[0]
-
-
 @dataclass(frozen=True)
 class Contest:
     """Our step and the plain one of one model, compiled, and found to agree."""
@@ -86,28 +77,17 @@ class Contest:
     operations: dict[str, int]
 
 
-def prepare_model(model: Model, preset: Preset) -> Contest:
-    """Both steps from the start of the protocol's pre-training."""
-    state, plan = training_run(model, preset.windows)
-    arguments = state.field, state.adam, plan, make_windows(preset.windows, preset.steps)
-    return prepare(model, arguments, SETTINGS)
-
-
-def prepare_own(name: OwnField, preset: Preset) -> Contest:
-    """Both steps of a field that a user wrote for one sample."""
-    state, count = start(own_field(name), jax.random.key(0)), preset.windows
-    plan = make_run_config(1e-3, np.arange(count), count, 1, 1, 1, 0.0)
-    arguments = state.field, state.adam, plan, own_windows(name, count, preset.steps)
-    return prepare(name, arguments, Settings(batch_size=count))
-
-
-def prepare(model: str, arguments: tuple, chosen: Settings) -> Contest:
-    """Both steps of a field, compiled and compared."""
-    ours = partial(gradient_step, settings=chosen)
-    programs = {"ours": compiled(ours, *arguments), "plain": compiled(plain.training_step, *arguments)}
-    calls = {name: call for name, (call, _) in programs.items()}
+def prepare(model: Any, preset: Preset) -> Contest:
+    """Both steps, compiled and compared: of a model at the start of pre-training, or of a user's own field."""
+    count = preset.windows
+    if model in preset.models:
+        (state, plan), windows, settings = training_run(model, count), make_windows(count, preset.steps), SETTINGS
+    else:
+        state, windows = start(own_field(model), jax.random.key(0)), own_windows(model, count, preset.steps)
+        plan, settings = make_run_config(1e-3, np.arange(count), count, 1, 1, 1, 0.0), Settings(batch_size=count)
+    arguments, ours = (state.field, state.adam, plan, windows), partial(gradient_step, settings=settings)
+    calls, seconds = compile_all({"ours": ours, "plain": plain.training_step}, *arguments)
     difference = compare(f"steps of {model}", calls["ours"](), calls["plain"]())
-    seconds = {name: taken for name, (_, taken) in programs.items()}
     exact = in_double_precision(ours, *arguments)
     rounding = compare(f"steps of {model} in single and double precision", calls["ours"](), exact, ROUNDING)
     return Contest(calls, seconds, difference, rounding, dict(count_operations(ours, *arguments)))
@@ -121,14 +101,6 @@ def in_double_precision(function: Callable[..., PyTree], *arguments: PyTree) -> 
 
     with jax.enable_x64(True):
         return jax.device_get(jax.jit(function)(*jax.tree.map(double, jax.device_get(arguments))))
-
-
-def time_all(contests: dict[str, Contest], preset: Preset) -> Times:
-    """All steps of all models and the matrix product, in the same turns."""
-    calls: dict[Any, Call] = {PRODUCT: matrix_product(preset.product)}
-    calls |= {(model, name): call for model, contest in contests.items() for name, call in contest.calls.items()}
-    calls[PRODUCT]()
-    return in_turns(calls, preset.turns)
 
 
 def row_of(model: str, contest: Contest, times: Times, preset: Preset) -> dict[str, Any]:
@@ -153,49 +125,46 @@ def row_of(model: str, contest: Contest, times: Times, preset: Preset) -> dict[s
     }
 
 
-def table_of(rows: list[dict[str, Any]]) -> Table:
-    """The steps for reading."""
-    heads = ("model", "ms", "windows/s", "plain [ms]", "plain / ours", "compile [s]", "differ by", "float32 error")
-    table = Table(*heads, title="one gradient step")
-    for row in rows:
-        seconds, compiling = row["seconds"], row["compile_seconds"]
-        table.add_row(
-            row["model"],
-            f"{1e3 * seconds['ours']:.2f}",
-            f"{row['windows_per_second']:,.0f}",
-            f"{1e3 * seconds['plain']:.2f}",
-            f"{row['plain_over_ours']:.2f}",
-            f"{compiling['ours']:.1f}",
-            f"{row['difference']:.0e}",
-            f"{row['float32_error']:.0e}",
-        )
-    return table
-
-
-def roofline(rows: list[dict[str, Any]]) -> Table:
-    """The rate of arithmetic for reading."""
-    heads = ("model", "Mflop a step", "of it products", "GFLOP/s", "roof", "share")
-    table = Table(*heads, title="arithmetic, estimated; roof: a matrix product")
-    for row in rows:
-        operations = row["operations"]
-        total, matrix = sum(operations.values()), operations.get("matrix", 0)
-        speeds = f"{row['gflops']:.1f}", f"{row['matrix_product_gflops']:.0f}", f"{row['share_of_matrix_product']:.0%}"
-        table.add_row(row["model"], f"{total / 1e6:.1f}", f"{matrix / total:.0%}", *speeds)
-    return table
+STEP = {
+    "model": lambda row: row["model"],
+    "ms": lambda row: f"{1e3 * row['seconds']['ours']:.2f}",
+    "windows/s": lambda row: f"{row['windows_per_second']:,.0f}",
+    "plain [ms]": lambda row: f"{1e3 * row['seconds']['plain']:.2f}",
+    "plain / ours": lambda row: f"{row['plain_over_ours']:.2f}",
+    "compile [s]": lambda row: f"{row['compile_seconds']['ours']:.1f}",
+    "differ by": lambda row: f"{row['difference']:.0e}",
+    "float32 error": lambda row: f"{row['float32_error']:.0e}",
+}
+ARITHMETIC = {
+    "model": lambda row: row["model"],
+    "Mflop a step": lambda row: f"{sum(row['operations'].values()) / 1e6:.1f}",
+    "of it products": lambda row: f"{row['operations'].get('matrix', 0) / sum(row['operations'].values()):.0%}",
+    "GFLOP/s": lambda row: f"{row['gflops']:.1f}",
+    "roof": lambda row: f"{row['matrix_product_gflops']:.0f}",
+    "share": lambda row: f"{row['share_of_matrix_product']:.0%}",
+}
 
 
 def measure(preset: Preset) -> Findings:
     """All models against their plain selves."""
-    contests = {model: prepare_model(model, preset) for model in preset.models}
-    contests |= {name: prepare_own(name, preset) for name in preset.own_fields}
-    times = time_all(contests, preset)
+    contests = {model: prepare(model, preset) for model in (*preset.models, *preset.own_fields)}
+    matrix = np.random.default_rng(0).normal(size=(preset.product, preset.product)).astype(np.float32)
+    calls: dict[Any, Call] = {PRODUCT: compiled(jnp.matmul, matrix, matrix)[0]}
+    calls |= {(model, name): call for model, contest in contests.items() for name, call in contest.calls.items()}
+    calls[PRODUCT]()
+    times = in_turns(calls, preset.turns)
     rows = [row_of(model, contest, times, preset) for model, contest in contests.items()]
-    ratios = []
-    for row in rows:
-        name, faster = row["model"], row["plain_over_ours"]
-        own = name in preset.own_fields
-        ratios.append(Ratio(f"{name}: plain / ours", faster, at_least=1 / 1.05 if own else 1.0))
-    return Findings(rows, [table_of(rows), roofline(rows)], ratios)
+    ratios = [
+        Ratio(
+            f"{row['model']}: plain / ours", row["plain_over_ours"], at_least=1 if model in preset.models else 1 / 1.05
+        )
+        for model, row in zip(contests, rows, strict=True)
+    ]
+    tables = [
+        table("one gradient step", rows, STEP),
+        table("arithmetic, estimated; roof: a matrix product", rows, ARITHMETIC),
+    ]
+    return Findings(rows, tables, ratios)
 
 
 if __name__ == "__main__":

@@ -168,9 +168,6 @@ def test_bad_input_is_refused_in_one_line_before_anything_is_measured(
 
 
 def test_results_that_differ_are_not_timed():
-    flight = np.zeros((2, 10, 13))
-    with pytest.raises(Disagreement, match="differ by"):
-        environment.compare(flight, flight + 0.01)
     with pytest.raises(Disagreement, match="sums differ by"):
         agree("sums", [np.ones(3), np.ones(2)], [np.ones(3), np.array([1, 1.1])], 0.05)
     with pytest.raises(Disagreement, match="nan"):

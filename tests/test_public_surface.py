@@ -223,7 +223,7 @@ def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
 ):
     assert outcome(Domain, "mine", vehicle) is None
     domain = outcome(Domain, "mine", drag_coefficient=drag, forces=forces)
-    assert domain is None or is_finite(domain.parameters())
+    assert domain is None or is_finite(domain.quadrotor().parameters)
     spec = outcome(SplitSpec, windows, steps)
     assert spec is None or spec.windows * spec.steps > 0
     assert outcome(fly, SOURCE, flights, seconds, "no key") is None

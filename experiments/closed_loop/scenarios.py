@@ -72,7 +72,7 @@ class Scenario:
     def flights(self) -> Iterator[Flight]:
         """In the order of `keys`."""
         home = np.array([self.distance, self.distance, 0.0], np.float32) / np.float32(np.sqrt(2))
-        vehicle = self.domain.parameters()
+        vehicle = self.domain.quadrotor().parameters
         shares = np.array([force in self.domain.forces for force in FORCES], np.float32)
         path = np.asarray(list(PATHS).index(self.reference), np.int32)
         for agent, seed in self.keys():

@@ -28,7 +28,7 @@ with the actual one.
 from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import Flight, Performance, fly, performance
-from hybrid_jax.control.open_loop import OpenLoopCosts, actual_cost, open_loop_costs, relative_cost_error
+from hybrid_jax.control.open_loop import OpenLoopCosts, open_loop_costs, relative_cost_error
 from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_pass, sample, step
 from hybrid_jax.control.sensitivities import advance
 
@@ -39,7 +39,6 @@ __all__ = [
     "Performance",
     "Plan",
     "Weights",
-    "actual_cost",
     "add_body_rates",
     "advance",
     "figure_eight",

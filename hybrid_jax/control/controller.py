@@ -11,6 +11,7 @@ Gauss–Newton step is mostly no descent direction, at any length.
 
 import math
 from dataclasses import dataclass, field
+from functools import partial
 
 import equinox as eqx
 import jax
@@ -18,9 +19,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.control.attitude import canonicalize_quaternion
+from hybrid_jax.control.attitude import canonicalize_quaternion, recovery_speeds
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
-from hybrid_jax.control.recovery import recovery_speeds
 from hybrid_jax.control.sensitivities import advance, advance_with_jacobian
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import normalise
@@ -41,13 +41,7 @@ class Plan(eqx.Module):
     damping: Scalar  # of the best Gauss–Newton step
 
 
-class _Point(eqx.Module):
-    """A plan, its predicted states and their cost."""
-
-    variables: Float[Array, "t 4"]
-    states: Float[Array, "t 13"]
-    cost: Scalar
-    damping: Scalar
+_Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
 
 
 def promote(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[State, Float[Array, "n 13"], Plan]:
@@ -150,14 +144,12 @@ class Controller:
         x, reference, plan = promote(x, reference, plan)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
-        variables, states, cost = self._initial_guess(model, reference, x, plan)
-        point = _Point(variables, states, cost, plan.damping)
+        point = self._initial_guess(model, reference, x, plan)
 
         def iteration(_, point):
             return self._improve(model, reference, x, point)
 
-        point = jax.lax.fori_loop(0, self.iterations, iteration, point)
-        plan = Plan(point.variables, point.cost, point.damping)
+        plan, _ = jax.lax.fori_loop(0, self.iterations, iteration, point)
         return self.speeds(plan)[0], plan
 
     def _range(self) -> tuple[float, float]:
@@ -167,24 +159,23 @@ class Controller:
         middle, half = self._range()
         return middle + half * share
 
-    def _shifted(self, variables: Float[Array, "t 4"]) -> Float[Array, "t 4"]:
-        """The plan one period later, interpolated; the last interval stays."""
-        following = jnp.concatenate([variables[1:], variables[-1:]])
-        return variables + (following - variables) / self.stride
-
-    def _initial_guess(self, model, reference, x: State, plan: Plan):
-        """Variables, states and cost of the shifted plan or of the attitude recovery, whichever costs less."""
+    def _initial_guess(self, model, reference, x: State, plan: Plan) -> _Point:
+        """The shifted plan or the attitude recovery, whichever costs less."""
+        # One period later, interpolated; the last interval stays.
+        following = jnp.concatenate([plan.variables[1:], plan.variables[-1:]])
+        shifted = plan.variables + (following - plan.variables) / self.stride
 
         def interval(x, inputs):
-            wanted, shifted = inputs
-            variables = jnp.stack([shifted, self._recovery(wanted, x[1])])
+            wanted, held = inputs
+            variables = jnp.stack([held, self._recovery(wanted, x[1])])
             x = jax.vmap(lambda x, variables: self._step(model, x, variables))(x, variables)
             return x, (x, variables)
 
-        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, self._shifted(plan.variables)))[1]
+        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, shifted))[1]
         states, variables = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
-        costs = jax.vmap(lambda states, variables: self._cost(reference, states, variables))(states, variables)
-        return jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, states, costs))
+        costs = jax.vmap(lambda *plan: self._cost(reference, *plan))(states, variables)
+        best = jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, costs, states))
+        return Plan(best[0], best[1], plan.damping), best[2]
 
     def _recovery(self, wanted: State, x: State) -> Float[Array, "4"]:
         """Decision variables that turn the vehicle to the reference attitude."""
@@ -195,47 +186,43 @@ class Controller:
     def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, "4"]) -> State:
         return advance(model, x, self._speeds(jnp.tanh(variables)), self.interval, self.unit_quaternion)
 
-    def _predict(self, model, reference, x: State, variables: Float[Array, "t 4"]):
-        """States (t, 13) and cost of a plan."""
-
-        def interval(x, held):
-            x = self._step(model, x, held)
-            return x, x
-
-        states = jax.lax.scan(interval, x, variables)[1]
-        return states, self._cost(reference, states, variables)
-
     def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t 4"]) -> Scalar:
         return plan_cost(self.weights, reference, states, jnp.tanh(variables))
 
     def _improve(self, model, reference, x: State, point: _Point) -> _Point:
         """Take the best of the damped Gauss–Newton steps, if it lowers the cost, and keep its damping."""
-        states = jnp.concatenate([x[None], point.states])
-        matrix, gradient = self._quadratic(model, reference, states, point.variables)
-        dampings = jnp.clip(point.damping * jnp.array(DAMPING_FACTORS, gradient.dtype), self.damping, MAX_DAMPING)
+        plan, states = point
+        matrix, gradient = self._quadratic(model, reference, jnp.concatenate([x[None], states]), plan.variables)
+        dampings = jnp.clip(plan.damping * jnp.array(DAMPING_FACTORS, gradient.dtype), self.damping, MAX_DAMPING)
+
+        def interval(x, held):
+            x = self._step(model, x, held)
+            return x, x
 
         def attempt(damping):
             step = _solve(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
             gain = step @ gradient + damping * step @ step  # decrease of the quadratic model
-            variables = point.variables - step.reshape(point.variables.shape)
+            variables = plan.variables - step.reshape(plan.variables.shape)
             variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
-            states, cost = self._predict(model, reference, x, variables)
-            return _Point(variables, states, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), gain
+            states = jax.lax.scan(interval, x, variables)[1]
+            cost = self._cost(reference, states, variables)
+            return (Plan(variables, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), states), gain
 
         tried, gains = jax.vmap(attempt)(dampings)
-        best = jax.tree.map(lambda leaf: leaf[jnp.argmin(tried.cost)], tried)
-        kept = eqx.tree_at(lambda p: p.damping, point, jnp.minimum(point.damping * FAILURE_FACTOR, MAX_DAMPING))
-        best = jax.tree.map(lambda new, old: jnp.where(best.cost < point.cost, new, old), best, kept)
+        best = jax.tree.map(lambda leaf: leaf[jnp.argmin(tried[0].cost)], tried)
+        kept = Plan(plan.variables, plan.cost, jnp.minimum(plan.damping * FAILURE_FACTOR, MAX_DAMPING)), states
+        lower = best[0].cost < plan.cost
+        best, states = jax.tree.map(lambda new, old: jnp.where(lower, new, old), best, kept)
         # At the optimum rounding decides which step lowers the cost, so its damping says nothing.
-        converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + point.cost)
-        return eqx.tree_at(lambda p: p.damping, best, jnp.where(converged, INITIAL_DAMPING, best.damping))
+        converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + plan.cost)
+        return Plan(best.variables, best.cost, jnp.where(converged, INITIAL_DAMPING, best.damping)), states
 
     def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], variables: Float[Array, "t 4"]):
         """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the decision variables."""
         factor = stage_factors(self.weights, self.steps)
-        residual, jacobian = jax.vmap(
-            lambda wanted, found: _with_jacobian(lambda state: deviations(self.weights, wanted, state), found)
-        )(reference, x[1:])
+        weighted = partial(deviations, self.weights)
+        residual = jax.vmap(weighted)(reference, x[1:])
+        jacobian = jax.vmap(jax.jacfwd(weighted, argnums=1))(reference, x[1:])
         sensitivities = self._sensitivities(model, x[:-1], variables)
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         share = jnp.tanh(variables)
@@ -274,7 +261,3 @@ def _solve(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Arr
     deadlock.
     """
     return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)
-
-
-def _with_jacobian(function, x):
-    return function(x), jax.jacfwd(function)(x)

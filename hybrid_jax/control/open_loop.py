@@ -1,7 +1,6 @@
 """Open-loop cost of the controller's plans: predicted by its model, and measured in the plant.
 
-Feedback hides the errors of a model, because the next call corrects them. A plan that runs to its end without another
-call shows them.
+Feedback hides the errors of a model. A plan that runs to its end without another call shows them.
 """
 
 from collections.abc import Sequence
@@ -24,29 +23,24 @@ class OpenLoopCosts(NamedTuple):
     actual: Float[Array, " c"]  # of the same inputs in the plant
 
 
-def actual_cost(
-    plant: Plant, flight: Flight, reference: Float[Array, "n 13"], controller: Controller, i: int | Scalar
-) -> Scalar:
-    """Cost of the plan of call i, run open loop in the plant; the predicted cost is `flight.plans.cost[i]`."""
-    plan = jax.tree.map(lambda leaf: leaf[i], flight.plans)
-    speeds = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
-    times = controller.period * (i + jnp.arange(len(speeds)))
+def open_loop_costs(
+    plant: Plant, flight: Flight, reference: Float[Array, "n 13"], controller: Controller, calls: Sequence[int]
+) -> OpenLoopCosts:
+    """Predicted and actual open-loop cost of the plans of these calls."""
 
     def advance(x, inputs):
         x = plant(x, *inputs)
         return x, x
 
-    states = jax.lax.scan(advance, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
-    return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))
+    def actual_cost(i: Scalar) -> Scalar:
+        plan = jax.tree.map(lambda leaf: leaf[i], flight.plans)
+        speeds = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
+        times = controller.period * (i + jnp.arange(len(speeds)))
+        states = jax.lax.scan(advance, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
+        return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))
 
-
-def open_loop_costs(
-    plant: Plant, flight: Flight, reference: Float[Array, "n 13"], controller: Controller, calls: Sequence[int]
-) -> OpenLoopCosts:
-    """Predicted and actual open-loop cost of the plans of these calls."""
     chosen = jnp.asarray(calls)
-    actual = jax.vmap(lambda i: actual_cost(plant, flight, reference, controller, i))
-    return OpenLoopCosts(flight.plans.cost[chosen], actual(chosen))
+    return OpenLoopCosts(flight.plans.cost[chosen], jax.vmap(actual_cost)(chosen))
 
 
 def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: float = 0.005) -> Float[Array, ""]:

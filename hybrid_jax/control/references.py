@@ -75,15 +75,15 @@ def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0
 
 
 def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
-    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, with constant φ̇; fastest at its centre, √2 a φ̇ [m/s].
+    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], with constant φ̇; fastest at its centre, √2 a φ̇ [m/s].
 
     Raises:
-        ValueError: `top_speed` or `half_width` [m] is not positive, or a number is not finite.
+        ValueError: `top_speed` or `half_width` is not positive, or a number is not finite.
     """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
-    for name, value in (("altitude", altitude), ("yaw", yaw)):
-        checks.number(name, value)
+    checks.number("altitude", altitude)
+    checks.number("yaw", yaw)
     rate = top_speed / (math.sqrt(2) * half_width)  # rad/s
 
     def path(t):

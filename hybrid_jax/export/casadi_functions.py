@@ -1,16 +1,12 @@
 """Fields and steps as CasADi functions, for optimal control, estimation and generated C code (extra `casadi`)."""
 
-from functools import partial
 from typing import TYPE_CHECKING
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.export.sizes import sizes_of
-from hybrid_jax.integrate import Derivative, check_field, rk4_step
+from hybrid_jax.export.program import program_of, sizes_of
 
 if TYPE_CHECKING:
     import casadi
@@ -25,17 +21,15 @@ def casadi_function(
     saves (`.save`) and translates to C (`.generate`).
 
     Args:
-        field: any field of the library, or a custom one made of operations that CasADi has.
         state_size: d; by default what the field knows (see `sizes_of`).
         input_size: m; likewise.
-        name: of the function.
 
     Raises:
         ValueError: unknown sizes, a field that does not accept such x and u, or an operation that CasADi does not
             have, by its name.
         ImportError: casadi is not installed.
     """
-    return _function(field, lambda double: double, state_size, input_size, name, "xdot")
+    return _function(field, None, state_size, input_size, name, "xdot")
 
 
 def casadi_step(
@@ -53,14 +47,10 @@ def casadi_step(
         ImportError: casadi is not installed.
     """
     checks.positive("dt", dt, "a positive number of seconds")
-    return _function(
-        field, lambda double: partial(rk4_step, double, dt=float(dt)), state_size, input_size, name, "xnext"
-    )
+    return _function(field, float(dt), state_size, input_size, name, "xnext")
 
 
-def _function(
-    field, whole, state_size: int | None, input_size: int | None, name: str, output: str
-) -> "casadi.Function":
+def _function(field, dt: float | None, state_size, input_size, name: str, output: str) -> "casadi.Function":
     try:
         import casadi as ca
 
@@ -73,16 +63,6 @@ def _function(
     symbols = [ca.SX.sym("x", sizes[0]), ca.SX.sym("u", sizes[1])]
     # In double precision throughout, so that the constants of the physics are not rounded.
     with jax.enable_x64(True):
-        program = jax.make_jaxpr(whole(_double(field, *sizes)))(*map(_like, sizes))
-        result = evaluate(program, symbols)
+        likes = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
+        result = evaluate(jax.make_jaxpr(program_of(field, likes, dt))(*likes), symbols)
     return ca.Function(name, symbols, [result], ["x", "u"], [output])
-
-
-def _double(field, state_size: int, input_size: int) -> Derivative:
-    double = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
-    check_field(double, _like(state_size), _like(input_size))
-    return double
-
-
-def _like(size: int) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((size,), float)

@@ -6,6 +6,7 @@ order, and its shape.
 
 from collections.abc import Callable, Sequence
 from functools import reduce
+from operator import add, eq, ge, gt, le, lt, mul, ne, neg, pow, sub, truediv
 from typing import Any, NamedTuple
 
 import casadi as ca
@@ -52,7 +53,8 @@ def _run(program: Jaxpr, constants: Sequence[Any], arguments: Sequence[Value]) -
 def _results(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     name, shape = equation.primitive.name, tuple(equation.outvars[0].aval.shape)  # type: ignore
     if name in CALLS:
-        return _call(equation, inputs)
+        inner = equation.params["jaxpr" if "jaxpr" in equation.params else "call_jaxpr"]
+        return _run(inner.jaxpr, inner.consts, inputs) if isinstance(inner, ClosedJaxpr) else _run(inner, (), inputs)
     if not any(isinstance(value, Entries) for value in inputs):
         return _known(equation, inputs)
     if name in ENTRYWISE:
@@ -78,13 +80,6 @@ def _refusal(equation: JaxprEqn, why: str = "") -> ValueError:
     return ValueError(f"field: its operation {equation.primitive.name!r}{why} has no counterpart in CasADi")
 
 
-def _call(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
-    inner = equation.params["jaxpr" if "jaxpr" in equation.params else "call_jaxpr"]
-    if isinstance(inner, ClosedJaxpr):
-        return _run(inner.jaxpr, inner.consts, inputs)
-    return _run(inner, (), inputs)
-
-
 def _column(value: Value) -> Column:
     return value.column if isinstance(value, Entries) else ca.DM(np.asarray(value, float).reshape(-1, 1))
 
@@ -94,19 +89,15 @@ def _taken(column: Column, places: np.ndarray) -> Column:
     return column[places.ravel().tolist(), 0]
 
 
-def _shape(value: Value) -> tuple[int, ...]:
-    return tuple(value.shape)
-
-
 def _places(value: Value) -> np.ndarray:
     """The index in its column of each entry of a value, in the value's shape."""
-    return np.arange(int(np.prod(_shape(value)))).reshape(_shape(value))
+    return np.arange(int(np.prod(value.shape))).reshape(value.shape)
 
 
 def _spread(value: Value, shape: tuple[int, ...]) -> Column:
     """The column of a value broadcast to a shape, as in NumPy; CasADi broadcasts single entries itself."""
     column = _column(value)
-    if _shape(value) == shape or column.numel() == 1:
+    if value.shape == shape or column.numel() == 1:
         return column
     return _taken(column, np.broadcast_to(_places(value), shape))
 
@@ -136,7 +127,7 @@ def _linear(equation: JaxprEqn, inputs: list[Value]) -> Column:
     data = LINEAR[equation.primitive.name]
     if any(isinstance(value, Entries) for i, value in enumerate(inputs) if i not in data):
         raise _refusal(equation, " at a place that depends on x or u")
-    zeros = [jnp.zeros(_shape(value)) if i in data else jnp.asarray(value) for i, value in enumerate(inputs)]
+    zeros = [jnp.zeros(value.shape) if i in data else jnp.asarray(value) for i, value in enumerate(inputs)]
 
     def part(i: int) -> Column:
         def of_one(entries):
@@ -165,9 +156,9 @@ def _product(left: Value, right: Value, dimension_numbers) -> Column:
 
 def _matrices(value: Value, contracted: Sequence[int], common: Sequence[int]) -> list[Column]:
     """One matrix (free × contracted) for each index of the batch axes."""
-    free = [axis for axis in range(len(_shape(value))) if axis not in (*contracted, *common)]
+    free = [axis for axis in range(len(value.shape)) if axis not in (*contracted, *common)]
     places = np.transpose(_places(value), (*common, *free, *contracted))
-    sizes = [int(np.prod([_shape(value)[axis] for axis in axes])) for axes in (common, free, contracted)]
+    sizes = [int(np.prod([value.shape[axis] for axis in axes])) for axes in (common, free, contracted)]
     column = _column(value)
     return [ca.reshape(_taken(column, one), sizes[2], sizes[1]).T for one in places.reshape(sizes)]
 
@@ -199,91 +190,46 @@ def _plain(operation: Callable) -> Callable:
 
 # Operations that call another program. Custom derivatives are replaced by CasADi's.
 CALLS = ("jit", "closed_call", "remat2", "custom_jvp_call", "custom_vjp_call")
-_FIRST, _ALL = (lambda count: (0,)), range
+_ONE_OPERAND = (
+    *("reshape", "squeeze", "expand_dims", "transpose", "rev", "tile", "split", "unstack", "slice", "gather"),
+    *("broadcast_in_dim", "dynamic_slice"),
+)
 # Name → from the number of inputs, the indices of those whose entries are moved.
 MOVES: dict[str, Callable[[int], Sequence[int]]] = {
-    "reshape": _FIRST,
-    "squeeze": _FIRST,
-    "expand_dims": _FIRST,
-    "transpose": _FIRST,
-    "rev": _FIRST,
-    "tile": _FIRST,
-    "split": _FIRST,
-    "unstack": _FIRST,
-    "slice": _FIRST,
-    "broadcast_in_dim": _FIRST,
-    "dynamic_slice": _FIRST,
-    "gather": _FIRST,
-    "concatenate": _ALL,
-    "stack": _ALL,
-    "pad": _ALL,
+    **dict.fromkeys(_ONE_OPERAND, lambda count: (0,)),
+    **dict.fromkeys(("concatenate", "stack", "pad"), range),
     "dynamic_update_slice": lambda count: (0, 1),
     "scatter": lambda count: (0, 2),
 }
 LINEAR = {"scatter-add": (0, 2), "cumsum": (0,)}
-FOLDS = {
-    "reduce_sum": lambda a, b: a + b,
-    "reduce_prod": lambda a, b: a * b,
-    "reduce_max": ca.fmax,
-    "reduce_min": ca.fmin,
+FOLDS = {"reduce_sum": add, "reduce_prod": mul, "reduce_max": ca.fmax, "reduce_min": ca.fmin}
+_SAME_NAME = (
+    *("sign", "floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "atan2"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+_PLAIN: dict[str, Callable] = {
+    **{name: getattr(ca, name) for name in _SAME_NAME},
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda a: a),
+    **{operation.__name__: operation for operation in (add, sub, mul, pow, neg, lt, le, gt, ge, eq, ne)},
+    "add_any": add,
+    "div": truediv,
+    "rem": ca.fmod,
+    "max": ca.fmax,
+    "min": ca.fmin,
+    "clamp": lambda low, a, high: ca.fmin(ca.fmax(a, low), high),
+    "abs": ca.fabs,
+    "square": lambda a: a * a,
+    "rsqrt": lambda a: 1 / ca.sqrt(a),
+    "exp2": lambda a: 2**a,
+    "logistic": lambda a: 1 / (1 + ca.exp(-a)),
+    "erfc": lambda a: 1 - ca.erf(a),
 }
 ENTRYWISE: dict[str, Callable] = {
+    **{name: _plain(operation) for name, operation in _PLAIN.items()},
     "select_n": _select,
     "convert_element_type": _convert,
     "integer_pow": lambda equation, a: a ** equation.params["y"],
     "and": _logical(ca.logic_and),
     "or": _logical(ca.logic_or),
     "not": _logical(ca.logic_not),
-} | {
-    name: _plain(operation)
-    for name, operation in {
-        "add": lambda a, b: a + b,
-        "add_any": lambda a, b: a + b,
-        "sub": lambda a, b: a - b,
-        "mul": lambda a, b: a * b,
-        "div": lambda a, b: a / b,
-        "rem": ca.fmod,
-        "pow": lambda a, b: a**b,
-        "max": ca.fmax,
-        "min": ca.fmin,
-        "clamp": lambda low, a, high: ca.fmin(ca.fmax(a, low), high),
-        "atan2": ca.atan2,
-        "lt": lambda a, b: a < b,
-        "le": lambda a, b: a <= b,
-        "gt": lambda a, b: a > b,
-        "ge": lambda a, b: a >= b,
-        "eq": lambda a, b: a == b,
-        "ne": lambda a, b: a != b,
-        "copy": lambda a: a,
-        "copy_p": lambda a: a,
-        "stop_gradient": lambda a: a,
-        "neg": lambda a: -a,
-        "sign": ca.sign,
-        "abs": ca.fabs,
-        "floor": ca.floor,
-        "ceil": ca.ceil,
-        "square": lambda a: a * a,
-        "sqrt": ca.sqrt,
-        "rsqrt": lambda a: 1 / ca.sqrt(a),
-        "exp": ca.exp,
-        "exp2": lambda a: 2**a,
-        "expm1": ca.expm1,
-        "log": ca.log,
-        "log1p": ca.log1p,
-        "logistic": lambda a: 1 / (1 + ca.exp(-a)),
-        "erf": ca.erf,
-        "erfc": lambda a: 1 - ca.erf(a),
-        "sin": ca.sin,
-        "cos": ca.cos,
-        "tan": ca.tan,
-        "asin": ca.asin,
-        "acos": ca.acos,
-        "atan": ca.atan,
-        "sinh": ca.sinh,
-        "cosh": ca.cosh,
-        "tanh": ca.tanh,
-        "asinh": ca.asinh,
-        "acosh": ca.acosh,
-        "atanh": ca.atanh,
-    }.items()
 }

@@ -10,11 +10,9 @@ import re
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.export
 import jax.numpy as jnp
@@ -22,36 +20,25 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
-from hybrid_jax.export.sizes import sizes_of
-from hybrid_jax.integrate import Derivative, check_field, rk4_step
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.export.program import program_of, sizes_of
 from hybrid_jax.io.archive import load_archive, save_archive
 
 FORMAT = "hybrid_jax program 1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
 BATCH = "b"  # name of the batch axis, whose length is symbolic
-_OWN_CALLS = ("shape_assertion",)  # JAX's checks of a symbolic length
 
 
 @dataclass(frozen=True)
 class Program:
-    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`.
+    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`."""
 
-    Attributes:
-        dt: length of a step [s]; None for a field.
-        state_size: d.
-        input_size: m.
-        batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
-        platforms: on which it runs.
-        about: JSON values that describe the model.
-    """
-
-    dt: float | None
-    state_size: int
-    input_size: int
-    batched: bool
-    platforms: tuple[str, ...]
-    about: Mapping[str, Any]
+    dt: float | None  # length of a step [s]; None for a field
+    state_size: int  # d
+    input_size: int  # m
+    batched: bool  # whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,)
+    platforms: tuple[str, ...]  # on which it runs
+    about: Mapping[str, Any]  # JSON values that describe the model
     _call: Callable[[Array, Array], Array] = field(repr=False)
 
     def __call__(
@@ -149,14 +136,10 @@ def _export(path, field, dt: float | None, state_size, input_size, batched, plat
             f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.short_repr(platforms)}"
         )
     with jax.enable_x64(False), _without_source_locations():
-        single = jax.tree.map(
-            lambda leaf: jnp.asarray(leaf, jnp.float32) if eqx.is_inexact_array(leaf) else leaf, field
-        )
+        program = program_of(field, [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes], dt, batched)
         batch = jax.export.symbolic_shape(BATCH) if batched else ()
         x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
-        check_field(single, *(jax.ShapeDtypeStruct(like.shape[-1:], like.dtype) for like in (x, u)))
-        derivative = _of_rows(single) if batched else single
-        exported = jax.export.export(jax.jit(_program(derivative, dt)), platforms=platforms)(x, u)
+        exported = jax.export.export(jax.jit(program), platforms=platforms)(x, u)
     _check_calls(exported)
     metadata = {"dt": dt, "about": dict(about or {})}
     save_archive(path, FORMAT, metadata, {"exported": np.frombuffer(exported.serialize(), np.uint8)})
@@ -174,33 +157,15 @@ def _without_source_locations() -> Iterator[None]:
         jax.config.update(name, before)
 
 
-def _program(derivative: Derivative, dt: float | None) -> Derivative:
-    whole = derivative if dt is None else partial(rk4_step, derivative, dt=dt)
-    return lambda x, u: whole(x, u)  # jax.jit needs a hashable function
-
-
-def _of_rows(field: AbstractVectorField) -> Derivative:
-    """The field on a batch, one sample per row."""
-    return lambda x, u: jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
-
-
 def _check_calls(exported: jax.export.Exported) -> None:
-    """Refuse a program that depends on libraries of a machine.
-
-    Raises:
-        ValueError: it has an external call, by its name.
-    """
+    """Refuse a program that depends on libraries of a machine."""
     for call in re.findall(r"custom_call\W*(\w*)", exported.mlir_module()):
-        if call not in _OWN_CALLS:
+        if call != "shape_assertion":  # JAX's check of a symbolic length
             raise ValueError(f"field: its program calls {call or 'something'}, which is not an operation of StableHLO")
 
 
 def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
-    """(batched, d, m) of a program (x, u) → ẋ or x⁺.
-
-    Raises:
-        ValueError: it has another signature.
-    """
+    """(batched, d, m) of a program (x, u) → ẋ or x⁺."""
     x, u = exported.in_avals
     (result,) = exported.out_avals
     arguments = jax.tree.structure(((0, 0), {}))

@@ -7,32 +7,24 @@ Raises:
 
 import contextlib
 import io
-from importlib.metadata import PackageNotFoundError, version
 
-MUJOCO_MINOR = "3.17"
+from hybrid_jax.io.datasets import versions
 
 
-def check_versions(mujoco: str | None, mjx: str | None) -> None:
-    """Check two versions; None for a package that is missing.
+def check_versions(found: dict[str, str]) -> None:
+    """Check the versions of mujoco and mujoco-mjx.
 
     Raises:
         ImportError: one is not 3.17.*; the message has the installed versions and the command to install others.
     """
-    if not all(found and found.split(".")[:2] == MUJOCO_MINOR.split(".") for found in (mujoco, mjx)):
+    if not all(found[package].startswith("3.17.") for package in ("mujoco", "mujoco-mjx")):
         raise ImportError(
-            f"hybrid_jax.sim needs mujoco and mujoco-mjx {MUJOCO_MINOR}.*, found mujoco {mujoco or 'missing'} and "
-            f'mujoco-mjx {mjx or "missing"}: pip install "mujoco=={MUJOCO_MINOR}.*" "mujoco-mjx=={MUJOCO_MINOR}.*"'
+            f"hybrid_jax.sim needs mujoco and mujoco-mjx 3.17.*, found mujoco {found['mujoco']} and mujoco-mjx "
+            f'{found["mujoco-mjx"]}: pip install "mujoco==3.17.*" "mujoco-mjx==3.17.*"'
         )
 
 
-def _installed(package: str) -> str | None:
-    try:
-        return version(package)
-    except PackageNotFoundError:
-        return None
-
-
-check_versions(_installed("mujoco"), _installed("mujoco-mjx"))
+check_versions(versions("mujoco", "mujoco-mjx"))
 
 # Importing mjx prints a message about its optional Warp backend to stdout.
 with contextlib.redirect_stdout(io.StringIO()):

@@ -25,28 +25,18 @@ MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the p
 
 
 class Flights(NamedTuple):
-    """n flights of t decisions, float64.
-
-    Attributes:
-        states: from the start on.
-        inputs: held from one state to the next [rad/s].
-        lowest_rotor: the altitude of the lowest rotor at each state [m].
-        start: time of the first state [s].
-    """
+    """n flights of t decisions, float64."""
 
     states: Float[Array | np.ndarray, "*n t+1 13"]
-    inputs: Float[Array | np.ndarray, "*n t 4"]
-    lowest_rotor: Float[Array | np.ndarray, "*n t+1"]
-    start: Float[Array | np.ndarray, "*n"]
+    inputs: Float[Array | np.ndarray, "*n t 4"]  # held from one state to the next [rad/s]
+    lowest_rotor: Float[Array | np.ndarray, "*n t+1"]  # altitude [m]
+    start: Float[Array | np.ndarray, "*n"]  # time of the first state [s]
 
 
 def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
-    """Simulate random closed-loop flights at 100 Hz, always in float64 and on the CPU.
+    """Simulate random closed-loop flights of `seconds` each, at 100 Hz, always in float64 and on the CPU.
 
     Flight i depends on the key and i alone.
-
-    Args:
-        seconds: duration of each flight.
 
     Raises:
         ValueError: flights or seconds are not positive, or key is not a random key.
@@ -61,43 +51,40 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         truth = domain.quadrotor()
         keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpu)))(jnp.arange(-(-flights // CHUNK) * CHUNK))
         # Chunks of one size share one compilation.
-        parts = [
-            _fly_chunk(truth, parameters_of(domain.nominal), chunk, steps, domain.nominal)
-            for chunk in keys.reshape(-1, CHUNK)
-        ]
+        nominal = parameters_of(domain.nominal)
+        parts = [_fly_chunk(truth, nominal, chunk, steps, domain.nominal) for chunk in keys.reshape(-1, CHUNK)]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
 @partial(jax.jit, static_argnames=("steps", "vehicle"), compiler_options=FASTEST_COMPILE)
 def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle) -> Flights:
-    return jax.vmap(lambda key: _fly_once(truth, nominal, key, steps, vehicle))(keys)
-
-
-def _fly_once(truth: Quadrotor, nominal: Parameters, key: PRNGKeyArray, steps: int, vehicle: Vehicle) -> Flights:
     scale = pilot.scale_of(vehicle)
-    key_plan, key_start, key_clock = jax.random.split(key, 3)
-    plan = pilot.draw_plan(key_plan, steps, scale)
-    x0 = pilot.starting_state(key_start, plan, scale)
-    start = jax.random.uniform(key_clock, maxval=CLOCK)
 
-    def decide(carry, now):
-        memory, x, t = carry
-        memory, u = pilot.act(memory, x, now, nominal, vehicle.max_rotor_speed, scale)
-        x = truth.step(x, u, t, DT)
-        return (memory, x, t + DT), (x, u)
+    def one_flight(key: PRNGKeyArray) -> Flights:
+        key_plan, key_start, key_clock = jax.random.split(key, 3)
+        plan = pilot.draw_plan(key_plan, steps, scale)
+        x0 = pilot.starting_state(key_start, plan, scale)
+        start = jax.random.uniform(key_clock, maxval=CLOCK)
 
-    _, (x, u) = jax.lax.scan(decide, (pilot.Memory(jnp.zeros(3)), x0, start), plan)
-    states = jnp.concatenate([x0[None], x])
-    altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
-    return Flights(states, u, altitudes.min(axis=1), start)
+        def decide(carry, now):
+            integral, x, t = carry
+            integral, u = pilot.act(integral, x, now, nominal, vehicle.max_rotor_speed, scale)
+            x = truth.step(x, u, t, DT)
+            return (integral, x, t + DT), (x, u)
+
+        _, (x, u) = jax.lax.scan(decide, (jnp.zeros(3), x0, start), plan)
+        states = jnp.concatenate([x0[None], x])
+        altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
+        return Flights(states, u, altitudes.min(axis=1), start)
+
+    return jax.vmap(one_flight)(keys)
 
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
     """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed."""
     scale = pilot.scale_of(vehicle)
-    finite = np.isfinite(states).all(axis=(1, 2))
-    p, v = states[..., POSITION], states[..., VELOCITY]
-    far = np.linalg.norm(p[..., :2], axis=-1) > MAX_DISTANCE * scale.length
-    fast = np.linalg.norm(v, axis=-1) > MAX_SPEED * scale.speed
-    outside = (p[..., 2] > MAX_ALTITUDE * scale.length) | (p[..., 2] < 0)
-    return ~finite | (far | fast | outside).any(axis=1)
+    place, altitude = states[..., POSITION][..., :2], states[..., POSITION][..., 2]
+    far = np.linalg.norm(place, axis=-1) > MAX_DISTANCE * scale.length
+    fast = np.linalg.norm(states[..., VELOCITY], axis=-1) > MAX_SPEED * scale.speed
+    outside = (altitude > MAX_ALTITUDE * scale.length) | (altitude < 0)
+    return (far | fast | outside | ~np.isfinite(states).all(axis=-1)).any(axis=1)

@@ -5,6 +5,7 @@ A force is a function (x, u, t, parameters) → Wrench. To add one, add the func
 
 import math
 from collections.abc import Callable
+from dataclasses import asdict, fields
 from typing import NamedTuple
 
 import equinox as eqx
@@ -25,56 +26,33 @@ WIND_ANGULAR_FREQUENCY = 2 / 3 * math.pi  # rad/s
 
 
 class Wrench(NamedTuple):
-    """A force and a torque on the body, as MuJoCo's xfrc_applied takes them.
+    """A force and a torque on the body at its centre of mass, in the world frame (MuJoCo's xfrc_applied)."""
 
-    Attributes:
-        force: at the centre of mass, world frame [N].
-        torque: about the centre of mass, world frame [N m].
-    """
-
-    force: Float[Array, "3"]
-    torque: Float[Array, "3"]
+    force: Float[Array, "3"]  # N
+    torque: Float[Array, "3"]  # N m
 
 
 class Parameters(eqx.Module):
-    """The parameters of a true vehicle as array leaves, so that they can be traced and vmapped; SI units.
-
-    Attributes:
-        mass: [kg].
-        inertia: principal moments (Ix, Iy, Iz) [kg m²].
-        thrust_coefficient: k [N/(rad/s)²].
-        torque_coefficient: c_m [N m/(rad/s)²].
-        rotor_positions: x, y, z = 0 of each rotor, body frame [m].
-        spin: sign of each rotor's reaction torque about body z.
-        rotor_radius: R [m].
-        gravity: [m/s²].
-        drag_coefficient: C_D [kg/s].
-    """
+    """The parameters of a true vehicle (see `Vehicle`) as array leaves, so that they can be traced and vmapped."""
 
     mass: Scalar
     inertia: Float[Array, "3"]
     thrust_coefficient: Scalar
     torque_coefficient: Scalar
-    rotor_positions: Float[Array, "4 3"]
+    rotor_positions: Float[Array, "4 3"]  # m, body frame, z = 0
     spin: Float[Array, "4"]
     rotor_radius: Scalar
     gravity: Scalar
-    drag_coefficient: Scalar
+    drag_coefficient: Scalar  # C_D, kg/s
 
 
 def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) -> Parameters:
     """The parameters of a vehicle, in the current precision."""
-    return Parameters(
-        mass=jnp.asarray(vehicle.mass),
-        inertia=jnp.asarray(vehicle.inertia),
-        thrust_coefficient=jnp.asarray(vehicle.thrust_coefficient),
-        torque_coefficient=jnp.asarray(vehicle.torque_coefficient),
-        rotor_positions=jnp.asarray([(x, y, 0.0) for x, y in vehicle.rotor_positions]),
-        spin=jnp.asarray(vehicle.spin),
-        rotor_radius=jnp.asarray(vehicle.rotor_radius),
-        gravity=jnp.asarray(vehicle.gravity),
-        drag_coefficient=jnp.asarray(drag_coefficient),
-    )
+    numbers = asdict(vehicle) | {
+        "rotor_positions": [(x, y, 0.0) for x, y in vehicle.rotor_positions],
+        "drag_coefficient": drag_coefficient,
+    }
+    return Parameters(*(jnp.asarray(numbers[field.name]) for field in fields(Parameters)))
 
 
 Force = Callable[[State, Input, Scalar, Parameters], Wrench]

@@ -3,7 +3,6 @@
 # MuJoCo's compiled modules carry no type stubs.
 # pyright: reportAttributeAccessIssue=false
 
-from functools import lru_cache
 from pathlib import Path
 from typing import cast
 
@@ -15,12 +14,10 @@ from mujoco import mjx
 from hybrid_jax.sim.forces import Parameters
 from hybrid_jax.vehicle import IRIS, Vehicle
 
-MODEL_FILE = Path(__file__).with_name("iris.xml")
-
 
 def build_model(vehicle: Vehicle) -> mujoco.MjModel:
     """The scene for C MuJoCo: one free body whose controls are the squared rotor speeds [(rad/s)²]."""
-    spec = mujoco.MjSpec.from_file(str(MODEL_FILE))
+    spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("iris.xml")))
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
     body = spec.body("vehicle")
     body.mass, body.inertia = vehicle.mass, vehicle.inertia
@@ -51,21 +48,11 @@ def _draw_arm(body: mujoco.MjsBody, x: float, y: float, radius: float) -> None:
         body.add_geom(type=shape, material=material, size=size, contype=0, conaffinity=0, mass=0, **place)
 
 
-@lru_cache(maxsize=1)
-def _iris() -> mujoco.MjModel:
-    return build_model(IRIS)
-
-
-def bare_model() -> mjx.Model:
-    """The scene for MJX in the current precision; see `with_parameters`."""
+def traced_model(p: Parameters) -> mjx.Model:
+    """The scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
     # Concrete even while tracing, so that MJX sees the model's structure as constants.
     with jax.ensure_compile_time_eval():
-        return mjx.put_model(_iris())
-
-
-def with_parameters(model: mjx.Model, parameters: Parameters) -> mjx.Model:
-    """The MJX model with the parameters of a vehicle, which may be traced."""
-    p = parameters
+        model = mjx.put_model(build_model(IRIS))
     thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
     ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
     replaced = model.tree_replace(

@@ -2,22 +2,19 @@
 
 A `Plan` holds all that is random and is drawn before take-off. `act` is the closed loop: a cascade of position,
 velocity, attitude and rate control at 100 Hz for the nominal vehicle. It tolerates parameter shifts and wind.
-
-The constants below are those for the Iris. `Scale` adapts them to vehicles of another size.
+The constants are those for the Iris; `Scale` adapts them to vehicles of another size.
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax.rotation import body_z, conjugate, from_axis_angle, multiply, normalise
-from hybrid_jax.sim.forces import Parameters
+from hybrid_jax.rotation import Vector, body_z, conjugate, from_axis_angle, multiply, normalise
+from hybrid_jax.sim.forces import Parameters, Scalar
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
 from hybrid_jax.vehicle import IRIS, Vehicle
 
@@ -52,61 +49,34 @@ ASTRAY, SAFE_ALTITUDE = 13.0, 1.5  # m from home, m: beyond the one go up to the
 DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no more than this share of the altitude
 
 
-@dataclass(frozen=True)
-class Scale:
-    """The size of a vehicle over that of the Iris. All 1 for the Iris; static, so that its program stays the same.
+class Scale(NamedTuple):
+    """Quantities of a vehicle over those of the Iris.
 
     Froude scaling: flights of vehicles of different size are geometrically similar at the same tilt and thrust over
     weight, with times proportional to the root of lengths. A small vehicle is slowed down to what 100 Hz can control.
     """
 
-    length: float = 1.0
-
-    @property
-    def time(self) -> float:
-        """Scale of durations."""
-        return max(math.sqrt(self.length), FASTEST)
-
-    @property
-    def speed(self) -> float:
-        """Scale of velocities."""
-        return self.length / self.time
-
-    @property
-    def acceleration(self) -> float:
-        """Scale of accelerations."""
-        return self.length / self.time**2
+    length: float
+    time: float
+    speed: float
+    acceleration: float
 
 
 def scale_of(vehicle: Vehicle) -> Scale:
     """The scale of a vehicle, from the distance of its outermost rotor."""
-
-    def arm(vehicle: Vehicle) -> float:
-        return max(math.hypot(x, y) for x, y in vehicle.rotor_positions)
-
-    return Scale(arm(vehicle) / arm(IRIS))
+    arm, arm_of_iris = (max(math.hypot(x, y) for x, y in each.rotor_positions) for each in (vehicle, IRIS))
+    length = arm / arm_of_iris
+    time = max(math.sqrt(length), FASTEST)
+    return Scale(length, time, length / time, length / time**2)
 
 
 class Plan(NamedTuple):
-    """The reference and the dither at each decision of one flight.
+    """The reference and the dither at each decision of one flight."""
 
-    Attributes:
-        position: reference [m, world].
-        velocity: its rate [m/s, world].
-        heading: reference yaw [rad].
-        dither: angular acceleration about x, y, z [rad/s², body] and acceleration along the thrust [m/s²].
-    """
-
-    position: Float[Array, "*t 3"]
-    velocity: Float[Array, "*t 3"]
-    heading: Float[Array, "*t"]
-    dither: Float[Array, "*t 4"]
-
-
-class Memory(eqx.Module):
-    """The state of the controller: the integral of the position error [m/s², world]."""
-
-    integral: Float[Array, "3"]
+    position: Float[Array, "*t 3"]  # m, world
+    velocity: Float[Array, "*t 3"]  # m/s, world
+    heading: Float[Array, "*t"]  # rad
+    dither: Float[Array, "*t 4"]  # angular acceleration [rad/s², body], acceleration along the thrust [m/s²]
 
 
 def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
@@ -128,7 +98,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
     return Plan(place[:, :3], rate[:, :3], place[:, 3], _draw_dither(key_dither, steps, scale))
 
 
-def _shorten(velocity: Float[Array, "4"], fastest: Float[Array, "3"]) -> Float[Array, "4"]:
+def _shorten(velocity: Float[Array, "4"], fastest: Vector) -> Float[Array, "4"]:
     """Keep the direction in the plane and limit the speed in it, the climb and the turn."""
     speed = jnp.linalg.norm(velocity[:2]) + 1e-9
     plane = velocity[:2] * jnp.minimum(1.0, fastest[0] / speed)
@@ -167,12 +137,18 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 
 
 def act(
-    memory: Memory, x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
-) -> tuple[Memory, Input]:
-    """One decision: rotor speeds [rad/s] in [0, max_speed] for the current entry of the plan."""
-    error = _retreat(plan.position, x[POSITION], scale) - x[POSITION]
+    integral: Vector, x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
+) -> tuple[Vector, Input]:
+    """One decision: rotor speeds [rad/s] in [0, max_speed] for the current entry of the plan.
+
+    `integral` is that of the position error [m/s², world], passed in and returned.
+    """
+    # Raise the reference to a safe altitude if wind has blown the vehicle far away.
+    far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, plan.position
+    place = place.at[2].set(jnp.where(far, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))
+    error = place - x[POSITION]
     limit, time = INTEGRAL_LIMIT * scale.acceleration, scale.time
-    integral = jnp.clip(memory.integral + PERIOD * (INTEGRAL_GAIN / time**3) * error, -limit, limit)
+    integral = jnp.clip(integral + PERIOD * (INTEGRAL_GAIN / time**3) * error, -limit, limit)
     wanted = POSITION_GAIN / time**2 * error + VELOCITY_GAIN / time * (plan.velocity - x[VELOCITY]) + integral
     climbing = _flare(wanted[2], x[POSITION][2], x[VELOCITY][2], scale)
     lift = _limit_tilt(wanted.at[2].set(climbing + nominal.gravity), x[POSITION][2], nominal.gravity, scale)
@@ -181,25 +157,17 @@ def act(
     torque = nominal.inertia * spin_up + jnp.cross(rates, nominal.inertia * rates)
     along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + plan.dither[3]
     thrust = nominal.mass * jnp.clip(along_thrust, 0.3 * nominal.gravity, 2.0 * nominal.gravity)
-    return Memory(integral), allocate(thrust, torque, nominal, max_speed)
+    return integral, _allocate(thrust, torque, nominal, max_speed)
 
 
-def _retreat(place: Float[Array, "3"], position: Float[Array, "3"], scale: Scale) -> Float[Array, "3"]:
-    """The reference position [m, world], raised to a safe altitude if wind has blown the vehicle far away."""
-    blown_away = jnp.linalg.norm(position[:2]) > ASTRAY * scale.length
-    return place.at[2].set(jnp.where(blown_away, jnp.maximum(place[2], SAFE_ALTITUDE * scale.length), place[2]))
-
-
-def _flare(wanted: Float[Array, ""], altitude: Float[Array, ""], climb: Float[Array, ""], scale: Scale):
+def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
     """At least the vertical acceleration [m/s²] that stops the descent above ground, once that exceeds GENTLE."""
     sink = jnp.minimum(climb, 0.0)
     needed = sink**2 / (2 * jnp.maximum(altitude - CLEARANCE * scale.length, 0.03 * scale.length))
     return jnp.where(needed > GENTLE * scale.acceleration, jnp.maximum(wanted, needed), wanted)
 
 
-def _limit_tilt(
-    lift: Float[Array, "3"], altitude: Float[Array, ""], gravity: Float[Array, ""], scale: Scale
-) -> Float[Array, "3"]:
+def _limit_tilt(lift: Vector, altitude: Scalar, gravity: Scalar, scale: Scale) -> Vector:
     """Limit the commanded acceleration [m/s², world] to upward thrust and to tilts that keep rotors off the ground."""
     up = jnp.clip(lift[2], 0.5 * gravity, 1.7 * gravity)
     lowest = jnp.arcsin(jnp.clip(DIP * altitude / (ARM * scale.length), 0.05, 1.0))
@@ -208,24 +176,18 @@ def _limit_tilt(
     return jnp.concatenate([lift[:2] * factor, up[None]])
 
 
-def _angular_acceleration(
-    x: State, lift: Float[Array, "3"], heading: Float[Array, ""], scale: Scale
-) -> Float[Array, "3"]:
+def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale) -> Vector:
     """The angular acceleration [rad/s², body] that turns thrust towards lift and the nose towards heading [rad]."""
     yaw = from_axis_angle(jnp.array([0.0, 0.0, 1.0]), heading)
-    wanted = multiply(_shortest_turn(lift / jnp.linalg.norm(lift)), yaw)
+    dx, dy, dz = lift / jnp.linalg.norm(lift)
+    tilt = normalise(jnp.stack([1 + dz, -dy, dx, jnp.zeros_like(dz)]))  # the shortest turn of world z to lift
+    wanted = multiply(tilt, yaw)
     error = multiply(conjugate(x[QUATERNION]), wanted)
     rates = jnp.array(np.array(ATTITUDE_GAIN) / scale.time) * 2 * jnp.sign(error[0]) * error[1:]
     return jnp.array(np.array(RATE_GAIN) / scale.time) * (rates - x[BODY_RATES])
 
 
-def _shortest_turn(direction: Float[Array, "3"]) -> Float[Array, "4"]:
-    """The rotation that takes world z to a unit direction above the horizon."""
-    dx, dy, dz = direction
-    return normalise(jnp.stack([1 + dz, -dy, dx, jnp.zeros_like(dz)]))
-
-
-def allocate(thrust: Float[Array, ""], torque: Float[Array, "3"], nominal: Parameters, max_speed: float) -> Input:
+def _allocate(thrust: Scalar, torque: Vector, nominal: Parameters, max_speed: float) -> Input:
     """Rotor speeds [rad/s] that give a thrust [N] and a torque [N m, body], clipped to what a rotor can do."""
     k, x, y = nominal.thrust_coefficient, nominal.rotor_positions[:, 0], nominal.rotor_positions[:, 1]
     mixer = jnp.stack([k * jnp.ones(4), k * y, -k * x, nominal.torque_coefficient * nominal.spin])

@@ -14,28 +14,28 @@ from hybrid_jax import checks
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import Force, Parameters, Scalar
-from hybrid_jax.sim.model import bare_model, with_parameters
+from hybrid_jax.sim.model import traced_model
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
 
 CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
 
 
 class Quadrotor(eqx.Module):
-    """ẋ = f(x, u, t) of one vehicle under a tuple of forces.
-
-    Attributes:
-        parameters: array leaves, so that vmap can run over vehicles.
-        forces: summed; those of `hybrid_jax.sim.forces` or custom functions.
-    """
+    """ẋ = f(x, u, t) of one vehicle under a sum of forces."""
 
     parameters: Parameters
-    forces: tuple[Force, ...] = eqx.field(static=True)
+    forces: tuple[Force, ...] = eqx.field(static=True)  # of `hybrid_jax.sim.forces`, or custom functions
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
         """ẋ for rotor speeds u [rad/s] at time t [s]."""
-        rates = x[BODY_RATES]
-        acceleration = self._acceleration(x, u, t)
-        return jnp.concatenate([x[VELOCITY], quaternion_derivative(x[QUATERNION], rates), acceleration])
+        wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
+        applied = sum(wrenches, jnp.zeros_like(x, shape=6))
+        model = traced_model(self.parameters)
+        data = mjx.make_data(model).replace(
+            qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=jnp.stack([jnp.zeros_like(applied), applied])
+        )
+        turning = quaternion_derivative(x[QUATERNION], x[BODY_RATES])
+        return jnp.concatenate([x[VELOCITY], turning, mjx.forward(model, data).qacc])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
         """The state after dt [s] with u held from time t on: one step of classical RK4."""
@@ -71,11 +71,7 @@ class Quadrotor(eqx.Module):
     def rollouts(
         self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
     ) -> Float[Array, "n t 13"]:
-        """`rollout` of n flights, in vectorised chunks.
-
-        Raises:
-            ValueError: as `rollout`.
-        """
+        """`rollout` of n flights, in vectorised chunks; raises the same."""
         x0, u = self._checked(x0, u, dt, windows=jnp.shape(t0))
         checks.count("chunk", chunk)
         return jax.lax.map(lambda one: self.rollout(one[0], one[1], one[2], dt), (x0, u, t0), batch_size=chunk)
@@ -83,22 +79,9 @@ class Quadrotor(eqx.Module):
     def _checked(self, x0, u, dt, windows: tuple[int, ...]) -> tuple[Float[Array, "*n 13"], Float[Array, "*n t 4"]]:
         """x0 and u as JAX arrays, with leading axes `windows`."""
         x0, u = checks.floating("x0", x0), checks.floating("u", u)
-        if (
-            x0.shape != (*windows, STATE_SIZE)
-            or u.ndim != x0.ndim + 1
-            or u.shape != (*windows, u.shape[-2], INPUT_SIZE)
-        ):
+        lengths = u.shape[-2:-1]
+        if x0.shape != (*windows, STATE_SIZE) or u.shape != (*windows, *lengths, INPUT_SIZE) or not lengths:
             raise ValueError(f"x0 (13,) and u (t, 4), or n of each and of t0, expected, got {x0.shape} and {u.shape}")
         checks.positive("dt", dt, "a positive number of seconds")
         checks.unit_quaternions("x0", x0)
         return x0, u
-
-    def _acceleration(self, x: State, u: Input, t: Scalar) -> Float[Array, "6"]:
-        """[v̇, ω̇]: world frame [m/s²], body frame [rad/s²]."""
-        model = with_parameters(bare_model(), self.parameters)
-        wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
-        applied = sum(wrenches, jnp.zeros_like(x, shape=6))
-        data = mjx.make_data(model).replace(
-            qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=jnp.stack([jnp.zeros_like(applied), applied])
-        )
-        return mjx.forward(model, data).qacc

@@ -1,7 +1,8 @@
 """Multi-process utilities: initialisation, gathering results on every process, and detection of lost peers.
 
 All processes run the same program on the same data and call these functions in the same order. Training runs never
-communicate (see lanes.py): only results, and what process 0 decides or reads, travel between processes.
+communicate (see lanes.py): only results, and what process 0 decides or reads, travel between processes. Every function
+that communicates raises PeerLost when another process has ended.
 """
 
 import contextlib
@@ -29,12 +30,9 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
     Args:
         coordinator: host:port of process 0. Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open
             MPI, Kubernetes, Cloud TPU).
-        processes: their number.
-        process: the index of this process.
 
     Raises:
         ValueError: an argument is missing or inconsistent, or the processes differ in their number of devices.
-        PeerLost: the other processes cannot be reached.
     """
     jax.config.update("jax_enable_preemption_service", False)  # the host loop handles signals
     try:
@@ -77,11 +75,7 @@ def collect(tree: PyTree) -> PyTree:
 
 
 def gather(tree: PyTree) -> PyTree:
-    """Host arrays of all processes, concatenated along the first axis on every process; shapes must agree.
-
-    Raises:
-        PeerLost: another process has ended.
-    """
+    """Host arrays of all processes, concatenated along the first axis on every process; shapes must agree."""
     # As bytes: JAX would truncate 64-bit numbers.
     own = jax.tree.map(lambda leaf: np.ascontiguousarray(leaf).view(np.uint8), tree)
     with _detect_lost_peers():
@@ -90,20 +84,12 @@ def gather(tree: PyTree) -> PyTree:
 
 
 def agreed(number: int) -> int:
-    """Process 0's number, on every process.
-
-    Raises:
-        PeerLost: another process has ended.
-    """
+    """Process 0's number, on every process."""
     return int(gather(np.array([number]))[0]) if jax.process_count() > 1 else number
 
 
 def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
-    """The result of `make` on process 0, JSON values and named arrays, on every process; only process 0 calls it.
-
-    Raises:
-        PeerLost: another process has ended; process 0, if `make` failed there.
-    """
+    """The result of `make` on process 0, JSON values and named arrays, on every process; only process 0 calls it."""
     if jax.process_count() == 1:
         return make()
     message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)

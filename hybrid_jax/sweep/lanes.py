@@ -41,17 +41,10 @@ def count(lanes: PyTree) -> int:
 
 
 def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity: int) -> list[np.ndarray]:
-    """Distribute the active lanes over the devices.
+    """For each device its shard: the active lanes that it runs, in order, in at most `capacity` chunks.
 
     The most expensive chunk goes first, to the device with the least work. Lanes of equal cost share a chunk, so that
     none waits long for another.
-
-    Args:
-        costs: of each lane.
-        capacity: chunks that a device can take at most.
-
-    Returns:
-        For each device its lanes, in the order in which they run: its shard.
     """
     ordered = sorted(active, key=lambda i: -costs[i])
     shards: list[list[int]] = [[] for _ in range(devices)]
@@ -97,8 +90,21 @@ class LaneMap:
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._min_capacity = min_capacity
-        self._mesh = Mesh(np.array(self.devices), (AXIS,))
-        self._run = jax.jit(self._on_mesh(function), static_argnums=0, compiler_options=compiler)
+        mesh = Mesh(np.array(self.devices), (AXIS,))
+        self._split, self._whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
+
+        def run(static, lanes, chunks, shared):
+            width, leaves, structure = static
+
+            def share(lanes, chunks, shared):
+                lanes, shared = eqx.combine((lanes, shared), jax.tree.unflatten(structure, leaves))
+                return _loop(function, width, lanes, chunks[0], shared)
+
+            split, whole = PartitionSpec(AXIS), PartitionSpec()
+            mapped = jax.shard_map(share, mesh=mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False)
+            return mapped(lanes, chunks, shared)
+
+        self._run = jax.jit(run, static_argnums=0, compiler_options=compiler)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
@@ -106,7 +112,11 @@ class LaneMap:
         places = np.stack([np.resize(np.concatenate([shard, [0]]), capacity * width) for shard in shards])
         chunks = np.array([-(-len(shard) // width) for shard in shards])
         own = [d for d, device in enumerate(self.devices) if device.process_index == jax.process_index()]
-        results = self._launch(width, lane(lanes, places[own].ravel()), chunks[own], shared)
+        arrays, rest = eqx.partition((lane(lanes, places[own].ravel()), shared), eqx.is_array)
+        leaves, structure = jax.tree.flatten(rest)
+        put_lanes, put_shared = hosts.put(arrays[0], self._split), hosts.put(arrays[1], self._whole)
+        static = width, tuple(leaves), structure
+        results = hosts.collect(self._run(static, put_lanes, hosts.put(chunks[own], self._split), put_shared))
         where = {i: capacity * width * d + j for d, shard in enumerate(shards) for j, i in enumerate(shard)}
         return lane(results, np.array([where[i] for i in active], int))
 
@@ -123,43 +133,6 @@ class LaneMap:
         # Twice the even share is enough to balance costs.
         capacity = min(-(-lanes // width), 2 * -(-lanes // (width * devices)))
         return schedule(costs, active, devices, width, capacity), width, capacity
-
-    def _launch(self, width: int, lanes: PyTree, chunks: Int[np.ndarray, " d"], shared: tuple) -> PyTree:
-        """Results of all devices; `lanes` and `chunks` are those of this process's devices."""
-        split, whole = NamedSharding(self._mesh, PartitionSpec(AXIS)), NamedSharding(self._mesh, PartitionSpec())
-        arrays, rest = eqx.partition((lanes, shared), eqx.is_array)
-        lanes, shared = hosts.put(arrays[0], split), hosts.put(arrays[1], whole)
-        return hosts.collect(self._run(_Static(width, rest), lanes, hosts.put(chunks, split), shared))
-
-    def _on_mesh(self, function: Callable[..., PyTree]) -> Callable[..., PyTree]:
-        split, whole = PartitionSpec(AXIS), PartitionSpec()
-
-        def run(static, lanes, chunks, shared):
-            def share(lanes, chunks, shared):
-                whole_lanes, whole_shared = eqx.combine((lanes, shared), static.rest)
-                return _loop(function, static.width, whole_lanes, chunks[0], whole_shared)
-
-            mapped = jax.shard_map(
-                share, mesh=self._mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False
-            )
-            return mapped(lanes, chunks, shared)
-
-        return run
-
-
-class _Static:
-    """What a compilation depends on besides shapes: the width of a chunk and the leaves that are not arrays."""
-
-    def __init__(self, width: int, rest: PyTree):
-        self.width, self.rest = width, rest
-        leaves, structure = jax.tree.flatten(rest)
-        self._identity = (width, tuple(leaves), structure)
-
-    def __hash__(self):
-        return hash(self._identity)
-
-    def __eq__(self, other):
-        return self._identity == other._identity
 
 
 def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], shared: tuple) -> PyTree:

@@ -30,25 +30,15 @@ PROGRAMS = 16  # compiled programs kept in memory, to train and to evaluate
 
 @dataclass(frozen=True)
 class Progress:
-    """The state of a sweep after a block of epochs.
+    """The state of a sweep after a block of epochs."""
 
-    Attributes:
-        active: lanes still training.
-        lanes: all lanes.
-        epochs: the most epochs that a lane has completed.
-        best: the smallest validation L_MSE of any lane.
-        at_least: epochs that some active lane still needs.
-        at_most: epochs that some active lane may still need.
-        seconds: since the sweep began.
-    """
-
-    active: int
-    lanes: int
-    epochs: int
-    best: float
-    at_least: int
-    at_most: int
-    seconds: float
+    active: int  # lanes still training
+    lanes: int  # all lanes
+    epochs: int  # the most that a lane has completed
+    best: float  # the smallest validation L_MSE of any lane
+    at_least: int  # epochs that some active lane still needs
+    at_most: int  # epochs that some active lane may still need
+    seconds: float  # since the sweep began
 
 
 def sweep(
@@ -68,8 +58,7 @@ def sweep(
     Args:
         states: stacked initial states, one per lane (`fitting.start`, `lanes.stack`).
         plans: stacked run configurations, one per lane.
-        train: the windows that `plans` index into; shared by all lanes.
-        validation: shared by all lanes.
+        train: the windows that `plans` index into; shared by all lanes, as `validation` is.
         min_capacity: lanes and training windows to compile for at least. Smaller sweeps are padded and share the
             program; padding of lanes needs a fixed width (see `LaneMap`).
         width: lanes in a chunk; see `LaneMap`. On a GPU, lower it if a sweep does not fit into memory.
@@ -85,7 +74,16 @@ def sweep(
             window where a field normalises minibatches.
     """
     states, plans = jax.device_get((states, plans))
-    plans, block, shared, costs = _prepare(states, plans, train, validation, settings, min_capacity, width)
+    shared = settings.objective.prepare(train, "train"), settings.objective.prepare(validation, "validation")
+    check_minibatch(states.field, settings)
+    _check(plans, shared[0], settings)
+    plans, shared = _padded(plans, shared, min_capacity[1])
+    shapes = _shapes(lane((states, plans), 0), shared)
+    block = _block(settings, width, max(count(states), min_capacity[0]), shapes)
+    # A validation window costs an eighth of a training window.
+    costs = np.asarray(plans.n_train) + len(shared[1]) / 8
+    none = np.zeros(len(costs), np.int32)
+    block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == fitting.RUNNING)):
         start = time.perf_counter()
@@ -114,37 +112,13 @@ def evaluate(
     return errors(fields, (windows,), np.ones(lanes), range(lanes))
 
 
-def _prepare(
-    states: FitState,
-    plans: RunConfig,
-    train: PyTree,
-    validation: PyTree,
-    settings: Settings,
-    min_capacity: tuple[int, int],
-    width: int | None,
-) -> tuple[RunConfig, LaneMap, tuple, np.ndarray]:
-    """The arguments of the compiled block, the block itself, and the cost of an epoch of each lane."""
-    train = settings.objective.prepare(train, "train")
-    validation = settings.objective.prepare(validation, "validation")
-    check_minibatch(states.field, settings)
-    _check(plans, train, settings)
-    plans, train = _padded(plans, train, min_capacity[1])
-    shared = (train, validation)
-    lanes = max(count(states), min_capacity[0])
-    block = _block(settings, width, lanes, _shapes(lane((states, plans), 0), shared))
-    costs = np.asarray(plans.n_train) + len(validation) / 8  # a validation window costs an eighth of a training window
-    none = np.zeros(len(costs), np.int32)
-    block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
-    return plans, block, shared, costs
-
-
-def _padded(plans: RunConfig, train: PyTree, windows: int) -> tuple[RunConfig, PyTree]:
-    """Pad plans and data to a number of windows. No plan uses the padding."""
-    listed = plans.subset.shape[-1]
+def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tuple[RunConfig, tuple[PyTree, PyTree]]:
+    """Pad plans and training data to a number of windows. No plan uses the padding."""
+    listed, (train, validation) = plans.subset.shape[-1], shared
     subset = np.pad(plans.subset, ((0, 0), (0, max(windows, listed) - listed)))
     if len(train) < windows:
         train = train[np.minimum(np.arange(windows), len(train) - 1)]
-    return replace(plans, subset=subset), train
+    return replace(plans, subset=subset), (train, validation)
 
 
 def _shapes(*trees: PyTree) -> tuple:

@@ -17,16 +17,13 @@ def rigid_body(vehicle):
     q, v, w = x[3:7], x[7:10], x[10:13]
     thrust = vehicle.thrust_coefficient * u**2
     px, py = np.array(vehicle.rotor_positions).T
-    torque = ca.vertcat(
-        ca.dot(py, thrust), -ca.dot(px, thrust), vehicle.torque_coefficient * ca.dot(np.array(vehicle.spin), u**2)
-    )
+    reaction = vehicle.torque_coefficient * ca.dot(np.array(vehicle.spin), u**2)
+    torque = ca.vertcat(ca.dot(py, thrust), -ca.dot(px, thrust), reaction)
     lift = product(product(q, ca.vertcat(0, 0, 0, ca.sum1(thrust))), ca.vertcat(q[0], -q[1:]))[1:]
     inertia = np.array(vehicle.inertia)
     spin_up = (torque - ca.cross(w, inertia * w)) / inertia
-    slope = ca.vertcat(
-        v, 0.5 * product(q, ca.vertcat(0, w)), lift / vehicle.mass - ca.DM([0, 0, vehicle.gravity]), spin_up
-    )
-    return ca.Function("f", [x, u], [slope])
+    acceleration = lift / vehicle.mass - ca.DM([0, 0, vehicle.gravity])
+    return ca.Function("f", [x, u], [ca.vertcat(v, 0.5 * product(q, ca.vertcat(0, w)), acceleration, spin_up)])
 
 
 def one_step(vehicle, dt):
@@ -75,8 +72,4 @@ def best_cost(controller: Controller, reference, x0) -> tuple[float, np.ndarray]
     guess = np.concatenate([np.tile(x0, n), np.full(share.numel(), vehicle.hover_speed / half - 1)])
     found = solver(x0=guess, lbx=-bounds, ubx=bounds, lbg=0, ubg=0)
     assert solver.stats()["success"], solver.stats()["return_status"]
-    return float(found["f"]), np.array(speeds_of(found["x"][size:], half, controller.min_speed))
-
-
-def speeds_of(share, half, low):
-    return low + half * (1 + np.array(share).reshape(-1, 4))
+    return float(found["f"]), controller.min_speed + half * (1 + np.array(found["x"][size:]).reshape(-1, 4))

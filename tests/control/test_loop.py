@@ -1,5 +1,7 @@
 """Laws of the closed loop, with a rigid body as the plant."""
 
+from functools import cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -10,21 +12,24 @@ import hybrid_jax as hj
 from hybrid_jax.control import (
     Controller,
     Flight,
-    actual_cost,
+    OpenLoopCosts,
     add_body_rates,
     advance,
     figure_eight,
     fly,
     hover,
     low_pass,
+    open_loop_costs,
     performance,
+    relative_cost_error,
     sample,
 )
+from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.dynamics.disturbance import disturbed
 
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
-WIND = jnp.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0])  # m/s²: the mean of experiment 2's
+WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
 
 
 def plant(field):
@@ -36,24 +41,27 @@ def simulate(wind, reference, x0, bandwidth):
     return flight, performance(flight, reference, CONTROLLER)
 
 
-alone = jax.jit(simulate)
-
-SECONDS = 2.0
-REFERENCES = [sample(path, CONTROLLER, SECONDS) for path in (hover(), figure_eight(3.5), figure_eight(6.0), low_pass())]
+alone = jax.jit(simulate)  # one program for all flights of 2 s
+PATHS = {"hover": hover(), "eight": figure_eight(3.5), "fast eight": figure_eight(6.0), "low pass": low_pass()}
 
 
-@pytest.mark.parametrize(("i", "allowed"), [(0, 0.001), (1, 0.001), (2, 0.005), (3, 0.002)])
-def test_true_model_tracks_the_reference(i, allowed):
+@cache
+def reference_of(name):
+    return sample(PATHS[name], CONTROLLER, 2.0)
+
+
+@pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
+def test_true_model_tracks_the_reference(name, allowed):
     """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
-    _, found = alone(jnp.zeros(6), REFERENCES[i], REFERENCES[i][0], 0.0)
+    _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0)
     assert found.position_rmse < allowed
     assert found.yaw_rmse < 0.002
     assert not found.crashed
 
 
 def test_recovery_from_a_rate_of_6_rad_per_s():
-    reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, SECONDS)
-    flight, found = alone(jnp.zeros(6), reference, add_body_rates(reference[0]), 0.0)
+    reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, 2.0)
+    flight, found = alone(np.zeros(6), reference, add_body_rates(reference[0]), 0.0)
     assert found.largest_error < 0.3
     assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
@@ -63,7 +71,7 @@ def test_recovery_from_a_rate_of_6_rad_per_s():
 
 def test_damping_does_not_grow_at_the_optimum():
     """A kick after a second of hover is corrected as well as one at the start."""
-    reference = REFERENCES[0]
+    reference = reference_of("hover")
 
     @jax.jit
     def furthest(at):
@@ -78,7 +86,7 @@ def test_damping_does_not_grow_at_the_optimum():
 
 
 def test_observer_finds_the_wind_and_removes_its_error():
-    reference = REFERENCES[0]
+    reference = reference_of("hover")
     _, without = alone(WIND, reference, reference[0], 0.0)
     flight, found = alone(WIND, reference, reference[0], 10.0)
     np.testing.assert_allclose(flight.disturbance[-1], WIND, rtol=0, atol=0.01)
@@ -89,7 +97,7 @@ def test_observer_finds_the_wind_and_removes_its_error():
 
 def test_vmap_equals_single_flights():
     winds = jnp.stack([0 * WIND, WIND])
-    references = jnp.stack([REFERENCES[0], REFERENCES[1]])[:, : 1 + 100 + 50]
+    references = jnp.stack([reference_of("hover"), reference_of("eight")])
     bandwidths = jnp.array([0.0, 10.0])
     lanes, found = jax.jit(jax.vmap(simulate))(winds, references, references[:, 0], bandwidths)
     for i in range(2):
@@ -100,17 +108,27 @@ def test_vmap_equals_single_flights():
 
 def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
     """Predictions have steps of 0.05 s, the plant 0.01 s."""
-    reference = REFERENCES[1]
+    reference, calls = reference_of("eight"), range(50, 200, 25)
+    costs = jax.jit(
+        lambda flight, wind: open_loop_costs(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, calls)
+    )
+    exact, windy = (costs(alone(wind, reference, reference[0], 0.0)[0], wind) for wind in (np.zeros(6), WIND))
+    np.testing.assert_allclose(exact.actual, exact.predicted, rtol=0.01)
+    assert (windy.actual > 5.0 * windy.predicted).all()
 
-    @jax.jit
-    def ratio(wind):
-        flight = simulate(wind, reference, reference[0], 0.0)[0]
-        calls = jnp.arange(50, 200, 25)
-        costs = jax.vmap(lambda i: actual_cost(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, i))(calls)
-        return costs / flight.plans.cost[calls]
 
-    np.testing.assert_allclose(ratio(jnp.zeros(6)), 1.0, rtol=0.01)
-    assert (ratio(WIND) > 5.0).all()
+def test_relative_cost_error_is_bounded_near_zero():
+    costs = OpenLoopCosts(jnp.array([1.0, 3.0]), jnp.array([1.0, 3.0]))
+    assert relative_cost_error(costs, CONTROLLER) == 0
+    higher = OpenLoopCosts(costs.predicted, 1.1 * costs.actual)
+    assert relative_cost_error(higher, CONTROLLER) == pytest.approx(0.1, rel=1e-5)
+    # The denominator is at least the cost of an offset of 5 mm.
+    reference = sample(hover(), CONTROLLER, 0.01)[:20]
+    floor = plan_cost(CONTROLLER.weights, reference, reference.at[:, 1].add(0.005), jnp.zeros((20, 4)))
+    small = OpenLoopCosts(jnp.array([0.0, 0.0]), jnp.array([0.1 * floor, 0.0]))
+    assert relative_cost_error(small, CONTROLLER) == pytest.approx(0.05, rel=1e-4)
+    with pytest.raises(ValueError, match="distance must be"):
+        relative_cost_error(costs, CONTROLLER, 0.0)
 
 
 def still(periods=4):
@@ -129,13 +147,10 @@ def test_performance_of_a_known_flight():
     assert found.saturation == 2 / 16
     assert found.yaw_rmse == 0
     assert not found.crashed
-
-
-def test_yaw_error_wraps():
-    flight, reference = still(), sample(hover(yaw=np.pi - 0.1), CONTROLLER, 0.1)
-    ahead = sample(hover(yaw=-np.pi + 0.1), CONTROLLER, 0.1)[0]
-    flight = eqx.tree_at(lambda f: f.x, flight, jnp.tile(ahead, (5, 1)))
-    assert performance(flight, reference, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
+    # The yaw error wraps.
+    behind, ahead = (sample(hover(yaw=yaw), CONTROLLER, 0.1) for yaw in (np.pi - 0.1, -np.pi + 0.1))
+    flight = eqx.tree_at(lambda f: f.x, flight, ahead[:5])
+    assert performance(flight, behind, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
 
 
 @pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
@@ -146,7 +161,7 @@ def test_crashes_are_below_ground_too_far_or_not_finite(end):
 
 
 def test_invalid_arguments_are_refused():
-    reference = REFERENCES[0]
+    reference = reference_of("hover")
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
             fly(plant(BODY), BODY, samples, x0, CONTROLLER)
@@ -157,8 +172,7 @@ def test_invalid_arguments_are_refused():
             fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
-@pytest.mark.parametrize("start", [np.float32, np.float64])
-@pytest.mark.parametrize("wanted", [np.float32, np.float64])
+@pytest.mark.parametrize(("start", "wanted"), [(np.float32, np.float64), (np.float64, np.float32)])
 def test_mixed_precision_is_promoted(start, wanted):
     """For the loop with a plant of another precision, and for the controller alone."""
     with jax.enable_x64(True):

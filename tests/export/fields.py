@@ -1,4 +1,6 @@
-"""One field of every kind, for the tests of export, with states and inputs to try them on."""
+"""One field of every kind, for the tests of export, with states and inputs to try them on; made when asked for."""
+
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -16,7 +18,7 @@ from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residua
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
-KEY = jax.random.key(0)
+KEY = np.zeros(2, np.uint32)  # jax.random.key(0)
 SCALING = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
 TERMS = Terms(torque_gain=(0.9, 1.1, 0.8), drag=(0.3, 0.4, 0.1))
 
@@ -49,32 +51,50 @@ def plain(x, u):
     return jnp.tanh(x) * jnp.where(x[2] > 0, 1.0, jnp.sum(u) / 2500)
 
 
-BODY = perturbed(IRIS, KEY)
-PER_ROTOR = moved(multirotor(IRIS, tuple(name for name in SHAPES if name != "k"), TERMS))
+@cache
+def body():
+    return perturbed(IRIS, KEY)
+
+
+@cache
+def per_rotor():
+    return moved(multirotor(IRIS, tuple(name for name in SHAPES if name != "k"), TERMS))
+
+
+def with_norm(norm):
+    return Hybrid(body(), moved(residual_network(13, 4, KEY, hidden=5, scaling=SCALING, norm=norm)))
+
+
+def with_residual(inputs, outputs):
+    return Hybrid(per_rotor(), network(inputs=inputs, outputs=outputs))
+
+
 FIELDS = {
-    "rigid body": BODY,
-    "multirotor, per rotor": PER_ROTOR,
-    "multirotor": multirotor(IRIS, (), TERMS),
+    "rigid body": body,
+    "multirotor, per rotor": per_rotor,
+    "multirotor": lambda: multirotor(IRIS, (), TERMS),
+    **{f"hybrid, norm {norm}": partial(with_norm, norm) for norm in NORMS},
     **{
-        f"hybrid, norm {norm}": Hybrid(BODY, moved(residual_network(13, 4, KEY, hidden=5, scaling=SCALING, norm=norm)))
-        for norm in NORMS
-    },
-    **{
-        f"residual from {inputs} to {outputs}": Hybrid(PER_ROTOR, network(inputs=inputs, outputs=outputs))
+        f"residual from {inputs} to {outputs}": partial(with_residual, inputs, outputs)
         for inputs in INPUTS
         for outputs in OUTPUTS
         if inputs in GO_WITH.get(outputs, INPUTS)
     },
-    "linear path": Hybrid(
-        moved(ForcedBody(BODY.log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
+    "linear path": lambda: Hybrid(
+        moved(ForcedBody(body().log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
     ),
-    "linear residual": Hybrid(BODY, moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
-    "frozen rates": FrozenRates(PER_ROTOR),
-    "frozen": Frozen(BODY),
-    "hold": HoldState(),
-    "one's own": Dragged(BODY, jnp.asarray(0.3)),
-    "function": plain,
+    "linear residual": lambda: Hybrid(body(), moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
+    "frozen rates": lambda: FrozenRates(per_rotor()),
+    "frozen": lambda: Frozen(body()),
+    "hold": HoldState,
+    "one's own": lambda: Dragged(body(), jnp.asarray(0.3)),
+    "function": lambda: plain,
 }
+
+
+@cache
+def field_of(name):
+    return FIELDS[name]()
 
 
 SIZES = {"state_size": 13, "input_size": 4}

@@ -5,7 +5,7 @@ import jax.export
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from fields import BODY, FIELDS, KEY, SIZES, samples
+from fields import KEY, SIZES, body, field_of, samples
 
 from hybrid_jax import residual_network, rollout_batch, save
 from hybrid_jax.export import export_field, export_step, load_program
@@ -13,7 +13,7 @@ from hybrid_jax.export.stablehlo import FORMAT
 from hybrid_jax.io.archive import save_archive
 
 KINDS = ("rigid body", "multirotor, per rotor", "hybrid, norm batch", "residual from body_motion to motion", "hold")
-HYBRID = FIELDS["hybrid, norm batch"]
+HYBRID = "hybrid, norm batch"
 
 
 @pytest.fixture
@@ -37,46 +37,45 @@ def close(found, expected):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_program_is_the_field(name, path):
-    export_field(path, FIELDS[name], **SIZES, about={"seed": 3})
+    export_field(path, field_of(name), **SIZES, about={"seed": 3})
     program = load_program(path)
     for x, u in zip(*samples(2), strict=True):
-        close(program(x, u), FIELDS[name](jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)))
+        close(program(x, u), field_of(name)(jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)))
     assert (program.dt, program.state_size, program.input_size) == (None, 13, 4)
     assert (program.batched, program.platforms, program.about) == (False, ("cpu",), {"seed": 3})
 
 
 @pytest.mark.parametrize("name", ["multirotor, per rotor", "hybrid, norm batch"])
 def test_a_program_of_steps_is_an_interval_of_a_rollout_for_a_batch_of_any_length(name, path):
-    export_step(path, FIELDS[name], 0.02, batched=True)
+    export_step(path, field_of(name), 0.02, batched=True)
     program = load_program(path)
     assert (program.dt, program.batched) == (0.02, True)
     for count in (1, 3):
         x, u = (part.astype(np.float32) for part in samples(count))
-        close(program(x, u), rollout_batch(FIELDS[name], x, u[:, None], 0.02)[:, 0])
+        close(program(x, u), rollout_batch(field_of(name), x, u[:, None], 0.02)[:, 0])
 
 
 def test_it_may_be_part_of_a_compiled_program(path):
-    export_field(path, BODY)
+    export_field(path, body())
     program, (x, u) = load_program(path), (part[0] for part in samples())
     close(jax.jit(lambda x, u: 2 * program(x, u))(x, u), 2 * program(x, u))
 
 
 def test_in_double_precision_it_stays_single(path):
+    single, (x, u) = body(), (part[0] for part in samples())
     with jax.enable_x64(True):
-        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float), BODY)
-        export_field(path, field)
-        x, u = (part[0] for part in samples())
-        close(load_program(path)(x, u), BODY(*(jnp.asarray(a, jnp.float32) for a in (x, u))))
+        export_field(path, jax.tree.map(lambda leaf: jnp.asarray(leaf, float), single))
+        close(load_program(path)(x, u), single(*(jnp.asarray(a, jnp.float32) for a in (x, u))))
 
 
 def test_a_file_for_two_platforms_says_so(path):
-    export_step(path, HYBRID, 0.01, platforms=("cpu", "cuda"))
+    export_step(path, field_of(HYBRID), 0.01, platforms=("cpu", "cuda"))
     assert load_program(path).platforms == ("cpu", "cuda")
 
 
 def test_equal_fields_are_equal_files_that_name_no_file_of_the_writer(path, tmp_path):
     for name in ("one.npz", "two.npz"):
-        export_step(tmp_path / name, HYBRID, 0.01, batched=True)
+        export_step(tmp_path / name, field_of(HYBRID), 0.01, batched=True)
     content = (tmp_path / "one.npz").read_bytes()
     assert content == (tmp_path / "two.npz").read_bytes()
     assert b".py" not in content.replace(b"exported.npy", b"")
@@ -88,18 +87,18 @@ def test_another_system_has_other_sizes(path):
     close(load_program(path)(np.ones(2), np.ones(1)), field(jnp.ones(2), jnp.ones(1)))
 
 
-@pytest.mark.parametrize("shapes", [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], ids=str)
-def test_shapes_that_are_not_the_program_s_are_refused(shapes, path):
-    export_field(path, BODY)
-    with pytest.raises(ValueError, match=r"x \(13,\) and u \(4,\) expected, got"):
-        load_program(path)(*map(np.ones, shapes))
-
-
-@pytest.mark.parametrize("shapes", [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], ids=str)
-def test_shapes_that_are_no_batch_are_refused(shapes, path):
-    export_field(path, BODY, batched=True)
-    with pytest.raises(ValueError, match=r"x \(b, 13\) and u \(b, 4\) expected, got"):
-        load_program(path)(*map(np.ones, shapes))
+@pytest.mark.parametrize(
+    ("batched", "shapes", "said"),
+    [
+        (False, [((12,), (4,)), ((13,), (5,)), ((2, 13), (2, 4)), ((), ())], r"x \(13,\) and u \(4,\) expected"),
+        (True, [((13,), (4,)), ((0, 13), (0, 4)), ((2, 13), (3, 4))], r"x \(b, 13\) and u \(b, 4\) expected"),
+    ],
+)
+def test_shapes_that_are_not_the_program_s_are_refused(batched, shapes, said, path):
+    export_field(path, body(), batched=batched)
+    for x, u in shapes:
+        with pytest.raises(ValueError, match=f"{said}, got"):
+            load_program(path)(np.ones(x), np.ones(u))
 
 
 @pytest.mark.parametrize(
@@ -115,8 +114,8 @@ def test_shapes_that_are_no_batch_are_refused(shapes, path):
     ids=str,
 )
 def test_what_makes_no_program_is_refused(options, said, path):
-    assert said in refusal(path, lambda path: export_field(path, BODY, **options))
-    assert "dt must be a positive" in refusal(path, lambda path: export_step(path, BODY, -0.1))
+    assert said in refusal(path, lambda path: export_field(path, body(), **options))
+    assert "dt must be a positive" in refusal(path, lambda path: export_step(path, body(), -0.1))
     assert not path.exists()
 
 
@@ -142,7 +141,7 @@ def forged(path, function, *shapes, **metadata):
 
 def test_what_is_no_program_is_refused_by_its_name(path):
     assert "no such file" in refusal(path)
-    save(path, BODY)
+    save(path, body())
     assert "not a hybrid_jax program" in refusal(path)
     for arrays in ({}, {"exported": np.zeros(0, np.uint8)}, {"exported": np.full(400, 7, np.uint8)}):
         save_archive(path, FORMAT, {"dt": None, "about": {}}, arrays)
@@ -161,7 +160,7 @@ def test_a_forged_program_is_refused(path):
 
 
 def test_a_truncated_or_altered_program_is_refused(path):
-    export_field(path, BODY)
+    export_field(path, body())
     content = path.read_bytes()
     path.write_bytes(content[:-100])
     assert "truncated" in refusal(path)

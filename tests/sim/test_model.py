@@ -11,7 +11,7 @@ from mujoco import mjx
 
 from hybrid_jax.sim import check_versions
 from hybrid_jax.sim.forces import parameters_of
-from hybrid_jax.sim.model import bare_model, build_model, with_parameters
+from hybrid_jax.sim.model import build_model, traced_model
 from hybrid_jax.sim.render import picture
 from hybrid_jax.vehicle import IRIS
 
@@ -39,7 +39,7 @@ def test_the_compiled_model_carries_the_vehicles_numbers_and_no_others():
 
 def test_traced_parameters_replace_every_number_that_differs_between_two_vehicles():
     built = mjx.put_model(build_model(OTHER))
-    replaced = with_parameters(bare_model(), parameters_of(OTHER))
+    replaced = traced_model(parameters_of(OTHER))
     # MuJoCo derives these for constraints, limits and the camera; a free body's acceleration does not read them.
     unused = ("invweight0", "acc0", "M0", "stat", "geom_", "cam_", "light_", "mesh_", "bvh", "names", "qpos0")
     for path, leaf in jax.tree_util.tree_leaves_with_path(built):
@@ -49,14 +49,11 @@ def test_traced_parameters_replace_every_number_that_differs_between_two_vehicle
             np.testing.assert_allclose(leaf, other, rtol=1e-12, err_msg=name)
 
 
-def test_matching_versions_pass():
-    check_versions("3.17.0", "3.17.5")
-
-
-@pytest.mark.parametrize(("mujoco", "mjx"), [("4.0.0", "3.17.0"), ("3.17.0", None), ("3.16.2", "3.16.2")])
+@pytest.mark.parametrize(("mujoco", "mjx"), [("4.0.0", "3.17.0"), ("3.17.0", "not installed"), ("3.16.2", "3.16.2")])
 def test_other_versions_are_refused_with_the_command_that_mends_it(mujoco, mjx):
+    check_versions({"mujoco": "3.17.0", "mujoco-mjx": "3.17.5"})
     with pytest.raises(ImportError, match=r"pip install .*mujoco==3\.17") as refusal:
-        check_versions(mujoco, mjx)
+        check_versions({"mujoco": mujoco, "mujoco-mjx": mjx})
     assert "\n" not in str(refusal.value)
 
 
@@ -80,8 +77,5 @@ def test_no_renderer_is_one_line_that_says_what_to_install(tmp_path, monkeypatch
     with pytest.raises(ValueError, match="libosmesa6 or libegl1") as refusal:
         picture(tmp_path / "vehicle.png")
     assert "\n" not in str(refusal.value)
-
-
-def test_a_picture_must_be_a_png(tmp_path):
     with pytest.raises(ValueError, match=r"\.png"):
         picture(tmp_path / "vehicle.jpg")

@@ -15,7 +15,7 @@ import pytest
 from pendulum import DAMPING, pendulum, swings
 
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.sweep.lanes import lane, stack
+from hybrid_jax.sweep.lanes import LaneMap, lane, stack
 from hybrid_jax.sweep.training import evaluate, sweep
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
@@ -94,6 +94,12 @@ def test_every_lane_comes_to_its_own_end(final):
     assert (final.epoch <= 12).all()
 
 
+def compilations(caplog):
+    """How many programs of sweeps were compiled under jax.log_compiles."""
+    messages = [record.getMessage() for record in caplog.records]
+    return sum("Finished XLA compilation" in message and "jit(run)" in message for message in messages)
+
+
 def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
     blocks = []
     own = replace(SETTINGS, batch_size=5)  # no other test's, or its compilation would serve here too
@@ -101,9 +107,8 @@ def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
         for _ in range(2):
             sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1, block_seconds=1e-9,
                   on_block=lambda states, progress: blocks.append(progress))  # fmt: skip
-    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
     assert len(blocks) > 3
-    assert sum("run" in message for message in compiled) == 1
+    assert compilations(caplog) == 1
 
 
 def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
@@ -116,12 +121,8 @@ def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
             sweep(*few, VALIDATION, own, width=1, min_capacity=capacity),
         ]
         errors = [evaluate(each.best, VALIDATION, 2, own, capacity[0]) for each in shared]
-    compiled = [record.getMessage() for record in caplog.records if "Finished XLA compilation" in record.getMessage()]
-    assert sum("jit(run)" in message for message in compiled) == 2  # one to train, one to test
-    apart = [
-        sweep(starts(), stack(PLANS), TRAIN, VALIDATION, own, width=1),
-        sweep(*few, VALIDATION, own, width=1),
-    ]
+    assert compilations(caplog) == 2  # one to train, one to test
+    apart = [swept(starts(), PLANS, settings=own, width=1), sweep(*few, VALIDATION, own, width=1)]
     for one, other, error in zip(shared, apart, errors, strict=True):
         np.testing.assert_array_equal(one.epoch, other.epoch)
         np.testing.assert_allclose(one.field.log_length, other.field.log_length, rtol=0, atol=1e-6)
@@ -153,39 +154,23 @@ def test_a_diverged_lane_changes_no_bit_of_another(width, final):
     assert np.isfinite(wild.best.log_length).all()
 
 
-def test_stopped_lanes_are_run_no_more():
-    seen = []
-
-    def note(states, progress):
-        seen.append((progress.active, states.epoch.copy()))
-
-    swept(starts(), [plan(cap=1), plan(cap=20, minimum=20), plan(cap=20, minimum=20)], width=1,
-          block_seconds=1e-9, on_block=note)  # fmt: skip
-    active, epochs = zip(*seen, strict=True)
-    assert active[0] == 2
-    assert active[-1] == 0
-    assert all(each[0] == 1 for each in epochs)
-    assert epochs[-1].tolist() == [1, 20, 20]
-    assert len(seen) > 3
-
-
-def test_stopped_lanes_cost_no_step(monkeypatch):
+def test_stopped_lanes_are_run_no_more(monkeypatch):
     """Only the active lanes are handed to the compiled block."""
-    from hybrid_jax.sweep import training as module
-
-    handed = []
-
-    run = module.LaneMap.__call__
+    handed, epochs, run = [], [], LaneMap.__call__
 
     def counting(self, lanes, shared, costs, active):
         handed.append(list(active))
         return run(self, lanes, shared, costs, active)
 
-    monkeypatch.setattr(module.LaneMap, "__call__", counting)
-    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9)
+    monkeypatch.setattr(LaneMap, "__call__", counting)
+    swept(starts(), [plan(cap=1), plan(cap=9, minimum=9), plan(cap=20, minimum=20)], width=1, block_seconds=1e-9,
+          on_block=lambda states, progress: epochs.append(states.epoch.tolist()))  # fmt: skip
     assert handed[1] == [0, 1, 2]  # the first call only compiles
     assert handed[2] == [1, 2]
     assert handed[-1] == [2]
+    assert len(epochs) > 3
+    assert {each[0] for each in epochs} == {1}
+    assert epochs[-1] == [1, 9, 20]
 
 
 def test_a_sweep_whose_lanes_have_all_stopped_is_left_as_it_is(final):
@@ -216,6 +201,9 @@ def test_evaluate_is_the_error_of_each_lane(final):
 def test_plans_that_do_not_fit_the_data_are_refused(size):
     with pytest.raises(ValueError, match=f"n_train={size} must lie between batch_size=10 and .* 40 in train"):
         swept(starts(), [*PLANS[:2], plan(n_train=size)])
+    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
+    with pytest.raises(ValueError, match="n_train=40"):
+        swept(starts(), short)
 
 
 @pytest.mark.parametrize(("place", "index"), [(0, 40), (39, -1)])
@@ -224,12 +212,6 @@ def test_subsets_that_point_outside_the_data_are_refused(place, index):
     wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
     with pytest.raises(ValueError, match=f"subset holds {index}"):
         swept(starts(), [PLANS[0], wrong, PLANS[2]])
-
-
-def test_subsets_shorter_than_n_train_are_refused():
-    short = [replace(each, subset=each.subset[:30]) for each in PLANS]
-    with pytest.raises(ValueError, match="n_train=40"):
-        swept(starts(), short)
 
 
 def test_bad_data_are_refused_by_name():

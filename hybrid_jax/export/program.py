@@ -1,14 +1,42 @@
-"""The numbers of states and inputs of a field."""
+"""What is exported of a field: a function of x and u in one precision, and its sizes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 
 from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
+from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
+
+
+def program_of(
+    field: AbstractVectorField, likes: Sequence[jax.ShapeDtypeStruct], dt: float | None, batched: bool = False
+) -> Derivative:
+    """ẋ = f(x, u), or the step of RK4 over dt [s], of a field with its numbers in the precision of `likes`.
+
+    Args:
+        likes: of one x and one u.
+        batched: for a function of rows of them.
+
+    Raises:
+        ValueError: the field does not accept such x and u.
+    """
+    precision = likes[0].dtype
+    field = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision) if eqx.is_inexact_array(leaf) else leaf, field)
+    check_field(field, *likes)
+    derivative = _of_rows(field) if batched else field
+    whole = derivative if dt is None else partial(rk4_step, derivative, dt=dt)
+    return lambda x, u: whole(x, u)  # jax.jit needs a hashable function
+
+
+def _of_rows(field: AbstractVectorField) -> Derivative:
+    return lambda x, u: jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
 
 
 def sizes_of(field: Any, state_size: int | None, input_size: int | None) -> tuple[int, int]:
