@@ -84,6 +84,15 @@ def test_mjx_is_newton_euler_and_c_mujoco(vehicle, states, derivative):
         np.testing.assert_allclose(found, data.qacc, rtol=1e-13, atol=4e-13)
 
 
+def test_hover_is_an_equilibrium(derivative):
+    speeds = np.linalg.solve(
+        [np.ones(4), *np.array(IRIS.rotor_positions).T, IRIS.spin], [IRIS.mass * IRIS.gravity, 0, 0, 0]
+    )
+    u = jnp.sqrt(speeds / IRIS.thrust_coefficient)
+    slope = derivative(quadrotor(IRIS), at_rest(), u, jnp.asarray(0.0))
+    np.testing.assert_allclose(slope, 0, atol=1e-13)
+
+
 def test_free_fall_is_exact(step):
     x = at_rest().at[7:10].set(jnp.array([1.0, -2.0, 3.0]))
     for _ in range(50):
