@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, trainable, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, check_batch_norm, trainable, update_running_stats
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import RK4, along, checked, rollout_minibatch
 from hybrid_jax.metrics import rollout_mse
@@ -108,6 +108,8 @@ def prepared(
     _check_learns(field)
     for name, windows in (("train", train), ("validation", validation)):
         _check_match(field, windows, name, settings)
+    if isinstance(field, AbstractVectorField):
+        check_batch_norm(field, jnp.asarray(train.x0[:2]).T, jnp.asarray(train.u[:2, 0]).T)
     checks.key("key", key)
     checks.count("settings.batch_size", settings.batch_size)
     check_minibatch(field, settings)

@@ -141,11 +141,12 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
     np.testing.assert_array_equal(jnp.delete(seen, np.arange(1, 5), axis=0), view("no_xy_yaw").read(x))
 
 
-def test_near_the_ground_of_an_unknown_vehicle_is_refused():
+@pytest.mark.parametrize("options", [{"inputs": "near_ground"}, {"outputs": "rotors"}], ids=str)
+def test_rotors_of_an_unknown_vehicle_are_refused(options):
     with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
-        make_residual(KEY, inputs="near_ground")
+        make_residual(KEY, **options)
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
-        view("near_ground", vehicle=replace(IRIS, rotor_radius=0.0))
+        view(**options, vehicle=replace(IRIS, rotor_radius=0.0))
 
 
 def test_the_body_s_view_of_a_state():

@@ -1,7 +1,5 @@
 """Laws of the thrust that a network adds to each rotor: with the right function of R / h it is the ground effect."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -29,9 +27,8 @@ class CheesemanBennett(AbstractVectorField):
         return 1 / (1 - (x / 4) ** 2) - 1
 
 
-def shared(vehicle=IRIS):
-    """A network that has something to say."""
-    return RotorThrust(residual_network(1, 1, KEY, hidden=7, scaling=HOVER, norm="none"), vehicle)
+def shared():
+    return RotorThrust(residual_network(1, 1, KEY, hidden=7, scaling=HOVER, norm="none"), IRIS)
 
 
 def samples(count=6):
@@ -90,10 +87,3 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     moved = Hybrid(rigid_body(IRIS), jax.tree.map(lambda leaf: leaf + 0.1, field))
     save(tmp_path / "model.npz", moved)
     assert eqx.tree_equal(load(tmp_path / "model.npz").field, moved)
-
-
-def test_of_an_unknown_vehicle_it_is_refused():
-    with pytest.raises(ValueError, match="'rotors' needs the vehicle whose rotors feel the ground, got None"):
-        make_residual(KEY, outputs="rotors")
-    with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
-        shared(replace(IRIS, rotor_radius=0.0))
