@@ -77,11 +77,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
-    """Read the tables of a TOML file.
-
-    Raises:
-        ValueError: the file and why it is not readable, in one line.
-    """
+    """The tables of a TOML file; ValueError if it is not readable."""
     try:
         return tomllib.loads(Path(path).read_bytes().decode())
     except (OSError, ValueError, RecursionError) as error:
@@ -106,14 +102,9 @@ def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None 
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
-    """A dataclass from a table of TOML.
-
-    Raises:
-        ValueError: a key that is unknown or missing, or a value that the class refuses; begins with `where`.
-    """
+    """A dataclass from a table of TOML; ValueError, after `where`, for a wrong or missing key or a refused value."""
     require_known(where, table, names_of(cls))
-    missing = [field.name for field in fields(cls) if field.default is MISSING and field.name not in table]  # pyright: ignore[reportArgumentType]
-    if missing:
+    if missing := [name for name, required in names_of(cls).items() if required and name not in table]:
         raise ValueError(f"{where}: {', '.join(missing)}: must be given")
     try:
         return cls(**{key: as_tuple(value) for key, value in table.items()})
@@ -121,27 +112,24 @@ def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
         raise ValueError(f"{where}: {checks.first_line(error)}") from error
 
 
-def names_of(cls: Any) -> dict[str, None]:
-    """The names of the fields of a dataclass, in order."""
-    return dict.fromkeys(field.name for field in fields(cls))
+def names_of(cls: Any) -> dict[str, bool]:
+    """The names of the fields of a dataclass, and whether they must be given."""
+    return {field.name: field.default is MISSING and field.default_factory is MISSING for field in fields(cls)}
 
 
 def require_known(where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
     """Raise ValueError if the table has other keys."""
-    unknown = sorted(repr(key) for key in table.keys() - set(known))
-    if unknown:
+    if unknown := sorted(repr(key) for key in table.keys() - set(known)):
         raise ValueError(f"{where}: {', '.join(unknown)}: must be one of {', '.join(known)}")
 
 
 def require_numbers(name: str, value: Any, shape: tuple[int, ...], what: str) -> None:
-    """Raise ValueError unless the value is a finite number, or nested tuples of them of this shape.
-
-    NumPy's scalars are refused: a vehicle is hashed and written to files.
-    """
+    """Raise ValueError unless the value is a finite number, or nested tuples of them of this shape."""
 
     def fits(value: Any, shape: tuple[int, ...]) -> bool:
         if shape:
             return isinstance(value, tuple) and len(value) == shape[0] and all(fits(part, shape[1:]) for part in value)
+        # NumPy's scalars are refused: a vehicle is hashed and written to files.
         number = checks.real(value) if isinstance(value, int | float) else None
         return number is not None and abs(number) <= checks.LARGEST
 

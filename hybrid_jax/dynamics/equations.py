@@ -40,9 +40,9 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
     return jnp.concatenate(
         [
-            _plus(jnp.stack(v), attitude, faster),
+            jnp.stack(v) + in_world(attitude, faster) if is_present(faster) else jnp.stack(v),
             rotation.derivative(q, omega),
-            _plus(acceleration, attitude, force),
+            acceleration + in_world(attitude, force) if is_present(force) else acceleration,
             _euler(inertia, torque, omega),
         ]
     )
@@ -97,10 +97,6 @@ def _with_aerodynamic_moments(constants: Constants, velocity, omega: Rows, torqu
     return torque
 
 
-def _plus(vector: Float[Array, " 3 *b"], attitude, parts) -> Float[Array, " 3 *b"]:
-    return vector + in_world(attitude, parts) if is_present(parts) else vector
-
-
 def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
     """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
     (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
@@ -134,12 +130,7 @@ def is_present(term, absent: float = 0.0) -> bool:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def evaluate_columns(
-    of_rows: Callable[[PyTree, Rows, Rows], Float[Array, "13 b"]],
-    theta: PyTree,
-    x: Float[Array, "13 b"],
-    u: Float[Array, "4 b"],
-) -> Float[Array, "13 b"]:
+def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "4 b"]):
     """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
 
     Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over

@@ -27,15 +27,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.equations import (
-    attitude_matrix,
-    constants_of,
-    derivative,
-    dot,
-    evaluate_columns,
-    in_world,
-    is_present,
-)
+from hybrid_jax.dynamics import equations
 from hybrid_jax.dynamics.rigid_body import LEARNED, AbstractRigidBody
 from hybrid_jax.dynamics.terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
 from hybrid_jax.rotation import Rows
@@ -80,19 +72,21 @@ class Multirotor(AbstractRigidBody):
         return {name: value(name, deviation) for name, deviation in self.deviations.items()}
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        return derivative(self.vehicle, self.terms, self.entries(), tuple(x), tuple(u))
+        return equations.derivative(self.vehicle, self.terms, self.entries(), tuple(x), tuple(u))
 
     def train_batch(self, x, u):
-        return evaluate_columns(partial(derivative, self.vehicle, self.terms), self.entries(), x, u)
+        of_rows = partial(equations.derivative, self.vehicle, self.terms)
+        return equations.evaluate_columns(of_rows, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
         """A residual force, too, changes the position before it shows in the estimated velocity."""
-        lag = constants_of(self.vehicle, self.terms, self.entries())["velocity_lag"]
-        if not is_present(lag):
+        lag = equations.constants_of(self.vehicle, self.terms, self.entries())["velocity_lag"]
+        if not equations.is_present(lag):
             return residual
-        attitude = attitude_matrix(tuple(x[QUATERNION]))
-        across = [dot(column, tuple(residual[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
-        return jnp.concatenate([residual[POSITION] + lag[0] * in_world(attitude, across), residual[POSITION.stop :]])
+        attitude = equations.attitude_matrix(tuple(x[QUATERNION]))
+        across = [equations.dot(column, tuple(residual[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
+        position = residual[POSITION] + lag[0] * equations.in_world(attitude, across)
+        return jnp.concatenate([position, residual[POSITION.stop :]])
 
     def entries(self) -> dict[str, Rows]:
         """θ_p number by number."""
@@ -100,11 +94,7 @@ class Multirotor(AbstractRigidBody):
 
 
 def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
-    """The multirotor at its nominal values, which learns the parameters named in `learn`.
-
-    Raises:
-        ValueError: a name that is not in `SHAPES`, or k beside k_rotors.
-    """
+    """The multirotor at its nominal values, which learns the parameters named in `learn`; see `check_names`."""
     check_names(tuple(learn))
     return Multirotor({name: jnp.zeros(SHAPES[name]) for name in learn}, vehicle, Terms() if terms is None else terms)
 

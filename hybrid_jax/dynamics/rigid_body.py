@@ -89,11 +89,7 @@ def rigid_body(vehicle: Vehicle) -> RigidBody:
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm.
-
-    Raises:
-        ValueError: not 0 < low <= high.
-    """
+    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm."""
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))

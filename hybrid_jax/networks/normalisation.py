@@ -12,14 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.batching import (
-    AbstractBatchNorm,
-    Batch,
-    Moments,
-    RunningStats,
-    expand_trailing,
-    record_moments,
-)
+from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
 from hybrid_jax.networks.batchnorm_vjp import normalised_layer, row_means
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
@@ -32,7 +25,7 @@ class AbstractNorm(eqx.Module):
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The normalised W z of each sample in inference mode."""
 
-    def train_layers(self, weight_in, weight_out, bias_out, z: Batch) -> Batch:
+    def train_layers(self, weight_in, weight_out, bias_out, z: Float[Array, "m b"]) -> Float[Array, "d b"]:
         """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
         return affine(weight_out, bias_out, jax.nn.relu(self.infer(weight_in, z)))
 

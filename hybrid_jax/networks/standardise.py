@@ -6,15 +6,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax.dynamics import batching
 from hybrid_jax.dynamics.base import AbstractVectorField, unfreeze
-from hybrid_jax.dynamics.batching import (
-    AbstractBatchNorm,
-    Moments,
-    RunningStats,
-    batch_norms,
-    moments_of,
-    record_moments,
-)
+from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.scaling import AbstractScaling, Channels, ChannelScaling
@@ -29,7 +23,7 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 
     running: RunningStats
     momentum: float = eqx.field(static=True, default=0.0)
-    seen: Moments | None = None
+    seen: batching.Moments | None = None
 
     def training_mode(self, seen):
         return _Probe(self.running, seen=seen)
@@ -38,7 +32,7 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
         z = jnp.concatenate([x, u])
         if self.seen is None:
             return z
-        mean, centred, _ = record_moments(z, self.seen)
+        mean, centred, _ = batching.record_moments(z, self.seen)
         return mean + centred
 
     def outputs(self, y):
@@ -54,19 +48,18 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     Args:
         windows: those that the field is to be trained on.
     """
-    networks = jax.tree.leaves(field, is_leaf=_is_unset)
-    networks = [node for node in networks if _is_unset(node)]
+    networks = [node for node in jax.tree.leaves(field, is_leaf=_is_unset) if _is_unset(node)]
     if not networks:
         return field
     x, u, after = _intervals(windows)
-    zeros = [jnp.zeros(network.weight_in.shape[1]) for network in networks]
+    zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
     probed = unfreeze(_rescaled(field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
 
     predicted = rollout_batch(probed, x, u[:, None], windows.dt)[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
     output = _positive(lacking, FLOOR * rate)
 
-    seen = zip(batch_norms(probed), moments_of(probed, x.T, u.T), strict=True)
+    seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x.T, u.T), strict=True)
     moments = [np.asarray(part) for norm, part in seen if isinstance(norm, _Probe)]
     scalings = []
     for network, (count, *sums) in zip(networks, moments, strict=True):
