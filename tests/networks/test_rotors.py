@@ -12,8 +12,10 @@ from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.factory import INPUTS, make_residual
 from hybrid_jax.networks.mlp import InputScaling, residual_network
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 KEY = jax.random.key(0)
@@ -87,3 +89,11 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     moved = Hybrid(rigid_body(IRIS), jax.tree.map(lambda leaf: leaf + 0.1, field))
     save(tmp_path / "model.npz", moved)
     assert eqx.tree_equal(load(tmp_path / "model.npz").field, moved)
+
+
+def test_what_all_rotors_read_is_scaled_by_windows():
+    x, u = samples()
+    windows = Trajectories(x.T, u.T[:, None], x.T[:, None], 0.01)
+    scaling = with_scaling(make_residual(KEY, outputs="rotors", hidden=5, vehicle=IRIS), windows).physics.field.scaling
+    np.testing.assert_allclose(scaling.offset, [shared().read(x).mean(), u.mean()], rtol=1e-5)
+    assert scaling.is_set
