@@ -36,12 +36,13 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
     force = _specific_force(vehicle, constants, velocity, torque)
     faster = _velocity_error(constants, velocity, force)
+    turning = rotation.derivative(q, omega)
     torque = _with_aerodynamic_moments(constants, velocity, omega, torque)
     inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
     return jnp.concatenate(
         [
             jnp.stack(v) + in_world(attitude, faster) if is_present(faster) else jnp.stack(v),
-            rotation.derivative(q, omega),
+            turning,
             acceleration + in_world(attitude, force) if is_present(force) else acceleration,
             _euler(inertia, torque, omega),
         ]
@@ -52,7 +53,7 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
     """Total thrust [N] and torque [N m] of the rotors about the centre of mass: thrust × arm, and c_m u²."""
     squares = [speed * speed for speed in u]
     (k,), of_rotors, gain = constants["k"], constants["k_rotors"], constants["torque_gain"]
-    if isinstance(of_rotors[0], float):
+    if isinstance(of_rotors[0], int | float):
         loads = squares
     else:
         k, loads = 1.0, [one * square for one, square in zip(of_rotors, squares, strict=True)]
@@ -126,7 +127,7 @@ def dot(a, b) -> Array:
 
 def is_present(term, absent: float = 0.0) -> bool:
     """Whether a term is learned, or known and does something."""
-    return any(not isinstance(number, float) or number != absent for number in term)
+    return any(not isinstance(number, int | float) or number != absent for number in term)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
