@@ -192,8 +192,7 @@ def rollout_minibatch(
 ) -> Float[Array, "t d b"]:
     """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
 
-    A field that is written for one sample is integrated samples first: to transpose its arrays in each evaluation
-    would cost up to half of the step.
+    A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
     """
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations

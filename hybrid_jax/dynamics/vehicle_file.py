@@ -38,7 +38,7 @@ class VehicleModel:
         learn: names of `multirotor.SHAPES`, and "motor_time_constant" to choose the rotors' lag from logs.
 
     Raises:
-        ValueError: an unknown name in `learn`.
+        ValueError: as `check_learned`.
     """
 
     vehicle: Vehicle

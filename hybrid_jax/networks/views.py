@@ -1,8 +1,7 @@
 """Views restrict what a multirotor's residual reads of the state and which derivatives it returns.
 
 A view is a vector field around another one: it passes features of x to it and maps its output to ẋ. Views nest: the
-outer one selects the inputs, the inner one the outputs. A network cannot overfit an input that it does not read: drag
-is independent of position, and drag and ground effect of yaw. Derivatives that it does not return remain those of the
+outer one selects the inputs, the inner one the outputs. Derivatives that a network does not return remain those of the
 physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for the estimates in a log (see `Motion`).
 """
 
