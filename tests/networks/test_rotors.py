@@ -10,8 +10,9 @@ from hybrid_jax import load, rotation, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.factory import INPUTS, make_residual
-from hybrid_jax.networks.mlp import InputScaling, residual_network
+from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork, residual_network
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.scaling import ChannelScaling
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
@@ -94,6 +95,10 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
 def test_what_all_rotors_read_is_scaled_by_windows():
     x, u = samples()
     windows = Trajectories(x.T, u.T[:, None], x.T[:, None], 0.01)
-    scaling = with_scaling(make_residual(KEY, outputs="rotors", hidden=5, vehicle=IRIS), windows).physics.field.scaling
+    field = with_scaling(make_residual(KEY, outputs="rotors", hidden=5, vehicle=IRIS), windows)
+    assert isinstance(field, Hybrid)
+    assert isinstance(field.physics, RotorThrust)
+    assert isinstance(field.physics.field, ResidualNetwork)
+    scaling = field.physics.field.scaling
+    assert isinstance(scaling, ChannelScaling)
     np.testing.assert_allclose(scaling.offset, [shared().read(x).mean(), u.mean()], rtol=1e-5)
-    assert scaling.is_set
