@@ -101,4 +101,5 @@ def test_what_all_rotors_read_is_scaled_by_windows():
     assert isinstance(field.physics.field, ResidualNetwork)
     scaling = field.physics.field.scaling
     assert isinstance(scaling, ChannelScaling)
+    assert scaling.offset is not None
     np.testing.assert_allclose(scaling.offset, [shared().read(x).mean(), u.mean()], rtol=1e-5)
