@@ -49,7 +49,7 @@ from hybrid_jax.flights import load_log, load_windows
 from hybrid_jax.integrate import RK4, SOLVERS, rollout, rollout_batch
 from hybrid_jax.io import Model, check_savable, load, portable, save
 from hybrid_jax.networks import residual_network
-from hybrid_jax.networks.scaling import with_scaling
+from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.training import Settings, Stage, fit, fit_in_stages, rates_by_group
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, Vehicle, load_vehicle

@@ -21,7 +21,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_
 from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
-
+Solver = diffrax.AbstractSolver
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _train, _infer = eqx.filter_jit(train_batch), eqx.filter_jit(infer_batch)
@@ -54,12 +54,7 @@ class RK4(diffrax.AbstractSolver):
 
 
 def integrate(
-    derivative: Derivative,
-    x0: Float[Array, " d *b"],
-    u: Float[Array, "t m *b"],
-    dt: float,
-    solver: diffrax.AbstractSolver,
-    substeps: int = 1,
+    derivative: Derivative, x0: Float[Array, " d *b"], u: Float[Array, "t m *b"], dt: float, solver: Solver, substeps=1
 ) -> Float[Array, "t d *b"]:
     """The states at the end of each of t intervals of length dt [s], solver steps of dt / substeps."""
     solver = _prepared(solver, jnp.result_type(x0))
@@ -91,7 +86,7 @@ def rk4_step(
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
 
 
-def _prepared(solver: diffrax.AbstractSolver, dtype) -> diffrax.AbstractSolver:
+def _prepared(solver: Solver, dtype) -> Solver:
     """The solver with tolerances for its root finder, and with its stages in a loop of bounded length.
 
     Diffrax takes tolerances from an adaptive step size controller, which fixed steps have not. Its default, a
@@ -114,7 +109,7 @@ def rollout(
     x0: Float[Array | np.ndarray, " d"],
     u: Float[Array | np.ndarray, "t m"],
     dt: float,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: Solver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "t d"]:
     """The trajectory of a field in inference mode: x[i] is the state (i + 1) dt after x0, u[i] the input until then.
@@ -140,14 +135,10 @@ def rollout_batch(
     x0: Float[Array | np.ndarray, "n d"],
     u: Float[Array | np.ndarray, "n t m"],
     dt: float,
-    solver: diffrax.AbstractSolver | None = None,
+    solver: Solver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "n t d"]:
-    """`rollout` of each of n windows.
-
-    Raises:
-        ValueError: as `rollout`.
-    """
+    """`rollout` of each of n windows."""
     x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field):
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
@@ -158,12 +149,8 @@ def rollout_batch(
 
 def checked(
     field, x0, u, dt, solver, substeps: int = 1, *, windows: bool = False
-) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], diffrax.AbstractSolver]:
-    """x0 in the precision of ẋ, u, and the solver or the default one.
-
-    Raises:
-        ValueError: as `rollout`.
-    """
+) -> tuple[Float[Array, "*n d"], Float[Array, "*n t m"], Solver]:
+    """x0 in the precision of ẋ, u, and the solver or the default one, after the checks of `rollout`."""
     x0, u = checks.floating("x0", x0), checks.floating("u", u)
     expected = "x0 (n, d) and u (n, t, m)" if windows else "x0 (d,) and u (t, m)"
     if x0.ndim != 1 + windows or u.ndim != x0.ndim + 1 or u.shape[:-2] != x0.shape[:-1]:
@@ -176,25 +163,19 @@ def checked(
     # A step starts at time zero, of which a multistep method would remember the wrong ones.
     if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
-    slope = check_field(
-        field, jax.ShapeDtypeStruct(x0.shape[-1:], x0.dtype), jax.ShapeDtypeStruct(u.shape[-1:], u.dtype)
-    )
+    slope = check_field(field, *(jax.ShapeDtypeStruct(part.shape[-1:], part.dtype) for part in (x0, u)))
     return x0.astype(jnp.result_type(x0.dtype, slope.dtype)), u, solver
 
 
 def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
-    """Shape and type of ẋ = field(x, u).
-
-    Raises:
-        ValueError: the field does not accept them, or does not return ẋ of the shape of x.
-    """
+    """Shape and type of ẋ = field(x, u); ValueError if the field does not map x and u to ẋ of the shape of x."""
     name = getattr(field, "__name__", type(field).__name__)
     given = f"a state {x.shape} and an input {u.shape}"
     try:
         slope = eqx.filter_eval_shape(field, x, u)
     except Exception as error:  # a user's code may raise anything
-        said = f"{type(error).__name__}: {checks.first_line(error)}"
-        raise ValueError(f"field: {name} does not take {given}: {said}") from error
+        reason = f"{type(error).__name__}: {checks.first_line(error)}"
+        raise ValueError(f"field: {name} does not take {given}: {reason}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):
         found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__
         raise ValueError(f"field: {name} must return a derivative {x.shape} for {given}, returned {found}")
@@ -206,24 +187,22 @@ def rollout_minibatch(
     x0: Float[Array, "d b"],
     u: Float[Array, "t m b"],
     dt: float,
-    solver: diffrax.AbstractSolver,
+    solver: Solver,
     substeps: int = 1,
 ) -> Float[Array, "t d b"]:
     """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
 
-    A field that is written for one sample is integrated samples first: to transpose its arrays in each evaluation
-    would cost up to half of the step.
+    A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
     """
-    coupled = isinstance(solver, diffrax.AbstractImplicitSolver) and batch_norms(field)  # one system of equations
-    apart = isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field)
-    if apart and not coupled:
-        alone = training_mode(field)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations
+        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
+    alone = training_mode(field)
 
-        def one_window(x0, u):
-            return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
+    def one_window(x0, u):
+        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
 
-        return over_samples(one_window)(x0, u)
-    return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
+    return over_samples(one_window)(x0, u)
 
 
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
@@ -232,7 +211,7 @@ def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t 
     return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], -1) for a in (starts, u))
 
 
-SOLVERS: dict[str, diffrax.AbstractSolver] = {
+SOLVERS: dict[str, Solver] = {
     "rk4": RK4(),
     "heun": diffrax.Heun(),
     "midpoint": diffrax.Midpoint(),

@@ -2,12 +2,14 @@
 
 import math
 import tomllib
-from collections.abc import Callable, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from hybrid_jax import checks
+
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -41,21 +43,17 @@ class Vehicle:
     name: str = "vehicle"
 
     def __post_init__(self):
-        for name in ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity"):
-            _require_positive(name, getattr(self, name))
-        if self.rotor_radius != 0 or isinstance(self.rotor_radius, bool):
-            _require_positive("rotor_radius", self.rotor_radius, "a finite number of at least 0")
-        if not isinstance(self.inertia, tuple) or len(self.inertia) != 3:
-            raise ValueError(
-                f"inertia must be a tuple of three moments (Ix, Iy, Iz), got {checks.short_repr(self.inertia)}"
-            )
-        for name, moment in zip(("Ix", "Iy", "Iz"), self.inertia, strict=True):
-            _require_positive(f"inertia {name}", moment)
-        if not _is_four(self.rotor_positions, _is_point):
-            got = checks.short_repr(self.rotor_positions)
-            raise ValueError(f"rotor_positions must be a tuple of four pairs (x, y) [m], got {got}")
-        if not _is_four(self.spin, lambda sign: _is_finite(sign) and abs(sign) == 1):
+        require_numbers("inertia", self.inertia, (3,), "a tuple of three moments (Ix, Iy, Iz)")
+        require_numbers("rotor_positions", self.rotor_positions, (4, 2), "a tuple of four pairs (x, y) [m]")
+        require_numbers("spin", self.spin, (4,), "a tuple of four signs +1 or -1")
+        if any(abs(sign) != 1 for sign in self.spin):
             raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {checks.short_repr(self.spin)}")
+        positive = ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity")
+        numbers = {name: getattr(self, name) for name in (*positive, "rotor_radius")}
+        moments = zip(("Ix", "Iy", "Iz"), self.inertia, strict=True)
+        for name, value in (numbers | {f"inertia {axis}": moment for axis, moment in moments}).items():
+            require_numbers(name, value, (), "a finite number")
+            (checks.not_negative if name == "rotor_radius" else checks.positive)(name, value)
         if not isinstance(self.name, str):
             raise ValueError(f"name must be text, got {checks.short_repr(self.name)}")
 
@@ -79,11 +77,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:
-    """Read the tables of a TOML file.
-
-    Raises:
-        ValueError: the file and why it is not readable, in one line.
-    """
+    """The tables of a TOML file; ValueError if it is not readable."""
     try:
         return tomllib.loads(Path(path).read_bytes().decode())
     except (OSError, ValueError, RecursionError) as error:
@@ -91,56 +85,56 @@ def read_tables(path: str | Path) -> dict[str, Any]:
 
 
 def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> Vehicle:
-    """As `load_vehicle`, of the tables of a file that was read already.
-
-    Raises:
-        ValueError: as `load_vehicle`.
-    """
+    """As `load_vehicle`, of the tables of a file that was read already."""
     table = tables.get("vehicle")
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
-    known = {field.name for field in fields(Vehicle)}
-    changes = {key: table[key] for key in table.keys() - known if isinstance(table[key], dict)}
+    changes = {key: table[key] for key in table.keys() - names_of(Vehicle) if isinstance(table[key], dict)}
     if variant is not None and variant not in changes:
         found = ", ".join(sorted(map(repr, changes))) or "none"
         raise ValueError(f"{path}: has no table [vehicle.{variant}]; its variants are {found}")
     common = {key: value for key, value in table.items() if key not in changes}
-    vehicle = _made(common, f"{path}: [vehicle]")
-    variants = {name: _made(common | changes[name], f"{path}: [vehicle.{name}]") for name in sorted(changes)}
+    vehicle = from_table(Vehicle, common, f"{path}: [vehicle]")
+    variants = {
+        name: from_table(Vehicle, common | changes[name], f"{path}: [vehicle.{name}]") for name in sorted(changes)
+    }
     return vehicle if variant is None else variants[variant]
 
 
-def _made(table: dict[str, Any], where: str) -> Vehicle:
-    known = [field.name for field in fields(Vehicle)]
-    unknown = sorted(repr(key) for key in table.keys() - set(known))
-    if unknown:
-        raise ValueError(f"{where}: {', '.join(unknown)}: must be one of {', '.join(known)}")
-    missing = [field.name for field in fields(Vehicle) if field.default is MISSING and field.name not in table]
-    if missing:
+def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
+    """A dataclass from a table of TOML; ValueError, after `where`, for a wrong or missing key or a refused value."""
+    require_known(where, table, names_of(cls))
+    if missing := [name for name, required in names_of(cls).items() if required and name not in table]:
         raise ValueError(f"{where}: {', '.join(missing)}: must be given")
     try:
-        return Vehicle(**{key: as_tuple(value) for key, value in table.items()})
+        return cls(**{key: as_tuple(value) for key, value in table.items()})
     except ValueError as error:
         raise ValueError(f"{where}: {checks.first_line(error)}") from error
 
 
-def _require_positive(name: str, value: Any, what: str = "a positive finite number") -> None:
-    if not isinstance(value, int | float):  # NumPy's scalars are refused: a vehicle is hashed and written to files
+def names_of(cls: Any) -> dict[str, bool]:
+    """The names of the fields of a dataclass, and whether they must be given."""
+    return {field.name: field.default is MISSING and field.default_factory is MISSING for field in fields(cls)}
+
+
+def require_known(where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:
+    """Raise ValueError if the table has other keys."""
+    if unknown := sorted(repr(key) for key in table.keys() - set(known)):
+        raise ValueError(f"{where}: {', '.join(unknown)}: must be one of {', '.join(known)}")
+
+
+def require_numbers(name: str, value: Any, shape: tuple[int, ...], what: str) -> None:
+    """Raise ValueError unless the value is a finite number, or nested tuples of them of this shape."""
+
+    def fits(value: Any, shape: tuple[int, ...]) -> bool:
+        if shape:
+            return isinstance(value, tuple) and len(value) == shape[0] and all(fits(part, shape[1:]) for part in value)
+        # NumPy's scalars are refused: a vehicle is hashed and written to files.
+        number = checks.real(value) if isinstance(value, int | float) else None
+        return number is not None and abs(number) <= checks.LARGEST
+
+    if not fits(value, shape):
         raise ValueError(f"{name} must be {what}, got {checks.short_repr(value)}")
-    checks.positive(name, value, what)
-
-
-def _is_finite(value: Any) -> bool:
-    number = checks.real(value) if isinstance(value, int | float) else None
-    return number is not None and abs(number) <= checks.LARGEST
-
-
-def _is_point(value: Any) -> bool:
-    return isinstance(value, tuple) and len(value) == 2 and all(_is_finite(number) for number in value)
-
-
-def _is_four(values: Any, is_right: Callable[[Any], bool]) -> bool:
-    return isinstance(values, tuple) and len(values) == 4 and all(is_right(value) for value in values)
 
 
 def as_tuple(value: Any) -> Any:

@@ -117,10 +117,6 @@ def test_unknown_variant_is_refused_with_the_known_ones(with_payload):
         load_vehicle(with_payload("mass = 2.0"), "load")
 
 
-def test_wrong_moment_is_named(written):
-    assert "Iy" in refusal(written(inertia="[0.1, -0.1, 0.1]"))
-
-
 def test_unknown_key_is_refused_with_the_known_ones(written):
     """A misspelt optional constant would silently keep its default."""
     assert "'gravitty': must be one of mass, inertia, thrust_coefficient," in refusal(written(gravitty="1.6"))

@@ -41,11 +41,11 @@ class AbstractVectorField(eqx.Module):
 
     def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         """See the function `train_batch`, as for the methods that follow."""
-        direct = self.accepts_batch and not batch_norms(self)
+        direct = features_first(self) and not batch_norms(self)
         return self(x, u) if direct else over_samples(training_mode(self))(x, u)
 
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
-        return self(x, u) if self.accepts_batch else over_samples(self)(x, u)
+        return self(x, u) if features_first(self) else over_samples(self)(x, u)
 
     def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
         return with_moved_stats(self, x, u)
@@ -60,22 +60,24 @@ class AbstractVectorField(eqx.Module):
         return self
 
 
+def _methods_of(field) -> type[AbstractVectorField]:
+    """The class whose methods evaluate a field: the defaults for what is no `AbstractVectorField`."""
+    return type(field) if isinstance(field, AbstractVectorField) else AbstractVectorField
+
+
 def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
-    if isinstance(field, AbstractVectorField):
-        return field.train_batch(x, u)
-    return over_samples(training_mode(field))(x, u)
+    return _methods_of(field).train_batch(field, x, u)
 
 
 def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ of many samples in inference mode."""
-    return field.infer_batch(x, u) if isinstance(field, AbstractVectorField) else over_samples(field)(x, u)
+    return _methods_of(field).infer_batch(field, x, u)
 
 
 def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
     """The field after one training batch: running statistics move, learned parameters do not."""
-    own = isinstance(field, AbstractVectorField)
-    return field.update_running_stats(x, u) if own else with_moved_stats(field, x, u)
+    return _methods_of(field).update_running_stats(field, x, u)
 
 
 def apply_residual(
@@ -85,20 +87,19 @@ def apply_residual(
 
     `Multirotor` also propagates residual forces to the position when it models the lag of a velocity estimator.
     """
-    return field.apply_residual(x, residual) if isinstance(field, AbstractVectorField) else residual
+    return _methods_of(field).apply_residual(field, x, residual)
 
 
 def linearize(
     field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
 ) -> tuple[Float[Array, " d"], Columns]:
     """ẋ of one sample in inference mode, and its derivative along each pair of columns of dx (d, c) and du (m, c)."""
-    own = isinstance(field, AbstractVectorField)
-    return field.linearize(x, u, dx, du) if own else jvp_columns(field, (x, u), (dx, du))
+    return _methods_of(field).linearize(field, x, u, dx, du)
 
 
 def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
     """The same map in inference mode, in a layout that is faster for few samples at a time. Identity by default."""
-    return field.fuse_for_inference() if isinstance(field, AbstractVectorField) else field
+    return _methods_of(field).fuse_for_inference(field)
 
 
 def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
@@ -172,7 +173,9 @@ def features_first(field: AbstractVectorField) -> bool:
             return features_first(field.physics) or features_first(field.residual)
         case Frozen():
             return features_first(field.field)
-    return getattr(field, "accepts_batch", False)
+        case AbstractVectorField():
+            return field.accepts_batch
+    return False
 
 
 def unfreeze(field: AbstractVectorField) -> AbstractVectorField:

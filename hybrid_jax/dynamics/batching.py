@@ -33,7 +33,7 @@ class AbstractBatchNorm(eqx.Module):
 
     @abstractmethod
     def training_mode(self, seen: Moments) -> eqx.Module:
-        """The layer to use for one sample of a minibatch; its moments are recorded by `record(_, seen, _)`."""
+        """The layer to use for one sample of a minibatch, which calls `record_moments(_, seen)`."""
 
     def moved(self, batch: RunningStats) -> Self:
         """This with the running statistics moved towards the minibatch's by the momentum."""
@@ -69,7 +69,7 @@ def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
 def moments_of(field, x: Batch, u: Float[Array, "m b"]) -> list[Moments]:
     """What each `AbstractBatchNorm` records when the field is evaluated on a minibatch.
 
-    The moments are the derivative with respect to an input that does nothing (`record`): they add up through any jit,
+    The moments are the derivative with respect to an input that does nothing (`_record`): they add up through any jit,
     scan or vmap around the layer, where values stored during tracing would leak.
     """
 
@@ -90,19 +90,36 @@ def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
         return field
 
     def moved(norm: AbstractBatchNorm, seen: Moments) -> AbstractBatchNorm:
-        means = (jnp.where(seen[0] > 0, part / seen[0], old) for part, old in zip(seen[1:], _rows(norm), strict=True))
+        old = (norm.running.mean, norm.running.variance)
+        means = (jnp.where(seen[0] > 0, part / seen[0], before) for part, before in zip(seen[1:], old, strict=True))
         return norm.moved(RunningStats(*means))
 
     return _replaced(field, list(map(moved, norms, moments_of(field, x, u))))
 
 
+def record_moments(hidden: Float[Array, " h *a"], seen: Moments):
+    """Mean, centred values and variance of a layer's values over the minibatch; adds the moments to `seen`.
+
+    Call inside `over_samples`. The mean is also over all axes of the sample but the first.
+    """
+    mean, centred = _centred(hidden)
+    variance, _ = _centred(jnp.square(centred))
+    moments = jnp.stack([jnp.ones_like(mean), mean, variance]).astype(seen.dtype)
+    return mean, _record(centred, seen, moments), variance
+
+
+def _centred(hidden):
+    mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
+    return mean, hidden - expand_trailing(mean, hidden)
+
+
 @jax.custom_vjp
-def record(hidden: Float[Array, " h"], seen: Moments, moments: Moments) -> Float[Array, " h"]:
+def _record(hidden: Float[Array, " h *a"], seen: Moments, moments: Moments) -> Float[Array, " h *a"]:
     """`hidden` as it is. In reverse mode the moments are added to the derivative with respect to `seen`."""
     return hidden
 
 
-record.defvjp(
+_record.defvjp(
     lambda hidden, seen, moments: (hidden, moments),
     lambda moments, d_hidden: (d_hidden, moments, jnp.zeros_like(moments)),
 )
@@ -115,10 +132,6 @@ def _stops(node) -> bool:
 def _replaced(tree: PyTree, norms: list) -> PyTree:
     left = iter(norms)
     return jax.tree.map(lambda n: next(left) if isinstance(n, AbstractBatchNorm) else n, tree, is_leaf=_stops)
-
-
-def _rows(norm: AbstractBatchNorm):
-    return norm.running.mean, norm.running.variance
 
 
 def _nothing(norm: AbstractBatchNorm) -> Moments:

@@ -4,7 +4,7 @@ import math
 from dataclasses import dataclass
 
 from hybrid_jax import checks
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import Vehicle, require_numbers
 
 SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
 POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
@@ -19,8 +19,6 @@ SIGNED = {
     "velocity_lag": (),
 }
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters
-
-
 Three = tuple[float, float, float]
 
 
@@ -55,20 +53,25 @@ class Terms:
 
     def __post_init__(self):
         for name, shape in SIGNED.items():
-            object.__setattr__(self, name, _floats(name, getattr(self, name), shape))
+            what = f"a tuple of {shape[0]}{' of 3' if shape[1:] else ''}" if shape else "a finite number"
+            require_numbers(name, getattr(self, name), shape, what)
+            object.__setattr__(self, name, _floats(getattr(self, name)))
         checks.not_negative("motor_time_constant", self.motor_time_constant)
 
 
-def check_names(learn) -> None:
-    """Check the names of learned parameters.
+def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
+    """Check the names of learned parameters, which are those of `SHAPES` and `also`.
 
     Raises:
         ValueError: an unknown name, one given twice, or two that are not identifiable together.
     """
+    if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
+        raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
+    known = (*SHAPES, *also)
     for name in learn:
-        if name not in tuple(SHAPES):
-            raise ValueError(f"learn must be names of {', '.join(SHAPES)}, got {checks.short_repr(name)}")
-    if len(set(learn)) != len(tuple(learn)):
+        if name not in known:
+            raise ValueError(f"learn must be names of {', '.join(known)}, got {checks.short_repr(name)}")
+    if len(set(learn)) != len(learn):
         raise ValueError(f"learn must not name a parameter twice, got {', '.join(learn)}")
     if {"k", "k_rotors"} <= set(learn):
         raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
@@ -103,13 +106,5 @@ def _flat(value) -> tuple[float, ...]:
     return tuple(number for row in value for number in _flat(row)) if isinstance(value, tuple) else (value,)
 
 
-def _floats(name: str, value, shape: tuple[int, ...]):
-    """Python's own floats, alone or in nested tuples, which can be hashed and written to files."""
-    if not shape:
-        checks.number(name, value)
-        return float(value)
-    if not isinstance(value, tuple) or len(value) != shape[0]:
-        raise ValueError(
-            f"{name} must be a tuple of {shape[0]}{' of 3' if shape[1:] else ''}, got {checks.short_repr(value)}"
-        )
-    return tuple(_floats(name, part, shape[1:]) for part in value)
+def _floats(value):
+    return tuple(map(_floats, value)) if isinstance(value, tuple) else float(value)

@@ -14,15 +14,15 @@ drag = [0.01, 0.01, 0.0]
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import LEARNED
-from hybrid_jax.dynamics.terms import SHAPES, Terms, check_names
-from hybrid_jax.vehicle import Vehicle, as_tuple, read_tables, vehicle_of
+from hybrid_jax.dynamics.terms import Terms, check_names
+from hybrid_jax.vehicle import Vehicle, from_table, read_tables, require_known, vehicle_of
 
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.rotor_lag`
 TABLES = ("vehicle", "learn", "terms")
@@ -38,7 +38,7 @@ class VehicleModel:
         learn: names of `multirotor.SHAPES`, and "motor_time_constant" to choose the rotors' lag from logs.
 
     Raises:
-        ValueError: an unknown name in `learn`.
+        ValueError: as `check_learned`.
     """
 
     vehicle: Vehicle
@@ -54,16 +54,8 @@ class VehicleModel:
 
 
 def check_learned(learn: tuple[str, ...]) -> None:
-    """Check the names of parameters to learn.
-
-    Raises:
-        ValueError: the known names, or names that exclude each other.
-    """
-    if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
-        raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
-    if learn.count(LAG) > 1 or not set(learn) <= {*SHAPES, LAG}:
-        raise ValueError(f"learn must be names of {', '.join([*SHAPES, LAG])}, each once, got {', '.join(learn)}")
-    check_names(learned_by_field(learn))
+    """Raise ValueError for names that are unknown or exclude each other."""
+    check_names(learn, also=(LAG,))
 
 
 def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
@@ -87,27 +79,13 @@ def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleM
 
 def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str | None = None) -> VehicleModel:
     """As `load_vehicle_model`, of the tables of a file that was read already."""
-    _require_known(f"{path}:", tables, TABLES)
-    if "learn" in (tables["vehicle"] if isinstance(tables.get("vehicle"), dict) else {}):
+    require_known(str(path), tables, TABLES)
+    vehicle, terms = tables.get("vehicle"), tables.get("terms", {})
+    if isinstance(vehicle, dict) and "learn" in vehicle:
         raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
-    vehicle = vehicle_of(tables, path, variant)
-    try:
-        return VehicleModel(vehicle, _terms(tables.get("terms", {})), as_tuple(tables.get("learn", [*LEARNED])))
-    except ValueError as error:
-        raise ValueError(f"{path}: {checks.first_line(error)}") from error
-
-
-def _terms(table: Any) -> Terms:
-    if not isinstance(table, dict):
-        raise ValueError(f"terms must be a table [terms], got {checks.short_repr(table)}")
-    _require_known("[terms]:", table, [entry.name for entry in fields(Terms)])
-    try:
-        return Terms(**{key: as_tuple(value) for key, value in table.items()})
-    except ValueError as error:
-        raise ValueError(f"[terms]: {checks.first_line(error)}") from error
-
-
-def _require_known(where: str, table: Mapping[str, Any], known) -> None:
-    unknown = sorted(repr(key) for key in table.keys() - set(known))
-    if unknown:
-        raise ValueError(f"{where} {', '.join(unknown)}: must be one of {', '.join(known)}")
+    if not isinstance(terms, dict):
+        raise ValueError(f"{path}: terms must be a table [terms], got {checks.short_repr(terms)}")
+    vehicle, terms = vehicle_of(tables, path, variant), from_table(Terms, terms, f"{path}: [terms]")
+    return from_table(
+        VehicleModel, {"vehicle": vehicle, "terms": terms, "learn": tables.get("learn", LEARNED)}, str(path)
+    )

@@ -1,7 +1,6 @@
 """`make_residual`: a residual network for a multirotor by the names of its inputs and outputs."""
 
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,36 +10,23 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
 from hybrid_jax.networks.rotor_thrust import RotorThrust
 from hybrid_jax.networks.scaling import AbstractScaling
-from hybrid_jax.networks.views import (
-    Accelerations,
-    BodyFrame,
-    BodyMotion,
-    DropXY,
-    DropXYYaw,
-    GroundDistance,
-    Motion,
-)
+from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
-
-def _unchanged(field: AbstractVectorField) -> AbstractVectorField:
-    return field
-
-
 Wrapper = Callable[..., AbstractVectorField]
 
-# Name → number of features that the network reads besides u, or of outputs, and the view around it.
-INPUTS: dict[str, tuple[int, Wrapper]] = {
-    "all": (STATE_SIZE, _unchanged),
+# Name → number of features that the network reads besides u, or of outputs, and the view around it if any.
+INPUTS: dict[str, tuple[int, Wrapper | None]] = {
+    "all": (STATE_SIZE, None),
     "no_xy": (STATE_SIZE - 2, DropXY),
     "no_xy_yaw": (10, DropXYYaw),
     "near_ground": (14, GroundDistance),
     "body": (10, BodyFrame),
     "body_motion": (9, BodyMotion),
 }
-OUTPUTS: dict[str, tuple[int, Wrapper]] = {
-    "all": (STATE_SIZE, _unchanged),
+OUTPUTS: dict[str, tuple[int, Wrapper | None]] = {
+    "all": (STATE_SIZE, None),
     "accelerations": (6, Accelerations),
     "rotors": (6, Accelerations),
     "angular_acceleration": (3, Accelerations),
@@ -90,13 +76,11 @@ def make_residual(
     if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
         raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
     network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
-    both = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
-    seeing = partial(seen, vehicle=vehicle) if seen is GroundDistance else seen
-    view = seeing(written(both))
-    return Hybrid(_rotor_thrust(key, hidden, scaling, vehicle), view) if outputs == "rotors" else view
-
-
-def _rotor_thrust(key: PRNGKeyArray, hidden: int, scaling: AbstractScaling | None, vehicle: Vehicle | None):
-    assert vehicle is not None
-    network = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
-    return zero_output(RotorThrust(network, vehicle))
+    field = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
+    field = field if written is None else written(field)
+    if seen is not None:
+        field = seen(field, vehicle) if seen is GroundDistance else seen(field)
+    if vehicle is None or outputs != "rotors":
+        return field
+    thrust = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
+    return Hybrid(zero_output(RotorThrust(thrust, vehicle)), field)

@@ -48,17 +48,3 @@ class FusedNetwork(AbstractVectorField):
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
         jacobian = jnp.where(hidden > 0, self.weight_out.T, 0) @ weight.T + skip.T
         return jax.nn.relu(hidden) @ self.weight_out + linear, jacobian @ dz
-
-
-def fused(
-    weight_in: Float[Array, "h m"],
-    bias_in: Float[Array, " h"],
-    weight_out: Float[Array, "d h"],
-    bias_out: Float[Array, " d"],
-    linear: Float[Array, "d m"],
-    scaling: AbstractScaling,
-) -> FusedNetwork:
-    """W₂ relu(W₁ z + c) + A z + b from W₁, c, W₂, b and A."""
-    return FusedNetwork(
-        jnp.concatenate([weight_in, linear]).T, jnp.concatenate([bias_in, bias_out]), weight_out.T, scaling
-    )

@@ -14,7 +14,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import RunningStats
-from hybrid_jax.networks.fused import FusedNetwork, fused
+from hybrid_jax.networks.fused import FusedNetwork
 from hybrid_jax.networks.normalisation import AbstractAffineNorm, AbstractNorm, BatchNorm, Bias, LayerNorm, affine
 from hybrid_jax.networks.scaling import AbstractScaling, ChannelScaling, InputScaling
 
@@ -32,6 +32,16 @@ class ResidualNetwork(AbstractVectorField):
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
+
+    @property
+    def state_size(self) -> int:
+        """d, where the network is a field by itself."""
+        return len(self.bias_out)
+
+    @property
+    def input_size(self) -> int:
+        """m, where the network is a field by itself."""
+        return self.weight_in.shape[1] - len(self.bias_out)
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
@@ -60,7 +70,9 @@ class ResidualNetwork(AbstractVectorField):
         if not isinstance(self.norm, AbstractAffineNorm):
             return None
         weight_out, bias_out = self.scaling.outputs(self.weight_out), self.scaling.outputs(self.bias_out)
-        return fused(*self.norm.fold(self.weight_in), weight_out, bias_out, linear, self.scaling)
+        weight_in, bias_in = self.norm.fold(self.weight_in)
+        weight, bias = jnp.concatenate([weight_in, linear]).T, jnp.concatenate([bias_in, bias_out])
+        return FusedNetwork(weight, bias, weight_out.T, self.scaling)
 
 
 class LinearResidual(AbstractVectorField):
@@ -112,7 +124,7 @@ def residual_network(
     """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
 
     Args:
-        scaling: by default read off the training windows by `hybrid_jax.fit`; see `scaling.with_scaling`.
+        scaling: by default read off the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of what it returns, by default `state_size`.
 
@@ -122,8 +134,7 @@ def residual_network(
     if norm not in tuple(NORMS):
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {checks.short_repr(norm)}")
     outputs = state_size if outputs is None else outputs
-    sizes = {"state_size": state_size, "hidden": hidden, "outputs": outputs}
-    for name, size in sizes.items():
+    for name, size in {"state_size": state_size, "hidden": hidden, "outputs": outputs}.items():
         checks.count(name, size)
     checks.count("input_size", input_size, least=0)
     checks.key("key", key)
@@ -143,18 +154,10 @@ def _batch_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> BatchNorm:
     return BatchNorm(gain=jnp.ones(hidden), shift=jnp.zeros(hidden), running=running)
 
 
-def _layer_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> LayerNorm:
-    return LayerNorm(jnp.ones(hidden), jnp.zeros(hidden))
-
-
-def _bias(hidden: int, fan_in: int, key: PRNGKeyArray) -> Bias:
-    return Bias(_uniform(key, (hidden,), fan_in))
-
-
 NORMS: dict[str, Callable[[int, int, PRNGKeyArray], AbstractNorm]] = {
     "batch": _batch_norm,
-    "layer": _layer_norm,
-    "none": _bias,
+    "layer": lambda hidden, fan_in, key: LayerNorm(jnp.ones(hidden), jnp.zeros(hidden)),
+    "none": lambda hidden, fan_in, key: Bias(_uniform(key, (hidden,), fan_in)),
 }
 
 
@@ -175,12 +178,12 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
     if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
         raise ValueError(f"field: there is no ResidualNetwork in {checks.short_repr(field)}")
 
+    def outputs(network):
+        return network.weight_out, network.bias_out
+
     def zeroed(node):
         if isinstance(node, LinearSkip):
             return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
-        if not is_network(node):
-            return node
-        zeros = jnp.zeros_like(node.weight_out), jnp.zeros_like(node.bias_out)
-        return eqx.tree_at(lambda network: (network.weight_out, network.bias_out), node, zeros)
+        return eqx.tree_at(outputs, node, replace_fn=jnp.zeros_like) if is_network(node) else node
 
     return jax.tree.map(zeroed, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearSkip))

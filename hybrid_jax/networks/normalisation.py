@@ -12,15 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.batching import (
-    SAMPLES,
-    AbstractBatchNorm,
-    Batch,
-    Moments,
-    RunningStats,
-    expand_trailing,
-    record,
-)
+from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
 from hybrid_jax.networks.batchnorm_vjp import normalised_layer, row_means
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
@@ -33,9 +25,7 @@ class AbstractNorm(eqx.Module):
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The normalised W z of each sample in inference mode."""
 
-    def train_layers(
-        self, weight_in: Float[Array, "h m"], weight_out: Float[Array, "d h"], bias_out: Float[Array, " d"], z: Batch
-    ) -> Batch:
+    def train_layers(self, weight_in, weight_out, bias_out, z: Float[Array, "m b"]) -> Float[Array, "d b"]:
         """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
         return affine(weight_out, bias_out, jax.nn.relu(self.infer(weight_in, z)))
 
@@ -93,17 +83,9 @@ class MinibatchNorm(AbstractNorm):
     epsilon: float = eqx.field(static=True)
 
     def infer(self, weight, z):
-        hidden = product(weight, z)
-        mean, centred = self._centred(hidden)
-        variance, _ = self._centred(jnp.square(centred))
-        hidden = record(centred, self.seen, jnp.stack([jnp.ones_like(mean), mean, variance]))
+        _, hidden, variance = record_moments(product(weight, z), self.seen)
         scale = self.gain * jax.lax.rsqrt(variance + self.epsilon)
         return expand_trailing(scale, hidden) * hidden + expand_trailing(self.shift, hidden)
-
-    def _centred(self, hidden):
-        """The mean over the minibatch and all axes of the sample but the first, and what exceeds it."""
-        mean = jax.lax.pmean(jnp.mean(hidden, axis=tuple(range(1, hidden.ndim))), SAMPLES)
-        return mean, hidden - expand_trailing(mean, hidden)
 
 
 class LayerNorm(AbstractNorm):

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, jvp_columns
+from hybrid_jax.dynamics.equations import dot
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -61,28 +62,19 @@ class RotorThrust(AbstractVectorField):
         """f of each rotor."""
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
-    def write(
-        self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"], share: Float[Array, " 4 *b"]
-    ) -> Float[Array, " 13 *b"]:
+    def write(self, x, u, share: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
         """ẋ from the additional thrust of each rotor, as a share of k u²."""
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
-        torque_x, torque_y = (
-            sum(arm * one for arm, one in zip(arms, thrust, strict=True))
-            for arms in zip(*((y, -x) for x, y in vehicle.rotor_positions), strict=True)
-        )
+        x_moment, y_moment = (dot(arms, thrust) for arms in zip(*vehicle.rotor_positions, strict=True))
         acceleration = sum(thrust) / vehicle.mass * rotation.body_z(x[QUATERNION])
-        turning = jnp.stack([torque_x / vehicle.inertia[0], torque_y / vehicle.inertia[1], jnp.zeros_like(torque_x)])
+        torque = y_moment, -x_moment, jnp.zeros_like(x_moment)
+        turning = jnp.stack([part / moment for part, moment in zip(torque, vehicle.inertia, strict=True)])
         still = jnp.zeros((VELOCITY.start, *turning.shape[1:]), turning.dtype)
         return jnp.concatenate([still, acceleration, turning])
 
 
 def nearness(altitude: Float[Array, "*b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
-    """R / h of each rotor, h at least R / 2.
-
-    Args:
-        altitude: of the body [m].
-        up: the direction of the world's up in the body.
-    """
+    """R / h of each rotor, h at least R / 2, from the body's altitude [m] and the world's up in the body frame."""
     heights = jnp.stack([altitude + x * up[0] + y * up[1] for x, y in vehicle.rotor_positions])
     return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)

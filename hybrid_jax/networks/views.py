@@ -1,12 +1,10 @@
 """Views restrict what a multirotor's residual reads of the state and which derivatives it returns.
 
 A view is a vector field around another one: it passes features of x to it and maps its output to ẋ. Views nest: the
-outer one selects the inputs, the inner one the outputs. A network cannot overfit an input that it does not read: drag
-is independent of position, and drag and ground effect of yaw. Derivatives that it does not return remain those of the
+outer one selects the inputs, the inner one the outputs. Derivatives that a network does not return remain those of the
 physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for the estimates in a log (see `Motion`).
 """
 
-from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
@@ -24,7 +22,7 @@ from hybrid_jax.dynamics.base import (
     update_running_stats,
 )
 from hybrid_jax.networks.rotor_thrust import nearness
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 Features = Float[Array, " n *b"]
@@ -35,15 +33,18 @@ class AbstractView(AbstractVectorField):
 
     accepts_batch: ClassVar[bool] = True
 
-    field: eqx.AbstractVar[AbstractVectorField]
+    state_size: ClassVar[int] = STATE_SIZE
+    input_size: ClassVar[int] = INPUT_SIZE
 
-    @abstractmethod
-    def read(self, x: Float[Array, " d *b"]) -> Features:
-        """The features of the state that the field inside reads."""
+    field: AbstractVectorField
 
-    @abstractmethod
-    def write(self, x: Float[Array, " d *b"], inside: Features) -> Features:
-        """ẋ from what the field inside returned."""
+    def read(self, x: Float[Array, " 13 *b"]) -> Features:
+        """The features of the state that the field inside reads; by default all."""
+        return x
+
+    def write(self, x: Float[Array, " 13 *b"], inside: Features) -> Features:
+        """ẋ from what the field inside returned; by default the same."""
+        return inside
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " 13"]:
         return self.write(x, self.field(self.read(x), u))
@@ -69,13 +70,8 @@ class AbstractView(AbstractVectorField):
 class DropXY(AbstractView):
     """Invariant to p_x and p_y: the field inside reads [p_z, q, v, ω] (11)."""
 
-    field: AbstractVectorField
-
     def read(self, x):
         return x[2:]
-
-    def write(self, x, inside):
-        return inside
 
 
 class DropXYYaw(AbstractView):
@@ -85,14 +81,9 @@ class DropXYYaw(AbstractView):
     rates [rad/s] (10), and returns ẋ.
     """
 
-    field: AbstractVectorField
-
     def read(self, x):
         up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
         return jnp.concatenate([x[2:3], up, x[VELOCITY], x[BODY_RATES]])
-
-    def write(self, x, inside):
-        return inside
 
 
 class GroundDistance(AbstractView):
@@ -108,7 +99,6 @@ class GroundDistance(AbstractView):
         ValueError: the vehicle's rotor radius is unknown.
     """
 
-    field: AbstractVectorField
     vehicle: Vehicle = eqx.field(static=True)
 
     def __check_init__(self):
@@ -118,62 +108,44 @@ class GroundDistance(AbstractView):
         up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
         return jnp.concatenate([x[2:3], nearness(x[2], up, self.vehicle), up, x[VELOCITY], x[BODY_RATES]])
 
-    def write(self, x, inside):
-        return inside
 
-
-class BodyFrame(AbstractView):
+class AbstractBodyView(AbstractView):
     """Equivariant to translation in x and y and to yaw: inputs and outputs are in the body frame.
 
-    The field inside reads p_z [m], the direction of gravity (3), the velocity [m/s] (3) and the body rates [rad/s] (3),
-    and returns ṗ and v̇ in the body frame, q̇ as the quaternion r of q̇ = q ⊗ r, and ω̇.
+    The field inside returns ṗ and v̇ in the body frame, q̇ as the quaternion r of q̇ = q ⊗ r, and ω̇.
     """
 
-    field: AbstractVectorField
+    def write(self, x, inside):
+        q = x[QUATERNION]
+        position, velocity = rotation.rotate(q, inside[POSITION]), rotation.rotate(q, inside[VELOCITY])
+        return jnp.concatenate([position, rotation.multiply(q, inside[QUATERNION]), velocity, inside[BODY_RATES]])
+
+
+class BodyFrame(AbstractBodyView):
+    """The field inside reads p_z [m], the direction of gravity (3), the velocity [m/s] and the body rates [rad/s] (10).
+
+    See `AbstractBodyView`.
+    """
 
     def read(self, x):
         to_body = rotation.conjugate(x[QUATERNION])
         gravity = -rotation.body_z(to_body)
         return jnp.concatenate([x[2:3], gravity, rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES]])
 
-    def write(self, x, inside):
-        return _to_world(x[QUATERNION], inside)
 
-
-class BodyMotion(AbstractView):
-    """Equivariant to translation and yaw: `BodyFrame` without the height, for flight away from the ground.
+class BodyMotion(AbstractBodyView):
+    """`BodyFrame` without the height, for flight away from the ground.
 
     The field inside reads the velocity Rᵀv [m/s], the body rates [rad/s] and the world's up Rᵀe_z (9).
     """
-
-    field: AbstractVectorField
 
     def read(self, x):
         to_body = rotation.conjugate(x[QUATERNION])
         return jnp.concatenate([rotation.rotate(to_body, x[VELOCITY]), x[BODY_RATES], rotation.body_z(to_body)])
 
-    def write(self, x, inside):
-        return _to_world(x[QUATERNION], inside)
-
-
-def _to_world(q: Float[Array, " 4 *b"], inside: Features) -> Float[Array, " 13 *b"]:
-    return jnp.concatenate(
-        [
-            rotation.rotate(q, inside[POSITION]),
-            rotation.multiply(q, inside[QUATERNION]),
-            rotation.rotate(q, inside[VELOCITY]),
-            inside[BODY_RATES],
-        ]
-    )
-
 
 class Accelerations(AbstractView):
     """The field inside returns v̇ and ω̇ (6), or ω̇ alone (3); the derivatives before them are exactly zero."""
-
-    field: AbstractVectorField
-
-    def read(self, x):
-        return x
 
     def write(self, x, inside):
         return jnp.concatenate([jnp.zeros((STATE_SIZE - len(inside), *inside.shape[1:]), inside.dtype), inside])
@@ -184,11 +156,6 @@ class Motion(AbstractView):
 
     To be used inside a view that maps to the world frame: there r = ½ [0, δω], so that |q| stays 1.
     """
-
-    field: AbstractVectorField
-
-    def read(self, x):
-        return x
 
     def write(self, x, inside):
         turning = jnp.concatenate([jnp.zeros((1, *inside.shape[1:]), inside.dtype), inside[3:6] / 2])

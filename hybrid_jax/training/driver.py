@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.io.models import check_savable
-from hybrid_jax.networks.scaling import with_scaling
+from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.training.fitting import (
     ADAM,
     RUNNING,

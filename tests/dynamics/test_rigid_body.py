@@ -6,10 +6,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from matrices import newton_euler
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, perturbed, rigid_body
+from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -46,35 +48,16 @@ def samples(count, seed=0):
     return x, rng.uniform(0, 1100, (count, 4))
 
 
-def newton_euler(x, u, vehicle, theta):
-    """Eq. 10 a second time: with matrices, a full inertia tensor and each rotor's force at its place."""
-    w, a, b, c = x[QUATERNION]
-    skew = np.array([[0, -c, b], [c, 0, -a], [-b, a, 0]])
-    attitude = np.eye(3) + 2 * w * skew + 2 * skew @ skew
-    inertia = np.diag([theta["Ix"], theta["Iy"], vehicle.inertia[2]])
-    force, torque = np.zeros(3), np.zeros(3)
-    for (px, py), sign, speed in zip(vehicle.rotor_positions, vehicle.spin, u, strict=True):
-        lift = np.array([0, 0, theta["k"] * speed**2])
-        force += lift
-        torque += np.cross([px, py, 0.0], lift)
-        torque[2] += sign * vehicle.torque_coefficient * speed**2
-    rates = x[BODY_RATES]
-    p, q, r = rates
-    turning = 0.5 * np.array([[0, -p, -q, -r], [p, 0, r, -q], [q, -r, 0, p], [r, q, -p, 0]])
-    acceleration = attitude @ force / vehicle.mass - [0, 0, vehicle.gravity]
-    spin_up = np.linalg.solve(inertia, torque - np.cross(rates, inertia @ rates))
-    return np.concatenate([x[VELOCITY], turning @ x[QUATERNION], acceleration, spin_up])
-
-
 @pytest.mark.parametrize("vehicle", [IRIS, ODD], ids=["iris", "odd"])
 def test_it_is_newton_euler(vehicle):
     logs = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
-    field = RigidBody(logs, vehicle)
-    ix, iy, _ = vehicle.inertia
-    theta = {"Ix": ix * np.exp(0.3), "Iy": iy * np.exp(-0.4), "k": vehicle.thrust_coefficient * np.exp(0.1)}
+    ix, iy, iz = vehicle.inertia
+    true = replace(vehicle, inertia=(float(ix * np.exp(0.3)), float(iy * np.exp(-0.4)), iz))
+    k = vehicle.thrust_coefficient * np.exp(0.1)
     for x, u in zip(*samples(8), strict=True):
         # Round-off of float64 at accelerations of some 1000 rad/s².
-        np.testing.assert_allclose(field(x, u), newton_euler(x, u, vehicle, theta), rtol=1e-12, atol=1e-11)
+        expected = newton_euler(x, u, true, Terms(), [k] * 4)
+        np.testing.assert_allclose(RigidBody(logs, vehicle)(x, u), expected, rtol=1e-12, atol=1e-11)
 
 
 def test_hover_is_an_equilibrium():
@@ -154,29 +137,3 @@ def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
         expected = jax.vmap(field, -1, -1)(x, u)
         for evaluate in (train_batch, infer_batch):
             np.testing.assert_allclose(evaluate(field, x, u), expected, rtol=1e-12, atol=1e-11)
-
-
-def test_a_batch_is_its_columns():
-    field = perturbed(IRIS, jax.random.key(1))
-    x, u = (jnp.asarray(part) for part in samples(6, seed=1))
-    columns = train_batch(field, x.T, u.T)
-    np.testing.assert_allclose(columns.T, jax.vmap(field)(x, u), rtol=1e-13, atol=1e-12)  # another order of sums
-
-
-def test_the_gradient_of_a_minibatch_is_that_of_its_samples():
-    """With respect to θ_p, states and inputs alike."""
-    field, (x, u) = perturbed(IRIS, jax.random.key(1)), (jnp.asarray(part) for part in samples(6, seed=1))
-    weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
-
-    def slope(evaluate):
-        return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x.T, u.T)
-
-    plain = slope(lambda field, x, u: jax.vmap(field, -1, -1)(x, u))
-    for ours, theirs in zip(jax.tree.leaves(slope(train_batch)), jax.tree.leaves(plain), strict=True):
-        np.testing.assert_allclose(ours, theirs, rtol=1e-12, atol=1e-12)
-
-
-def test_single_precision_stays_single():
-    x, u = samples(1)
-    field = jax.tree.map(lambda leaf: leaf.astype(np.float32), rigid_body(IRIS))
-    assert field(jnp.asarray(x[0], np.float32), jnp.asarray(u[0], np.float32)).dtype == np.float32

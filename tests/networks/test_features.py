@@ -58,20 +58,14 @@ def samples(count=7, seed=0):
 
 
 def deployed(field, x, u):
-    return jax.vmap(field, in_axes=-1, out_axes=-1)(x, u)
+    return jax.vmap(field, -1, -1)(x, u)
 
 
 def turned(x, yaw):
     """States, or derivatives of states, turned about the world's vertical."""
     turn = jnp.broadcast_to(rotation.from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.asarray(yaw))[:, None], (4, 1))
-    return jnp.concatenate(
-        [
-            rotation.rotate(turn, x[POSITION]),
-            rotation.multiply(turn, x[QUATERNION]),
-            rotation.rotate(turn, x[VELOCITY]),
-            x[BODY_RATES],
-        ]
-    )
+    position, velocity = rotation.rotate(turn, x[POSITION]), rotation.rotate(turn, x[VELOCITY])
+    return jnp.concatenate([position, rotation.multiply(turn, x[QUATERNION]), velocity, x[BODY_RATES]])
 
 
 def network_of(field):
@@ -141,11 +135,12 @@ def test_near_the_ground_each_rotor_is_as_high_as_in_the_simulator():
     np.testing.assert_array_equal(jnp.delete(seen, np.arange(1, 5), axis=0), view("no_xy_yaw").read(x))
 
 
-def test_near_the_ground_of_an_unknown_vehicle_is_refused():
+@pytest.mark.parametrize("options", [{"inputs": "near_ground"}, {"outputs": "rotors"}], ids=str)
+def test_rotors_of_an_unknown_vehicle_are_refused(options):
     with pytest.raises(ValueError, match="needs the vehicle whose rotors feel the ground, got None"):
-        make_residual(KEY, inputs="near_ground")
+        make_residual(KEY, **options)
     with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
-        view("near_ground", vehicle=replace(IRIS, rotor_radius=0.0))
+        view(**options, vehicle=replace(IRIS, rotor_radius=0.0))
 
 
 def test_the_body_s_view_of_a_state():
@@ -247,9 +242,8 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
 def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
-        one_by_one = jax.vmap(field, -1, -1)(x, u)
-        np.testing.assert_allclose(infer_batch(field, x, u), one_by_one, rtol=0, atol=1e-11)
-        np.testing.assert_allclose(infer_batch(Frozen(field), x, u), one_by_one, rtol=0, atol=1e-11)
+        for same in (field, Frozen(field)):
+            np.testing.assert_allclose(infer_batch(same, x, u), deployed(field, x, u), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), VIEWS)

@@ -1,7 +1,5 @@
 """Laws of the thrust that a network adds to each rotor: with the right function of R / h it is the ground effect."""
 
-from dataclasses import replace
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,10 +10,13 @@ from hybrid_jax import load, rotation, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.factory import INPUTS, make_residual
-from hybrid_jax.networks.mlp import InputScaling, residual_network
+from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork, residual_network
 from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.scaling import ChannelScaling
+from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.sim.forces import ground_effect, parameters_of
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 KEY = jax.random.key(0)
@@ -29,9 +30,8 @@ class CheesemanBennett(AbstractVectorField):
         return 1 / (1 - (x / 4) ** 2) - 1
 
 
-def shared(vehicle=IRIS):
-    """A network that has something to say."""
-    return RotorThrust(residual_network(1, 1, KEY, hidden=7, scaling=HOVER, norm="none"), vehicle)
+def shared():
+    return RotorThrust(residual_network(1, 1, KEY, hidden=7, scaling=HOVER, norm="none"), IRIS)
 
 
 def samples(count=6):
@@ -92,8 +92,14 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     assert eqx.tree_equal(load(tmp_path / "model.npz").field, moved)
 
 
-def test_of_an_unknown_vehicle_it_is_refused():
-    with pytest.raises(ValueError, match="'rotors' needs the vehicle whose rotors feel the ground, got None"):
-        make_residual(KEY, outputs="rotors")
-    with pytest.raises(ValueError, match=r"vehicle\.rotor_radius must be .*got 0"):
-        shared(replace(IRIS, rotor_radius=0.0))
+def test_what_all_rotors_read_is_scaled_by_windows():
+    x, u = samples()
+    windows = Trajectories(x.T, u.T[:, None], x.T[:, None], 0.01)
+    field = with_scaling(make_residual(KEY, outputs="rotors", hidden=5, vehicle=IRIS), windows)
+    assert isinstance(field, Hybrid)
+    assert isinstance(field.physics, RotorThrust)
+    assert isinstance(field.physics.field, ResidualNetwork)
+    scaling = field.physics.field.scaling
+    assert isinstance(scaling, ChannelScaling)
+    assert scaling.offset is not None
+    np.testing.assert_allclose(scaling.offset, [shared().read(x).mean(), u.mean()], rtol=1e-5)

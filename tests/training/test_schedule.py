@@ -12,7 +12,7 @@ from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import zero_output
-from hybrid_jax.networks.scaling import with_scaling
+from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.training.fitting import make_run_config
 from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 from hybrid_jax.vehicle import IRIS

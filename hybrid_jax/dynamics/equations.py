@@ -1,0 +1,157 @@
+"""Equations of motion of a multirotor, for one sample or a minibatch; see `multirotor`.
+
+They take the entries of θ_p, x and u as separate arrays, which spares stacking and unstacking them.
+"""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PyTree
+
+from hybrid_jax import rotation
+from hybrid_jax.dynamics.terms import SHAPES, Terms, nominal_values
+from hybrid_jax.rotation import Rows
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import Vehicle
+
+Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
+
+
+def constants_of(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows]) -> Constants:
+    """Everything in `SHAPES`: the learned value where there is one, else the nominal one."""
+    known = nominal_values(vehicle, terms)
+    return {name: theta.get(name, known[name]) for name in SHAPES}
+
+
+def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+    """ẋ of a multirotor with learned parameters θ_p. Terms that are neither learned nor present cost nothing."""
+    constants = constants_of(vehicle, terms, theta)
+    q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
+    thrust, torque = _wrench(vehicle, constants, u)
+    gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
+    acceleration = (thrust / vehicle.mass) * rotation.body_z(q) + gravity
+    attitude = attitude_matrix(q)
+    velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
+    force = _specific_force(vehicle, constants, velocity, torque)
+    faster = _velocity_error(constants, velocity, force)
+    turning = rotation.derivative(q, omega)
+    torque = _with_aerodynamic_moments(constants, velocity, omega, torque)
+    inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
+    return jnp.concatenate(
+        [
+            jnp.stack(v) + in_world(attitude, faster) if is_present(faster) else jnp.stack(v),
+            turning,
+            acceleration + in_world(attitude, force) if is_present(force) else acceleration,
+            _euler(inertia, torque, omega),
+        ]
+    )
+
+
+def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
+    """Total thrust [N] and torque [N m] of the rotors about the centre of mass: thrust × arm, and c_m u²."""
+    squares = [speed * speed for speed in u]
+    (k,), of_rotors, gain = constants["k"], constants["k_rotors"], constants["torque_gain"]
+    if isinstance(of_rotors[0], int | float):
+        loads = squares
+    else:
+        k, loads = 1.0, [one * square for one, square in zip(of_rotors, squares, strict=True)]
+    total = sum(loads[1:], loads[0])
+    x, y = (dot(arms, loads) for arms in zip(*vehicle.rotor_positions, strict=True))
+    if is_present(constants["centre_of_mass"]):
+        x, y = (moment - offset * total for moment, offset in zip((x, y), constants["centre_of_mass"], strict=True))
+    torque = [k * y, -k * x, constants["torque_coefficient"][0] * dot(vehicle.spin, squares)]
+    if is_present(gain, absent=1.0):
+        torque = [factor * part for factor, part in zip(gain, torque, strict=True)]
+    return k * total, torque
+
+
+def _specific_force(vehicle: Vehicle, constants: Constants, velocity, torque):
+    """Specific force without thrust in the body frame [m/s²]: drag, and a cable that the rotors' torque balances."""
+    drag, pull = constants["drag"], constants["cable_pull"]
+    x, y, z = 0.0, 0.0, 0.0
+    if is_present(drag):
+        x, y, z = (-(factor / vehicle.mass) * part for factor, part in zip(drag, velocity, strict=True))
+    if is_present(pull):
+        x, y = x + pull[0] / vehicle.mass * torque[1], y - pull[1] / vehicle.mass * torque[0]
+    return [x, y, z]
+
+
+def _velocity_error(constants: Constants, velocity, force):
+    """ṗ less the estimated velocity, in the body frame [m/s]."""
+    gain, lag = constants["velocity_gain"], constants["velocity_lag"]
+    x, y, z = 0.0, 0.0, 0.0
+    if is_present(gain, absent=1.0):
+        x, y, z = ((factor - 1.0) * part for factor, part in zip(gain, velocity, strict=True))
+    if is_present(lag):
+        x, y = x + lag[0] * force[0], y + lag[0] * force[1]
+    return [x, y, z]
+
+
+def _with_aerodynamic_moments(constants: Constants, velocity, omega: Rows, torque):
+    moment, damping = constants["aerodynamic_moment"], constants["rate_damping"]
+    if is_present(moment):
+        torque = [part + dot(moment[3 * i : 3 * i + 3], velocity) for i, part in enumerate(torque)]
+    if is_present(damping):
+        torque = [part - one * rate for part, one, rate in zip(torque, damping, omega, strict=True)]
+    return torque
+
+
+def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
+    """ω̇ = J⁻¹ (τ − ω × J ω) for J = diag(Ix, Iy, Iz)."""
+    (ix, iy, iz), (tx, ty, tz), (wx, wy, wz) = inertia, torque, omega
+    return jnp.stack(
+        [(tx - (iz - iy) * wy * wz) / ix, (ty - (ix - iz) * wz * wx) / iy, (tz - (iy - ix) * wx * wy) / iz]
+    )
+
+
+def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
+    """A body vector, of which the entries that are not given are zero, in the world frame."""
+    return jnp.stack([dot(row[: len(parts)], parts) for row in attitude])
+
+
+def attitude_matrix(q: Rows):
+    """The rows of R, which turns body vectors into world vectors (scaled by |q|², as `rotation.rotate`)."""
+    w, x, y, z = q
+    return (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+
+
+def dot(a, b) -> Array:
+    return sum(left * right for left, right in zip(a, b, strict=True))  # type: ignore
+
+
+def is_present(term, absent: float = 0.0) -> bool:
+    """Whether a term is learned, or known and does something."""
+    return any(not isinstance(number, int | float) or number != absent for number in term)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "4 b"]):
+    """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
+
+    Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over
+    the minibatch once for each place where it stands. Here x and u are kept, and each parameter is summed once.
+    """
+    return of_rows(theta, tuple(x), tuple(u))
+
+
+def _columns_forward(of_rows, theta, x, u):
+    return of_rows(theta, tuple(x), tuple(u)), (theta, x, u)
+
+
+def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
+    theta, x, u = saved
+    own = jax.tree.map(lambda parameter: jnp.broadcast_to(parameter, x.shape[1:]), theta)  # one for each column
+    d_own, d_x, d_u = jax.vjp(of_rows, own, tuple(x), tuple(u))[1](d_derivative)
+    leaves, structure = jax.tree.flatten(d_own)
+    if leaves:
+        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype))
+    return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
+
+
+evaluate_columns.defvjp(_columns_forward, _columns_backward)

@@ -1,0 +1,99 @@
+"""Set the scaling of networks from the training windows: inputs of mean 0 and deviation 1, outputs of the size of ẋ."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.dynamics import batching
+from hybrid_jax.dynamics.base import AbstractVectorField, unfreeze
+from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.networks.mlp import ResidualNetwork
+from hybrid_jax.networks.scaling import AbstractScaling, Channels, ChannelScaling
+from hybrid_jax.trajectories import Trajectories
+
+SAMPLES = 10_000  # intervals that are looked at, at most
+FLOOR = 0.01  # least scale of an input over the size of its mean, and of an output over the size of ẋ
+
+
+class _Probe(AbstractBatchNorm, AbstractScaling):
+    """Silences a network in inference mode. In training mode, records the moments of what the network reads."""
+
+    running: RunningStats
+    momentum: float = eqx.field(static=True, default=0.0)
+    seen: batching.Moments | None = None
+
+    def training_mode(self, seen):
+        return _Probe(self.running, seen=seen)
+
+    def concatenate(self, x, u):
+        z = jnp.concatenate([x, u])
+        if self.seen is None:
+            return z
+        mean, centred, _ = batching.record_moments(z, self.seen)
+        return mean + centred
+
+    def outputs(self, y):
+        return jnp.zeros_like(y) if self.seen is None else y
+
+
+def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
+    """The field with every `ChannelScaling` that is not set yet, as `residual_network` makes it, set from windows.
+
+    Inputs are brought to mean 0 and standard deviation 1. If there is one output for each state, outputs are brought
+    to the RMS of the derivative that the rest of the field lacks. A scaling that was given or set stays as it is.
+
+    Args:
+        windows: those that the field is to be trained on.
+    """
+    networks = [node for node in jax.tree.leaves(field, is_leaf=_is_unset) if _is_unset(node)]
+    if not networks:
+        return field
+    x, u, after = _intervals(windows)
+    zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
+    probed = unfreeze(_rescaled(field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
+
+    predicted = rollout_batch(probed, x, u[:, None], windows.dt)[:, 0]
+    lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
+    output = _positive(lacking, FLOOR * rate)
+
+    seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x.T, u.T), strict=True)
+    moments = [np.asarray(part) for norm, part in seen if isinstance(norm, _Probe)]
+    scalings = []
+    for network, (count, *sums) in zip(networks, moments, strict=True):
+        mean, variance = (part / np.maximum(count, 1) for part in sums)
+        scale = _positive(np.sqrt(variance), FLOOR * np.abs(mean))
+        whole = len(network.bias_out) == x.shape[1]
+        scalings.append(ChannelScaling(tuple(mean.tolist()), scale, output if whole else None))
+    return _rescaled(field, scalings)
+
+
+def _is_unset(node) -> bool:
+    return isinstance(node, ResidualNetwork) and isinstance(node.scaling, ChannelScaling) and not node.scaling.is_set
+
+
+def _rescaled(field: AbstractVectorField, scalings: list) -> AbstractVectorField:
+    """The field with these scalings in place of those that are not set."""
+    left = iter(scalings)
+
+    def rescaled(node):
+        return eqx.tree_at(lambda network: network.scaling, node, next(left)) if _is_unset(node) else node
+
+    return jax.tree.map(rescaled, field, is_leaf=_is_unset)
+
+
+def _intervals(windows: Trajectories) -> tuple[Array, Array, Array]:
+    """x, u and the next x of at most `SAMPLES` intervals."""
+    x0, u, after = (jnp.asarray(part) for part in (windows.x0, windows.u, windows.x))
+    before = jnp.concatenate([x0[:, None], after[:, :-1]], axis=1)
+    every = -(-before.shape[0] * before.shape[1] // SAMPLES)
+    x, u, after = (rows.reshape(-1, rows.shape[-1])[::every] for rows in (before, u, after))
+    return x, u, after
+
+
+def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:
+    """The scale of each channel, no less than its floor; 1 where both are zero or the scale is not finite."""
+    scale = np.maximum(scale, floor)
+    return tuple(np.where(np.isfinite(scale) & (scale > 0), scale, 1.0).tolist())
