@@ -98,10 +98,9 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
 ) -> tuple[FitState, RunConfig]:
-    """One run per seed: the encoder of Expert Augmentation, on source flights and on rollouts of the expert.
+    """One run per seed: the encoder of Expert Augmentation, on source flights and on rollouts of the seed's hybrid.
 
     Args:
-        experts: the pre-trained hybrids of all seeds.
         past: the first part of each source window, the input of the encoder.
     """
 

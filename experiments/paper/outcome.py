@@ -16,10 +16,10 @@ from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.introduction import introduction
 from experiments.paper.lanes import save_models
-from experiments.paper.study import EVERY, Study
+from experiments.paper.study import EVERY, Study, study
 from experiments.paper.tables import by_size, parameters, ranking, run_notes
 from experiments.reporting.claims import verdict_table
-from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY
+from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY, label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
@@ -27,26 +27,28 @@ from experiments.runner.environment import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
+from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.vehicle import IRIS
 
 FLIGHT_SECONDS = 11.0
 FLOOR = "wind_sine_mse"  # the key of report.json for the share of L^T_MSE that is the wind's sine
 
 
-def write_outcome(
-    experiment: str, title: str, domain: Domain, config: AdaptationConfig, found: Study, floor: float = 0.0
-) -> None:
-    """Write models, figures and, last, the report; print its tables.
+def adapt_and_report(experiment: str, domain: Domain, floor: float, config: AdaptationConfig, console: Console) -> None:
+    """Run the protocol on a target domain; write models, figures and, last, the report; print its tables.
 
     Args:
         floor: the share of the test error that no model ẋ = f(x, u) can remove.
     """
-    out, truth = config.out / experiment, nominal(domain.vehicle)
-    save_models(out / "models", found.lanes, found.rows)
-    figures = save_figures(out, draw(title, domain, config, found, truth, floor))
+    found = study(domain, IRIS, config, console)
+    if not hosts.is_main_process():
+        return
+    out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
+    save_models(out / "models", found.lanes, rows)
+    figures = save_figures(out, draw(domain, config, found, truth, floor))
     extra = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
-    rows, seconds = found.rows, found.seconds
-    report = paper_report(experiment, config, seconds, rows, truth, figures, found.notes, floor, extra)
+    report = paper_report(experiment, config, found.seconds, rows, truth, figures, found.notes, floor, extra)
     write_report(out, report, Console())
 
 
@@ -67,7 +69,6 @@ def paper_report(
         seconds: of each stage.
         truth: the true θ_p, by domain where there are several.
         figures: caption by file.
-        floor: as in `write_outcome`.
     """
     verdicts = claims(rows, experiment, truth)
     headline = ranking if experiment == COMPARISON else by_size
@@ -87,9 +88,10 @@ def paper_report(
 
 
 def draw(
-    title: str, domain: Domain, config: AdaptationConfig, found: Study, truth: dict[str, float], floor: float
+    domain: Domain, config: AdaptationConfig, found: Study, truth: dict[str, float], floor: float
 ) -> dict[str, tuple[Figure, str]]:
     """Figs. 2/4, 3/5, 7 and the recovered parameters, with captions, by name."""
+    title = label(domain.name).capitalize()
     flight = fly(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
     figures = {

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from experiments.paper.claims import FEW
-from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.paper.lanes import MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
@@ -16,7 +16,7 @@ TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
 EXPERT = (names.EXPERT_AUGMENTATION, SOURCE_ONLY, 0)
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "k": "N/(rad/s)²"}
 # Errors printed in the paper: a mean with its std, or the smallest of ten seeds.
-PAPER: Mapping[str, Mapping[Cell, tuple[float, float | None]]] = {
+PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] = {
     names.PARAMETER_SHIFT: {TUNED: (3.26e-3, 2.66e-5), EXPERT: (3.68e-3, None), PHYSICS: (3.76e-3, None)},
     names.EXTERNAL_FORCE: {TUNED: (2.64e-3, 1.56e-4), EXPERT: (4.02e-3, None), PHYSICS: (4.53e-3, None)},
 }
@@ -37,30 +37,29 @@ def rho_text(rows: Results) -> str:
 
 def by_size(rows: Results) -> list[Table]:
     """Test error and ρ in each domain: a line per N, a column per model and mode."""
-    return [table for place, group in _places(rows) for table in _by_size(group, place)]
 
-
-def _by_size(rows: Results, place: str) -> list[Table]:
-    of = mean_over_seeds(rows)
-    trained = rows.where(mode=(FINE_TUNED, TARGET_ONLY))
-    pairs = {(row["model"], FINE_TUNED if row["mode"] == SOURCE_ONLY else row["mode"]) for row in trained or rows}
-    columns = {
-        # A source-only model is what fine-tuning starts from: it stands at the head of that column.
-        label(model, mode): {"model": model, "mode": (FINE_TUNED, SOURCE_ONLY) if mode == FINE_TUNED else mode}
-        for model in MODELS
-        for mode in (FINE_TUNED, TARGET_ONLY)
-        if (model, mode) in pairs
-    }
-
-    def table(rows: Results, title: str, text: Callable[[Results], str]) -> Table:
+    def table(
+        rows: Results, title: str, columns: Mapping[str, Mapping[str, Any]], text: Callable[[Results], str]
+    ) -> Table:
         groups = rows.sort(n_train=None).group("n_train")
         lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": group for n, group in groups.items()}
         return cross_table(title, lines, columns, text, "N, target trajectories")
 
-    return [
-        table(rows, f"Test error L^T_MSE{place} ({of}; less is better)", error_text),
-        table(trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
-    ]
+    tables = []
+    for place, group in _places(rows):
+        trained, of = group.where(mode=(FINE_TUNED, TARGET_ONLY)), mean_over_seeds(group)
+        # A source-only model is what fine-tuning starts from: it stands at the head of that column.
+        modes = {FINE_TUNED: (FINE_TUNED, SOURCE_ONLY), TARGET_ONLY: (TARGET_ONLY,)}
+        columns = {
+            label(model, mode): {"model": model, "mode": seen}
+            for model in MODELS
+            for mode, seen in modes.items()
+            if len((trained or group).where(model=model, mode=seen))
+        }
+        error = f"Test error L^T_MSE{place} ({of}; less is better)"
+        rho = f"Improvement ρ over source-only{place} ({of}; 1 is perfect)"
+        tables += [table(group, error, columns, error_text), table(trained, rho, columns, rho_text)]
+    return tables
 
 
 def ranking(rows: Results) -> list[Table]:
@@ -69,32 +68,30 @@ def ranking(rows: Results) -> list[Table]:
     A ratio is the paper's: the mean of the fine-tuned hybrid, the smallest error of any other method, over the smallest
     of fine-tuned physics-only (at the smallest N, if there are several).
     """
-    return [_ranking(domain, group) for domain, group in by_domain(rows).items()]
-
-
-def _ranking(domain: str, rows: Results) -> Table:
-    found, quoted = ranked(rows), PAPER[domain]
-    physics = min((cell for cell in found if cell[:2] == PHYSICS[:2]), default=None)
-    below = math.nan if physics is None else found[physics].spread("test_mse").smallest
-
-    def line(cell: Cell, rows: Results) -> tuple[str, ...]:
-        values, kind = rows.spread("test_mse"), "mean" if cell[:2] == TUNED[:2] else "smallest"
-
-        def ratio(above: float, below: float) -> str:
-            return f"{above / below:.3g} ({kind})".replace("inf", "∞") if 0 < below < math.inf else EMPTY
-
-        smallest = f"{values.smallest:.2e}".replace("inf", "∞")
-        own = ratio(values.mean if kind == "mean" else values.smallest, below)
-        paper = EMPTY, EMPTY
-        if cell in quoted:
-            error, std = quoted[cell]
-            shown = f"{error:.2e} (smallest)" if std is None else f"{error:.2e} ± {std:.2e}"
-            paper = shown, ratio(error, quoted[PHYSICS][0])
-        return method_label(cell), str(cell[2] or EMPTY), smallest, error_text(rows), own, *paper
-
-    of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(rows)}; less is better"
     header = ("method", "N", "smallest", "mean ± std", "ratio to physics-only's smallest", "paper", "paper's ratio")
-    return Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, [line(*item) for item in found.items()])
+    tables = []
+    for domain, group in by_domain(rows).items():
+        found, quoted = ranked(group), PAPER[domain]
+        physics = min((cell for cell in found if cell[:2] == PHYSICS[:2]), default=None)
+        best = math.nan if physics is None else found[physics].spread("test_mse").smallest
+        lines = []
+        for cell, of_cell in found.items():
+            values, kind = of_cell.spread("test_mse"), "mean" if cell[:2] == TUNED[:2] else "smallest"
+            own = _ratio(values.mean if kind == "mean" else values.smallest, best, kind)
+            paper = EMPTY, EMPTY
+            if cell in quoted:
+                error, std = quoted[cell]
+                shown = f"{error:.2e} (smallest)" if std is None else f"{error:.2e} ± {std:.2e}"
+                paper = shown, _ratio(error, quoted[PHYSICS][0], kind)
+            smallest = f"{values.smallest:.2e}".replace("inf", "∞")
+            lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
+        of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better"
+        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines))
+    return tables
+
+
+def _ratio(above: float, below: float, kind: str) -> str:
+    return f"{above / below:.3g} ({kind})".replace("inf", "∞") if 0 < below < math.inf else EMPTY
 
 
 def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
