@@ -20,7 +20,7 @@ from experiments.paper.lanes import rows_of, save_models, source_of, with_rho
 from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
 from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
-from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER, NO_PHYSICS
+from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
@@ -66,8 +66,6 @@ class ComparisonConfig(Config):
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)
-        if NO_PHYSICS in self.methods and self.residual_outputs != "all":
-            raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
         if LAST_LAYER in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
             raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")
 

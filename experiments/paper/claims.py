@@ -57,12 +57,7 @@ Predicate = Callable[[Evidence], tuple[bool, str]]
 
 
 def claims(rows: Results, experiment: str, truth: Mapping[str, float] | None) -> list[Verdict]:
-    """Evaluate the claims about an experiment. An error that is not finite counts as infinite.
-
-    Args:
-        experiment: one of DOMAINS_OF.
-        truth: see `Evidence`.
-    """
+    """Evaluate the claims about one of DOMAINS_OF. An error that is not finite counts as infinite."""
     evidence = [Evidence(domain, cells(rows.where(domain=domain)), truth) for domain in DOMAINS_OF[experiment]]
     own = [id for id in CLAIMS if experiment in ONLY.get(id, ("param_shift", "external_force"))]
     return evaluate([Claim(id, CLAIMS[id][0], _in_each_domain(CLAIMS[id][1])) for id in own], evidence)

@@ -98,11 +98,7 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
 ) -> tuple[FitState, RunConfig]:
-    """One run per seed: the encoder of Expert Augmentation, on source flights and on rollouts of the seed's hybrid.
-
-    Args:
-        past: the first part of each source window, the input of the encoder.
-    """
+    """One run per seed: the encoder of Expert Augmentation, which sees the past, the first part of source windows."""
 
     def build(expert, seed):
         key = _key(seed, ENCODER)

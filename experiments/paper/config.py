@@ -144,8 +144,12 @@ class Config(Run):
             raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
-        # Physics alone has nothing to normalise; configurations without a choice of models have networks.
-        if self.norm == "batch" and self.batch_size < 2 and {*getattr(self, "models", ())} != {PHYSICS_ONLY}:
+        chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
+        if NO_PHYSICS in chosen and self.residual_outputs != "all":
+            refused = f"--residual-outputs {self.residual_outputs}"
+            raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")
+        # Physics alone has nothing to normalise.
+        if self.norm == "batch" and self.batch_size < 2 and chosen != {PHYSICS_ONLY}:
             raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
         if self.pooled() < max(self.sizes):
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
@@ -174,14 +178,10 @@ class AdaptationConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--models", self.models)
-        if NO_PHYSICS in self.models and self.residual_outputs != "all":
-            raise ValueError(
-                f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives, leave it out"
-            )
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
-    """A configuration of a kind with the shared options of another one, except sizes and pool, and the changes."""
+    """A configuration with the shared options of another one, except sizes and pool, and the changes."""
     shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
     return kind(**shared | changes)
 

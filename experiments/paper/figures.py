@@ -28,7 +28,7 @@ MEANING = "mean ± one standard deviation over seeds; hollow: over the finite se
 
 
 class _Curve(NamedTuple):
-    """At each N: of the finite values mean, mean ± one std and smallest; and how many of how many are not finite."""
+    """At each N: of the finite values mean, mean ± std and smallest; and how many of how many are not finite."""
 
     n: np.ndarray
     mean: np.ndarray
@@ -44,11 +44,7 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
-    """Figs. 3 and 5: test error and ρ against N, mean and one standard deviation over seeds.
-
-    Args:
-        floor: an error that no model at hand can get below, such as the share of a wind's sine; 0 if there is none.
-    """
+    """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
     figure = Figure(figsize=(9, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_errors(left, _curves(rows, "test_mse"), floor)
@@ -62,11 +58,7 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
 
 @mpl.rc_context(STYLE)
 def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
-    """Ix, Iy and k relative to the truth against N, mean and one standard deviation over seeds.
-
-    Args:
-        truth: the true value of each; none is 0.
-    """
+    """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
     sizes = adapted_sizes(known)
     figure = Figure(figsize=(9, 4.1), layout="constrained")
@@ -84,21 +76,16 @@ def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProx
     """Table 2: the test errors of all seeds of every method, the smallest mean on top, a panel for each domain.
 
     Args:
-        floors: domain → an error that no model at hand can get below, such as the share of a wind's sine.
+        floors: domain → an error that no model can get below.
     """
     several_sizes = len(adapted_sizes(rows)) > 1
-    panels = {
-        domain: [
-            Line(
-                f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell),
-                errors.numbers("test_mse"),
-                colour(cell[0]),
-                "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else "",
-            )
-            for cell, errors in ranked(group).items()
-        ]
-        for domain, group in by_domain(rows).items()
-    }
+    panels = {}
+    for domain, group in by_domain(rows).items():
+        panels[domain] = lines = []
+        for cell, own in ranked(group).items():
+            name = f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell)
+            marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
+            lines.append(Line(name, own.numbers("test_mse"), colour(cell[0]), marked))
     counts = [len(lines) for lines in panels.values()]
     figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
     column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
@@ -108,11 +95,10 @@ def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProx
 
 @mpl.rc_context(STYLE)
 def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
-    """The test errors of the fine-tuned models of one choice: a panel for each domain, a line for each value and N.
+    """The fine-tuned models of one choice, as in `ranking`: a line for each value and N.
 
     Args:
         rows: with the tags value and default.
-        floors: domain → an error that no model can get below.
     """
     panels = {domain: _ablation_lines(group) for domain, group in by_domain(rows.where(mode=FINE_TUNED)).items()}
     count = max(len(lines) for lines in panels.values())

@@ -36,8 +36,7 @@ class Lanes:
     """The trained models of one kind in one mode, one for each size and seed.
 
     Attributes:
-        sizes, seeds: of each.
-        fields: the trained models, stacked.
+        fields: the models, stacked.
         errors: L^T_MSE of each on the test flights.
         val_mse: L_MSE of each on the validation windows.
         epochs, status: of its training; see `training`.
@@ -109,9 +108,7 @@ def rows_of(groups: Sequence[Lanes], domain: str) -> Results:
 
 
 def with_rho(rows: Results) -> Results:
-    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9).
-
-    L^S is the source-only error of the same domain, seed and model; for one of BASELINES, that of the hybrid.
+    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`.
 
     Raises:
         ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.

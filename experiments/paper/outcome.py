@@ -66,7 +66,6 @@ def paper_report(
     """The report of an experiment of the paper.
 
     Args:
-        seconds: of each stage.
         truth: the true θ_p, by domain where there are several.
         figures: caption by file.
     """

@@ -46,11 +46,7 @@ class Study:
 
 
 def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
-    """Run the protocol on a target domain; finished stages come from the cache.
-
-    Args:
-        vehicle: as known before the change; models start around its nominal θ_p.
-    """
+    """Run the protocol on a target domain, from models around the nominal θ_p of the vehicle before the change."""
     stages = stages_of(config, console)
     lanes: list[Lanes] = []
     learned: dict[str, FitState] = {}
@@ -127,11 +123,8 @@ def from_first(read: Callable[[], Dataset]) -> Dataset:
     def parts() -> tuple[Any, Arrays]:
         found = read()
         arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
-        return [
-            dict(found.metadata),
-            {name: windows.dt for name, windows in found.splits.items()},
-            found.origin,
-        ], arrays
+        steps = {name: windows.dt for name, windows in found.splits.items()}
+        return [dict(found.metadata), steps, found.origin], arrays
 
     (metadata, steps, origin), arrays = hosts.from_first(parts)
     splits = {name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=dt) for name, dt in steps.items()}

@@ -95,11 +95,7 @@ def _ratio(above: float, below: float, kind: str) -> str:
 
 
 def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
-    """θ_p of each cell that has it, mean ± std over seeds, and the truth: a table for each domain.
-
-    Args:
-        truth: Ix, Iy [kg m²], k [N/(rad/s)²], or these by domain.
-    """
+    """θ_p of each cell that has it, mean ± std over seeds, and the truth (or that by domain): a table per domain."""
     known = _places(rows.where(lambda row: row["theta"] is not None))
     if truth is None or set(truth) == set(THETA):
         return [_parameters(group, place, truth) for place, group in known]
@@ -145,7 +141,7 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
 
     Args:
         rows: with the tags choice, value and default.
-        truth: domain → the true Ix, Iy [kg m²], k [N/(rad/s)²].
+        truth: the true θ_p by domain.
     """
 
     def bias(rows: Results) -> str:

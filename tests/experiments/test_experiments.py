@@ -1,20 +1,30 @@
 """Both experiments from their command lines, in the smallest preset: what they leave, and what they refuse."""
 
 import csv
+import io
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from smoke import ROOT, command, experiments, refused, smallest, unbegun
+from rich.console import Console
+from smoke import ROOT, experiments, refused, smallest, unbegun
 
 import hybrid_jax
 from experiments.external_force import sine_floor
+from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in, source_of
+from experiments.paper.outcome import draw
+from experiments.paper.study import study
 from experiments.reporting.report import load_report
+from hybrid_jax.dynamics.rigid_body import nominal
+from hybrid_jax.sim.domain import PARAMETER_SHIFT
+from hybrid_jax.vehicle import IRIS
 
 EXPERIMENTS = ("param_shift", "external_force")
 ROW = {
@@ -36,8 +46,8 @@ def finished(folder):
     return runs
 
 
-def record(folder, name, out="out"):
-    return json.loads((folder / out / name / "report.json").read_text())
+def record(folder, name):
+    return json.loads((folder / "out" / name / "report.json").read_text())
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -48,6 +58,7 @@ def test_the_report_keeps_its_contract(name, folder, finished):
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     # Three models: source-only once a seed, two modes for each size and seed; and the one that is solved.
     assert len(report["rows"]) == 3 * (1 + 2) + 1
+    source = {row["model"]: row["test_mse"] for row in report["rows"] if row["mode"] == "source_only"}
     for row in report["rows"]:
         assert set(row) == set(ROW)
         assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
@@ -57,20 +68,12 @@ def test_the_report_keeps_its_contract(name, folder, finished):
         assert (row["theta"] is None) == (row["model"] == "no_physics")
         assert row["theta"] is None or set(row["theta"]) == {"Ix", "Iy", "k"}
         assert row["n_train"] == (0 if row["mode"] == "source_only" else 20)
+        error = source[source_of(row["model"])]
+        np.testing.assert_allclose(row["rho"], (error - row["test_mse"]) / error, rtol=1e-12)
     for claim in report["claims"]:
         assert set(claim) == {"id", "text", "holds", "measured"}
         assert isinstance(claim["holds"], bool)
     load_report(folder / "out" / name)
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
-    rows = record(folder, name)["rows"]
-    source = {row["model"]: row["test_mse"] for row in rows if row["mode"] == "source_only"}
-    for row in rows:
-        error = source[source_of(row["model"])]
-        expected = (error - row["test_mse"]) / error
-        np.testing.assert_allclose(row["rho"], expected, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
@@ -112,25 +115,20 @@ def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
     assert all("pre-training" in line for line in reused)
 
 
-def test_a_second_run_reuses_every_stage_and_finds_the_same_rows(folder, finished):
-    again = command("param_shift", folder=folder, out=folder / "again")
-    assert again.returncode == 0, again.stderr
-    assert again.stderr.count("as found in the cache") == 9  # three models: pre-training and two adaptations
-    assert record(folder, "param_shift", "again")["rows"] == record(folder, "param_shift")["rows"]
-
-
-def test_other_input_scaling_is_another_pretraining(folder, finished):
-    """Nothing but what is static in the network differs; and a report without physics has no figure of θ_p."""
-    other = command("param_shift", "--inputs", "raw", "--models", "no_physics", folder=folder, out=folder / "raw")
-    assert other.returncode == 0, other.stderr
-    assert "as found in the cache" not in other.stderr
-    assert "theta.png" not in record(folder, "param_shift", "raw")["figures"]
-
-
-def test_physics_alone_is_an_experiment_too(folder, finished):
-    run = command("param_shift", "--models", "physics_only", folder=folder, out=folder / "physics")
-    assert run.returncode == 0, run.stderr
-    assert len(record(folder, "param_shift", "physics")["rows"]) == 3
+@pytest.mark.parametrize(("model", "figure"), [("no_physics", "predictions"), ("physics_only", "theta")])
+def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figure, folder, finished):
+    config = replace(SMOKE, models=(model,), cache=folder / "cache")
+    text = io.StringIO()
+    found = study(PARAMETER_SHIFT, IRIS, config, Console(file=text))
+    assert text.getvalue().count("as found in the cache") == 3  # pre-training and two adaptations
+    before = [row for row in record(folder, "param_shift")["rows"] if row["model"] == model]
+    for row, expected in zip(found.rows, before, strict=True):
+        assert [row[key] for key in ("mode", "val_mse", "theta")] == [
+            expected[key] for key in ("mode", "val_mse", "theta")
+        ]
+        assert row["test_mse"] == pytest.approx(expected["test_mse"], rel=1e-5)
+    drawn = draw(PARAMETER_SHIFT, config, found, nominal(PARAMETER_SHIFT.vehicle), 0.0)
+    assert set(drawn) == {"scores", "example_flight", figure}
 
 
 @pytest.mark.usefixtures("heard")
@@ -142,8 +140,9 @@ def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert any("runs active" in line for line in process.stderr)  # said after a few seconds of training
-            second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
-            assert "another run is writing" in refused(second, "param_shift")
+            if sent == signal.SIGTERM:
+                second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
+                assert "another run is writing" in refused(second, "param_shift")
             process.send_signal(sent)
             rest = process.stderr.read()
             assert process.wait(timeout=60) == code
@@ -172,7 +171,7 @@ def test_wrong_options_are_refused_in_one_line(options, named, tmp_path):
 def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
     out = tmp_path / "precious"
     out.write_text("mine")
-    assert "--out" in refused(command("external_force", folder=tmp_path, out=out), "external_force")
+    assert "--out" in refused(unbegun("external_force", *smallest(folder=tmp_path, out=out)), "external_force")
     assert out.read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["precious"]
 
@@ -181,13 +180,11 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
 def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
     (file,) = (folder / "cache").glob(pattern)
     content = file.read_bytes()
-    report = (folder / "out" / "param_shift" / "report.json").read_bytes()
     file.write_bytes(content[: len(content) // 2])
     try:
-        run = command("param_shift", folder=folder)
-        assert str(file) in refused(run, "param_shift")
+        with pytest.raises(ValueError, match=re.escape(str(file))):
+            study(PARAMETER_SHIFT, IRIS, replace(SMOKE, cache=folder / "cache"), Console(quiet=True))
         assert file.read_bytes() == content[: len(content) // 2]
-        assert (folder / "out" / "param_shift" / "report.json").read_bytes() == report
     finally:
         file.write_bytes(content)
 
