@@ -47,7 +47,7 @@ class Flight:
     speed: NotNegative = 2.0
     """[m/s], along each axis, a third of it vertically."""
     tilt: NotNegative = 0.1
-    """[rad], about each axis, beside the lean that balances the drag in steady flight."""
+    """[rad], about each axis, in addition to the lean that balances the drag in steady flight."""
     body_rates: NotNegative = 1.0
     """[rad/s], along each axis."""
     rotor_speed: NotNegative = 40.0
@@ -173,7 +173,7 @@ def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
 
 
 def _parts(config: Config) -> list[PRNGKeyArray]:
-    """The keys of all repeats, a few at a time: between two parts progress is drawn and an interrupt is heard."""
+    """The keys of all repeats, a few at a time: between two parts progress is drawn and interrupts are handled."""
     size = min(config.batch * -(-PART // config.batch), config.repeats)
     keys = jax.random.split(jax.random.key(config.seed), config.repeats)
     # The last part is filled up, so that one program serves all.

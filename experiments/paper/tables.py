@@ -1,4 +1,4 @@
-"""The tables of the paper's experiments: errors and ρ by N, the ranking beside Table 2, θ_p, ablations; notes."""
+"""The tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
 
 import math
 from collections.abc import Callable, Mapping

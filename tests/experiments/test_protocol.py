@@ -187,23 +187,19 @@ def test_minibatches_of_one_window_are_for_what_does_not_normalise_them():
         assert replace(PAPER, batch_size=1, **change).batch_size == 1
 
 
-@pytest.mark.parametrize("model", ["hybrid", "no_physics"])
+@pytest.mark.parametrize("model", ["hybrid", "no_physics", "physics_only"])
 def test_the_output_bias_has_a_rate_of_its_own_if_asked_for(model):
-    """And all else the rate that it had."""
+    """And all else the rate that it had; physics alone has no such bias."""
     offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
     for (_, _, usual), (_, _, found) in zip(
         plans_by_lane(model, "fine_tuned"), plans_by_lane(model, "fine_tuned", offset), strict=False
     ):
-        network = found.rates.residual if model == "hybrid" else found.rates
-        rate = usual.rates.residual if model == "hybrid" else usual.rates
-        np.testing.assert_array_equal(network.bias_out, np.float32([rate] * 7 + [0.3] * 6))
-        others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
-        assert {float(each) for each in others} == {float(rate)}
-        if model == "hybrid":
-            assert {float(each) for each in jax.tree.leaves(found.rates.physics)} == {float(usual.rates.physics)}
-
-
-def test_physics_alone_has_no_output_bias():
-    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
-    for _, _, plan in plans_by_lane("physics_only", "fine_tuned", offset):
-        assert {float(each) for each in jax.tree.leaves(plan.rates)} == {np.float32(SMALL.rates.physics)}
+        if model != "no_physics":
+            physics = (plan.rates.physics if model == "hybrid" else plan.rates for plan in (found, usual))
+            rates, before = ({float(each) for each in jax.tree.leaves(part)} for part in physics)
+            assert rates == before
+        if model != "physics_only":
+            network, rate = (plan.rates.residual if model == "hybrid" else plan.rates for plan in (found, usual))
+            np.testing.assert_array_equal(network.bias_out, np.float32([rate] * 7 + [0.3] * 6))
+            others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
+            assert {float(each) for each in others} == {float(rate)}
