@@ -18,7 +18,7 @@ from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import Lanes, rows_of, save_models, source_of, with_rho
-from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
+from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER, NO_PHYSICS
@@ -123,7 +123,7 @@ def past_splits(**windows: int) -> dict[str, SplitSpec]:
 
 def compared(case: Case, methods: Sequence[Method]) -> list[Lanes]:
     """Every source model as it is, then every method, tested in one domain."""
-    return [source_only(model)(case) for model in case.pretrained] + [METHODS[name](case, name) for name in methods]
+    return [source_only(case, model) for model in case.pretrained] + [adapted(case, name) for name in methods]
 
 
 def write(config: ComparisonConfig, rows: Results, stages: Stages, flights: dict[str, Any], covered: Results) -> None:

@@ -1,6 +1,6 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -14,8 +14,8 @@ from experiments.paper.conditions import adaptation, annealing, fresh_fields, pr
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
 from experiments.paper.sensors import measured
-from experiments.paper.solved import Solve, constant_disturbance, solved
-from experiments.reporting.names import CONSTANT_DISTURBANCE, FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
+from experiments.paper.solved import SOLVED, solved
+from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
 from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
@@ -31,7 +31,6 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
-SOLVED: Mapping[str, Solve] = {CONSTANT_DISTURBANCE: constant_disturbance}  # models that are not trained
 
 
 @dataclass(frozen=True)
