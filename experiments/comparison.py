@@ -17,7 +17,7 @@ from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import rows_of, save_models, source_of, with_rho
-from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
+from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
@@ -85,8 +85,8 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     for domain in DOMAINS:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
         case = Case(config, stages, learned, experts, target)
-        lanes = [source_only(model)(case) for model in learned]
-        lanes += [METHODS[name](case, name) for name in config.methods]
+        lanes = [source_only(case, model) for model in learned]
+        lanes += [adapted(case, method) for method in config.methods]
         found = with_rho(rows_of(lanes, domain.name))
         if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)

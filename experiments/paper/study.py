@@ -14,8 +14,8 @@ from experiments.paper.conditions import adaptation, annealing, fresh_fields, pr
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
 from experiments.paper.sensors import measured
-from experiments.paper.solved import Solved, constant_disturbance, solved
-from experiments.reporting.names import CONSTANT_DISTURBANCE, FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
+from experiments.paper.solved import SOLVED, Solved, solved
+from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
 from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
@@ -62,9 +62,9 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
                 learned[start] = pretrained(start, vehicle, config, stages, source)
                 lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
             fields, finals = learned[start].best, dict[str, FitState | Solved]()
-            if model == CONSTANT_DISTURBANCE:
+            if model in SOLVED:
                 name = f"{FINE_TUNED} {model} {domain_name(target)}"
-                finals[FINE_TUNED] = solved(name, constant_disturbance, fields, config, stages, target)
+                finals[FINE_TUNED] = solved(name, SOLVED[model], fields, config, stages, target)
             else:
                 finals[FINE_TUNED] = adapted(model, FINE_TUNED, fields, config, stages, target)
                 fresh = fresh_fields(model, vehicle, config)
