@@ -3,6 +3,7 @@
 import inspect
 import json
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -88,9 +89,7 @@ def test_units_of_the_states_do_not_matter():
     stretched = replace(data, x0=np.asarray(data.x0) * factor, x=np.asarray(data.x) * factor)
     stretched = jax.tree.map(lambda leaf: np.asarray(leaf, np.float32), stretched)
     plain = adapt(pendulum(0.7), data, method="theta_least_squares").parameters["log_length"]
-    with pytest.warns(UserWarning, match="Stretched") as warned:  # a file of it could not be loaded alone
-        other = adapt(Stretched(pendulum(0.7), factor), stretched, method="theta_least_squares")
-    assert len(warned) == 1
+    other = adapt(Stretched(pendulum(0.7), factor), stretched, method="theta_least_squares")
     found = other.parameters["field.log_length"]
     np.testing.assert_allclose([found.value, found.low, found.high], [plain.value, plain.low, plain.high], rtol=1e-3)
 
@@ -151,6 +150,19 @@ def test_a_disturbance_acts_on_any_states():
 class Nothing(AbstractVectorField):
     def __call__(self, x, u):
         return x
+
+
+class Shaped(AbstractVectorField):
+    shape: Callable
+
+    def __call__(self, x, u):
+        return self.shape(x)
+
+
+def test_a_field_that_cannot_be_saved_is_adapted_with_one_warning():
+    with pytest.warns(UserWarning, match="field/shape is the callable") as warned:
+        adapt(Shaped(lambda x: -x), swings(40), method="source")
+    assert len(warned) == 1
 
 
 class Weights(AbstractVectorField):
