@@ -6,15 +6,13 @@ python -m experiments.ablation --help
 from dataclasses import dataclass, replace
 from typing import Any, Literal, get_args
 
-import numpy as np
 from rich.console import Console
 
-from experiments.external_force import sine_floor
+from experiments.external_force import FLOOR
 from experiments.paper import figures
-from experiments.paper.conditions import settings
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
-from experiments.paper.lanes import Lanes, rows_of, trained, with_rho
-from experiments.paper.study import EVERY, adapted, flown, places, pretrained, source_splits, target_splits
+from experiments.paper.lanes import rows_of, with_rho
+from experiments.paper.study import adapted, flown, pretrained, source_splits, target_splits, tested
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY
 from experiments.reporting.plots import save_figures
@@ -26,15 +24,13 @@ from experiments.runner.environment import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.flight import DT
 from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.training import evaluate
-from hybrid_jax.training.fitting import FitState
 from hybrid_jax.training.loss import REGULARISERS
 from hybrid_jax.vehicle import IRIS
 
 NAME = "ablation"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
+TRUTH = {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
 HEAD = """# ablation
 
 One choice of the hybrid method is changed at a time; everything else keeps its default. Each value is pre-trained on
@@ -81,42 +77,30 @@ PRESETS = {
 }
 
 
-def variations(choice: str, config: Config) -> dict[str, dict[str, Any]]:
-    """Name of each value of a choice → the options that differ from the configuration; none for the default."""
-    match choice:
-        case "residual":
-            seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
-            added = {"all": "all 13", "accelerations": "v̇, ω̇"}
-            return {
-                f"{seen[i]} → {added[o]}": {"residual_inputs": i, "residual_outputs": o} for o in added for i in seen
-            }
-        case "weight":
-            return {f"λ = {weight:g}": {"regulariser_weight": weight} for weight in (0.0, 1e-4, 1e-3, 1e-2, 1e-1)}
-        case "form":
-            return {form.replace("_", " "): {"regulariser": form} for form in (*REGULARISERS, "none")}
-        case "norm":
-            return {norm: {"norm": norm} for norm in ("batch", "layer", "none")}
-        case "start":
-            factors = f"random in {config.guess[0]:g} to {config.guess[1]:g}"
-            return {factors: {"perturbed_by": None}} | {
-                f"off by {off:.0%}": {"perturbed_by": off} for off in (0.2, 0.5, 1.0)
-            }
-        case "source":
-            sizes = [n for n in (300, 1000, 3000, 10_000) if config.batch_size <= n < config.source_train]
-            return {f"{n} trajectories": {"source_train": n} for n in (*sizes, config.source_train)}
-        case "noise":
-            return {f"{level:g} × typical": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)}
-        case _:
-            return {solver: {"solver": solver} for solver in ("rk4", "heun", "tsit5")}
-
-
 def varied(choice: str, config: Kind) -> dict[str, Kind]:
-    """Name of each value of a choice → the configuration with it.
+    """Name of each value of a choice → the configuration with it; the default's is the configuration itself.
 
     Raises:
         ValueError: a value that does not go with the other options.
     """
-    return {value: replace(config, **changes) for value, changes in variations(choice, config).items()}
+    seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
+    added = {"all": "all 13", "accelerations": "v̇, ω̇"}
+    low, high = config.guess
+    sizes = [n for n in (300, 1000, 3000, 10_000) if config.batch_size <= n < config.source_train]
+    changes: dict[str, dict[str, dict[str, Any]]] = {
+        "residual": {
+            f"{seen[i]} → {added[o]}": {"residual_inputs": i, "residual_outputs": o} for o in added for i in seen
+        },
+        "weight": {f"λ = {weight:g}": {"regulariser_weight": weight} for weight in (0.0, 1e-4, 1e-3, 1e-2, 1e-1)},
+        "form": {form.replace("_", " "): {"regulariser": form} for form in (*REGULARISERS, "none")},
+        "norm": {norm: {"norm": norm} for norm in ("batch", "layer", "none")},
+        "start": {f"random in {low:g} to {high:g}": {"perturbed_by": None}}
+        | {f"off by {off:.0%}": {"perturbed_by": off} for off in (0.2, 0.5, 1.0)},
+        "source": {f"{n} trajectories": {"source_train": n} for n in (*sizes, config.source_train)},
+        "noise": {f"{level:g} × typical": {"noise": level} for level in (0.0, 0.5, 1.0, 2.0)},
+        "solver": {solver: {"solver": solver} for solver in ("rk4", "heun", "tsit5")},
+    }
+    return {value: replace(config, **options) for value, options in changes[choice].items()}
 
 
 def experiment(config: AblationConfig, console: Console) -> None:
@@ -134,7 +118,7 @@ def experiment(config: AblationConfig, console: Console) -> None:
         if hosts.is_main_process():
             write(config, rows, seconds)
     if hosts.is_main_process():
-        print_tables(Console(), ablation_tables(rows, truth()))
+        print_tables(Console(), ablation_tables(rows, TRUTH))
 
 
 def run(config: AblationConfig, stages: Stages) -> Results:
@@ -143,33 +127,19 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     rows = Results()
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        final = adapted(HYBRID, FINE_TUNED, learned.best, config, stages, target)
-
-        def tested(mode: str, sizes: tuple[int, ...], found: FitState, test=target.splits["test"]) -> Lanes:
-            errors = evaluate(found.best, test, EVERY, settings(config))
-            return trained(HYBRID, mode, *places(sizes, config), found, errors)
-
-        both = [tested(SOURCE_ONLY, (0,), learned), tested(FINE_TUNED, config.sizes, final)]
-        rows += with_rho(rows_of(both, domain.name))
+        found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.best, config, stages, target)}
+        lanes = [tested(HYBRID, mode, states, config, stages, target) for mode, states in found.items()]
+        rows += with_rho(rows_of(lanes, domain.name))
     return rows
-
-
-def truth() -> dict[str, dict[str, float]]:
-    """The true θ_p of each domain."""
-    return {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
 
 
 def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> None:
     """Write the figure of each choice and the report of all rows so far."""
-    out = config.out / NAME
-    floors = {EXTERNAL_FORCE.name: sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))}
-    drawn = {
-        choice: (
-            figures.ablation(group, f"{choice.capitalize()}: test error over 1 s after fine-tuning", floors),
-            f"Test errors of all seeds, by {choice}",
-        )
-        for choice, group in rows.group("choice").items()
-    }
+    out, drawn = config.out / NAME, {}
+    for choice, group in rows.group("choice").items():
+        title = f"{choice.capitalize()}: test error over 1 s after fine-tuning"
+        figure = figures.ablation(group, title, {EXTERNAL_FORCE.name: FLOOR})
+        drawn[choice] = figure, f"Test errors of all seeds, by {choice}"
     report = Report(
         experiment=NAME,
         config=config.described(),
@@ -178,7 +148,7 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
         figures=save_figures(out, drawn),
         notes=NOTES,
         head=HEAD,
-        tables=ablation_tables(rows, truth()),
+        tables=ablation_tables(rows, TRUTH),
     )
     write_report(out, report)
 

@@ -3,7 +3,6 @@
 python -m experiments.comparison --help
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any, get_args
 
@@ -17,11 +16,11 @@ from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
 from experiments.paper.figures import ranking
-from experiments.paper.lanes import Lanes, rows_of, save_models, source_of, with_rho
-from experiments.paper.methods import METHODS, PAST, Case, Method, source_only
+from experiments.paper.lanes import rows_of, save_models, source_of, with_rho
+from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
-from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER, NO_PHYSICS
+from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
@@ -67,8 +66,6 @@ class ComparisonConfig(Config):
         if min(self.sizes) <= len(LEARNED):
             raise ValueError(f"--sizes must each be more than the {len(LEARNED)} of θ_p, got {self.sizes}")
         factors("--encoding.box", self.encoding.box)
-        if NO_PHYSICS in self.methods and self.residual_outputs != "all":
-            raise ValueError("--residual-outputs accelerations: no_physics must write all derivatives, leave it out")
         if LAST_LAYER in self.methods and (self.residual_inputs, self.residual_outputs) != ("all", "all"):
             raise ValueError("--methods last_layer needs a residual that sees and writes the whole state")
 
@@ -84,20 +81,30 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     """Run all methods in both domains and write the report."""
     stages = stages_of(config, console)
     learned, experts = source_models(config, stages)
-    out, rows, datasets = config.out / NAME, Results(), dict[str, Any]()
+    out, rows, flights = config.out / NAME, Results(), dict[str, Any]()
     for domain in DOMAINS:
         target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
-        lanes = compared(Case(config, stages, learned, experts, target), config.methods)
+        case = Case(config, stages, learned, experts, target)
+        lanes = [source_only(case, model) for model in learned]
+        lanes += [adapted(case, method) for method in config.methods]
         found = with_rho(rows_of(lanes, domain.name))
         if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)
-        rows, datasets = rows + found, datasets | {domain.name: target.metadata}
+        rows, flights = rows + found, flights | {domain.name: target.metadata}
     if not hosts.is_main_process():
         return
-    covered = stages.timed(
-        "coverage", lambda: coverage(CoverageConfig(repeats=config.repeats, n_train=config.sizes[0]), console)
-    )
-    write(config, rows, stages, datasets, covered)
+    simulated = CoverageConfig(repeats=config.repeats, n_train=config.sizes[0])
+    covered = stages.timed("coverage", lambda: coverage(simulated, console))
+    floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
+    drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
+    figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
+    notes = [*stages.notes(), GIVEN_NETWORK]
+    for (truth, noise_on), group in covered.group("case", "noise_on").items():
+        shares = ", ".join(f"{row['parameter']} {row['coverage']:.0%}" for row in group)
+        notes.append(f"95 % intervals of θ_p contained the truth, {truth}, noise on {noise_on}: {shares}.")
+    true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights, "coverage": covered.rows}
+    report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
+    write_report(out, report, Console())
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, FitState], FitState | None]:
@@ -119,33 +126,6 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
 def past_splits(**windows: int) -> dict[str, SplitSpec]:
     """Splits whose windows begin with the past that an encoder reads: `train=1000` makes `train_with_past`."""
     return {f"{name}_with_past": SplitSpec(count, 2 * PAST) for name, count in windows.items()}
-
-
-def compared(case: Case, methods: Sequence[Method]) -> list[Lanes]:
-    """Every source model as it is, then every method, tested in one domain."""
-    return [source_only(model)(case) for model in case.pretrained] + [METHODS[name](case, name) for name in methods]
-
-
-def write(config: ComparisonConfig, rows: Results, stages: Stages, flights: dict[str, Any], covered: Results) -> None:
-    """Write the figure and the report; print its tables."""
-    out, truth = config.out / NAME, {domain.name: nominal(domain.vehicle) for domain in DOMAINS}
-    floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
-    drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
-    figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
-    notes = [*stages.notes(), GIVEN_NETWORK, *coverage_notes(covered)]
-    extra = {"flights": flights, "coverage": covered.rows}
-    report = paper_report(NAME, config, stages.seconds, rows, truth, figures, notes, floor, extra)
-    write_report(out, report, Console())
-
-
-def coverage_notes(covered: Results) -> list[str]:
-    """How often the 95 % intervals of θ_p contained the truth in simulation."""
-
-    def shares(rows: Results) -> str:
-        return ", ".join(f"{row['parameter']} {row['coverage']:.0%}" for row in rows)
-
-    groups = covered.group("case", "noise_on").items()
-    return [f"95 % intervals of θ_p contained the truth, {c}, noise on {n}: {shares(rows)}." for (c, n), rows in groups]
 
 
 def main() -> None:

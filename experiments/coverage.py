@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -18,7 +18,7 @@ from rich.console import Console
 
 from experiments.paper.sensors import Noise, measure
 from experiments.reporting.results import Results
-from experiments.reporting.tables import Table, print_tables, tabulate
+from experiments.reporting.tables import print_tables, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
 from experiments.runner.progress import Line
@@ -47,7 +47,7 @@ class Flight:
     speed: NotNegative = 2.0
     """[m/s], along each axis, a third of it vertically."""
     tilt: NotNegative = 0.1
-    """[rad], about each axis, beside the lean that balances the drag in steady flight."""
+    """[rad], about each axis, in addition to the lean that balances the drag in steady flight."""
     body_rates: NotNegative = 1.0
     """[rad/s], along each axis."""
     rotor_speed: NotNegative = 40.0
@@ -97,46 +97,16 @@ class Dragged(AbstractVectorField):
         return self.body(x, u).at[VELOCITY].add(-self.drag / self.body.vehicle.mass * x[VELOCITY])
 
 
-class Repeat(NamedTuple):
-    """What one recording gave, each entry of θ_p in the order of `LEARNED`, in shares of the truth."""
-
-    inside: Bool[Array, " p"]
-    error: Float[Array, " p"]
-    half_width: Float[Array, " p"]
-    converged: Bool[Array, ""]
-
-
 def coverage(config: Config, console: Console) -> Results:
-    """The rows of every case: exact physics and unknown drag, with noise on what was asked for; see `_rows`.
+    """A row for each parameter in every case: exact physics and unknown drag, with noise on what was asked for.
+
+    Shares; bias and half-width in % of the truth. A repeat that did not converge is a miss.
 
     Args:
         console: where progress is drawn.
 
     Raises:
         ValueError: an option that makes no sense, by its name on the command line.
-    """
-    check(config)
-    drags = {"exact physics": 0.0, "unknown drag": config.drag}
-    cases = list(itertools.product(drags, config.noise_on))
-    parts, done = _parts(config), itertools.count(1)
-    with Line(NAME, console) as line:
-
-        def one(case: str, noise_on: str, keys: PRNGKeyArray) -> Repeat:
-            found = jax.device_get(_repeats(config, noise_on == "all", drags[case], keys))
-            line.show_parts(next(done), len(cases) * len(parts))
-            return found
-
-        found = [[one(*case, keys) for keys in parts] for case in cases]
-    whole = (jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *each) for each in found)
-    rows = [row for case, repeats in zip(cases, whole, strict=True) for row in _rows(*case, repeats)]
-    return Results(rows, ("case", "noise_on", "parameter"))
-
-
-def check(config: Config) -> None:
-    """Refuse options that make no sense.
-
-    Raises:
-        ValueError: which, and what was expected.
     """
     if config.n_train <= len(LEARNED):
         raise ValueError(f"--n-train must be more than the {len(LEARNED)} parameters, got {config.n_train}")
@@ -145,6 +115,30 @@ def check(config: Config) -> None:
     if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
         raise ValueError(f"--noise-on must be targets, all or both, got {' '.join(config.noise_on) or 'nothing'}")
     check_numbers("--", config)
+    drags = {"exact physics": 0.0, "unknown drag": config.drag}
+    cases = list(itertools.product(drags, config.noise_on))
+    parts, done, rows = _parts(config), itertools.count(1), []
+    with Line(NAME, console) as line:
+        for case, noise_on in cases:
+            pieces = []
+            for keys in parts:
+                pieces.append(jax.device_get(_repeats(config, noise_on == "all", drags[case], keys)))
+                line.show_parts(next(done), len(cases) * len(parts))
+            repeats = jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *pieces)
+            share = repeats["inside"].mean(axis=0)
+            columns = {
+                "coverage": share,
+                "standard_error": np.sqrt(share * (1 - share) / config.repeats),
+                "bias": 100 * repeats["error"].mean(axis=0),
+                "half_width": 100 * repeats["half_width"].mean(axis=0),
+                "converged": np.full(len(LEARNED), repeats["converged"].mean()),
+            }
+            rows += [
+                {"case": case, "noise_on": noise_on, "parameter": parameter}
+                | {name: float(column[i]) for name, column in columns.items()}
+                for i, parameter in enumerate(LEARNED)
+            ]
+    return Results(rows, ("case", "noise_on", "parameter"))
 
 
 def recording(
@@ -155,14 +149,10 @@ def recording(
     x0 = starts(config, start_key)
     jitter = jax.random.normal(input_key, (config.n_train, config.steps, 4))
     u = IRIS.hover_speed + config.flight.rotor_speed * jitter
-    x = rollout_batch(Dragged(truth(), drag), x0, u, DT)
+    truth = RigidBody({name: jnp.log(TRUTH[name] / value) for name, value in nominal(IRIS).items()}, IRIS)
+    x = rollout_batch(Dragged(truth, drag), x0, u, DT)
     start = jnp.where(start_is_measured, measure(x0, config.noise, x0_key), x0)
     return Trajectories(start, u, measure(x, config.noise, x_key), DT)
-
-
-def truth() -> RigidBody:
-    """The vehicle that is flown."""
-    return RigidBody({name: jnp.log(TRUTH[name] / value) for name, value in nominal(IRIS).items()}, IRIS)
 
 
 def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
@@ -183,7 +173,7 @@ def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
 
 
 def _parts(config: Config) -> list[PRNGKeyArray]:
-    """The keys of all repeats, a few at a time: between two parts progress is drawn and an interrupt is heard."""
+    """The keys of all repeats, a few at a time: between two parts progress is drawn and interrupts are handled."""
     size = min(config.batch * -(-PART // config.batch), config.repeats)
     keys = jax.random.split(jax.random.key(config.seed), config.repeats)
     # The last part is filled up, so that one program serves all.
@@ -191,49 +181,22 @@ def _parts(config: Config) -> list[PRNGKeyArray]:
 
 
 @partial(jax.jit, static_argnums=0)
-def _repeats(config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray) -> Repeat:
-    """A part of the repeats, stacked: one program, compiled once for all parts and cases."""
+def _repeats(
+    config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray
+) -> dict[str, Array]:
+    """A part of the repeats, stacked, errors in shares of the truth: one program for all parts and cases."""
 
-    def one(key: PRNGKeyArray) -> Repeat:
+    def one(key: PRNGKeyArray) -> dict[str, Array]:
         windows = recording(config, start_is_measured, drag, key)
         found = fit_least_squares(rigid_body(IRIS), windows)
         around = intervals(found.field, covariance_of(found.field, windows, config.kind), config.level)
         value, low, high = (jnp.stack(side) for side in zip(*(around[name] for name in LEARNED), strict=True))
         true = jnp.array([TRUTH[name] for name in LEARNED])
         inside = (low <= true) & (true <= high) & found.converged
-        return Repeat(inside, value / true - 1, (high - low) / (2 * true), found.converged)
+        errors = {"error": value / true - 1, "half_width": (high - low) / (2 * true)}
+        return errors | {"inside": inside, "converged": found.converged}
 
     return jax.lax.map(one, keys, batch_size=min(config.batch, len(keys)))
-
-
-def _rows(case: str, noise_on: str, repeats: Repeat) -> list[dict[str, Any]]:
-    """A row for each parameter: shares; bias, half-width [% of the truth]. A repeat that did not converge is a miss."""
-    share = repeats.inside.mean(axis=0)
-    columns = {
-        "coverage": share,
-        "standard_error": np.sqrt(share * (1 - share) / len(repeats.inside)),
-        "bias": 100 * repeats.error.mean(axis=0),
-        "half_width": 100 * repeats.half_width.mean(axis=0),
-        "converged": np.full(len(LEARNED), repeats.converged.mean()),
-    }
-    return [
-        {"case": case, "noise_on": noise_on, "parameter": parameter}
-        | {name: float(column[i]) for name, column in columns.items()}
-        for i, parameter in enumerate(LEARNED)
-    ]
-
-
-def table(rows: Results, level: float) -> Table:
-    """The rows as text."""
-    groups = rows.group("case", "noise_on", "parameter")
-    columns = {
-        "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
-        "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",
-        "half-width [%]": lambda r: f"{r[0]['half_width']:.2f}",
-        "converged [%]": lambda r: f"{100 * r[0]['converged']:.0f}",
-    }
-    title = f"Does the {100 * level:g} % interval contain the truth?"
-    return tabulate(title, groups, columns, ("truth", "noise on", "θ_p"))
 
 
 def experiment(config: Config) -> None:
@@ -242,7 +205,15 @@ def experiment(config: Config) -> None:
     command.check_folder("--out", folder)
     rows = coverage(config, Console(stderr=True))
     write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": rows.rows}))
-    print_tables(Console(), [table(rows, config.level)])
+    columns = {
+        "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
+        "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",
+        "half-width [%]": lambda r: f"{r[0]['half_width']:.2f}",
+        "converged [%]": lambda r: f"{100 * r[0]['converged']:.0f}",
+    }
+    title = f"Does the {100 * config.level:g} % interval contain the truth?"
+    groups = rows.group("case", "noise_on", "parameter")
+    print_tables(Console(), [tabulate(title, groups, columns, ("truth", "noise on", "θ_p"))])
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

@@ -11,7 +11,7 @@ from typing import Annotated, Any, Literal
 import tyro
 
 from experiments.runner import command
-from hybrid_jax import Model, checks, load
+from hybrid_jax import checks, load
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 
@@ -44,16 +44,19 @@ class Config:
     """Size of u, likewise."""
 
 
-def export(config: Config) -> list[Path]:
-    """Write the files; their paths.
+def export(config: Config) -> None:
+    """Write the files; print their paths.
 
     Raises:
-        ValueError: no model, or a model that cannot be exported; says why.
+        ValueError: no model, a model that cannot be exported, or a step length that is not known or not positive.
         ImportError: the extra `export` or `casadi` is not installed.
         OSError: the folder cannot be written.
     """
     model = load(config.model)
-    dt = step_length(config, model)
+    dt = model.about.get("dt") if config.dt is None else config.dt
+    if dt is None:
+        raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
+    checks.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
     command.check_folder("--out", config.out)
     sizes: dict[str, Any] = {"state_size": config.state_size, "input_size": config.input_size}
     options = sizes | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
@@ -65,25 +68,12 @@ def export(config: Config) -> list[Path]:
         for path, function in zip([path.with_suffix(".casadi") for path in written], functions, strict=True):
             function.save(str(path))
             written.append(path)
-    return written
-
-
-def step_length(config: Config, model: Model) -> float:
-    """--dt, or the step length saved with the model.
-
-    Raises:
-        ValueError: neither is given, or it is not a positive number.
-    """
-    dt = model.about.get("dt") if config.dt is None else config.dt
-    if dt is None:
-        raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
-    checks.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
-    return dt
+    print(*written, sep="\n")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """The command line."""
-    command.call(NAME, Config, lambda config: print(*export(config), sep="\n"), arguments)
+    command.call(NAME, Config, export, arguments)
 
 
 if __name__ == "__main__":

@@ -3,29 +3,20 @@
 python -m experiments.external_force --help
 """
 
-import numpy as np
-from rich.console import Console
+from functools import partial
 
-from experiments.paper.config import PRESETS, AdaptationConfig
-from experiments.paper.outcome import write_outcome
-from experiments.paper.study import EVERY, study
+import numpy as np
+
+from experiments.paper.config import PRESETS
+from experiments.paper.outcome import adapt_and_report
+from experiments.paper.study import EVERY
 from experiments.runner import command
 from hybrid_jax.sim.domain import EXTERNAL_FORCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
-from hybrid_jax.sweep import hosts
 from hybrid_jax.vehicle import IRIS
 
-NAME, TITLE = "external_force", "External force"
-
-
-def experiment(config: AdaptationConfig, console: Console) -> None:
-    """Run the protocol in the wind and write the report, with the error that the wind's sine alone makes."""
-    found = study(EXTERNAL_FORCE, IRIS, config, console)
-    times = DT * np.arange(EVERY, found.target.splits["test"].horizon + 1, EVERY)
-    floor = sine_floor(IRIS.mass, times)
-    if hosts.is_main_process():
-        write_outcome(NAME, TITLE, EXTERNAL_FORCE, config, found, floor)
+NAME = "external_force"
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:
@@ -40,9 +31,13 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
     return float((WIND_AMPLITUDE / mass) ** 2 * np.mean(velocity + position))
 
 
+FLOOR = sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))  # on test flights
+
+
 def main() -> None:
     """The command line."""
-    command.run(NAME, "A side wind that no source flight had: adapt to it.", experiment, presets=PRESETS)
+    about = "A side wind that no source flight had: adapt to it."
+    command.run(NAME, about, partial(adapt_and_report, NAME, EXTERNAL_FORCE, FLOOR), presets=PRESETS)
 
 
 if __name__ == "__main__":

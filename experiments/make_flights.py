@@ -10,8 +10,7 @@ from rich.console import Console
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from experiments.runner.progress import Line
-from hybrid_jax.io.archive import digest
-from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
+from hybrid_jax.io.datasets import Dataset, config_hash, load_dataset, require_config, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
 from hybrid_jax.sim.render import picture
@@ -59,21 +58,17 @@ class Options:
         return splits
 
 
-def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_dir: str | Path) -> Dataset:
-    """The dataset of a domain, from the cache folder if it is there, else flown and saved there.
-
-    Raises:
-        ValueError: a cached file is damaged; the message names it, so that it can be deleted.
-    """
-    name = f"flights-{domain.name}-{digest(configuration(domain, splits, seed), {})[:12]}.npz"
-    return read_or_fly(Path(cache_dir) / name, domain, splits, seed)
+def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_dir: Path) -> Dataset:
+    """The dataset of a domain, from the cache folder if it is there, else flown and saved there; as `read_or_fly`."""
+    digest = config_hash(configuration(domain, splits, seed))
+    return read_or_fly(cache_dir / f"flights-{domain.name}-{digest[:12]}.npz", domain, splits, seed)
 
 
 def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
     """The dataset in a file; it is flown and saved if the file does not exist.
 
     Raises:
-        ValueError: the file is damaged or holds a dataset of another configuration.
+        ValueError: the file is damaged or holds another configuration; names it, so that it can be deleted.
     """
     if not path.exists():
         with Line(f"flying {domain.name}", Console(stderr=True)) as line:
@@ -88,37 +83,27 @@ def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) 
     Raises:
         ValueError: the file is damaged, of another domain, or has fewer windows than asked for, or of other lengths.
     """
-    whole = load_dataset(path, domain.describe())
+    whole, expected = load_dataset(path), domain.describe()
+    require_config(path, {key: whole.config.get(key) for key in expected}, expected)
     parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
     for name, spec in splits.items():
-        if parts[name].horizon != spec.steps:
-            raise ValueError(
-                f"{path}: split {name!r} has windows of {parts[name].horizon} steps, expected {spec.steps}"
-            )
+        found = parts[name].horizon
+        if found != spec.steps:
+            raise ValueError(f"{path}: split {name!r} has windows of {found} steps, expected {spec.steps}")
     return Dataset(parts, whole.metadata, origin=str(path))
 
 
-def statistics_table(dataset: Dataset) -> Table:
-    """Counts and statistics of the flights, a column for each split."""
-    tallies, statistics = dataset.metadata["tallies"], dataset.metadata["statistics"]
-    lines = [("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))]
-    lines += [
-        (name.replace("_", " "), *(str(tallies[split][name]) for split in dataset.splits))
-        for name in next(iter(tallies.values()))
-    ]
-    lines += [
-        (name, *(f"{statistics[split][name]:.3g}" for split in dataset.splits))
-        for name in next(iter(statistics.values()))
-    ]
-    return Table(f"{dataset.config['domain']}, seed {dataset.config['seed']}", ("", *dataset.splits), lines)
-
-
 def make_flights(options: Options) -> None:
-    """Fly and save the dataset unless it exists; print its table."""
+    """Fly and save the dataset unless it exists; print counts and statistics of its splits."""
     dataset = read_or_fly(options.out, DOMAINS[options.domain], options.splits(), options.seed)
     if options.picture is not None:
         picture(options.picture)
-    print_tables(Console(), [statistics_table(dataset)])
+    lines = [("windows x steps", *(f"{len(split)} x {split.horizon}" for split in dataset.splits.values()))]
+    for kind, form in (("tallies", ""), ("statistics", ".3g")):
+        found = [dataset.metadata[kind][split] for split in dataset.splits]
+        lines += [(name.replace("_", " "), *(f"{each[name]:{form}}" for each in found)) for name in found[0]]
+    title = f"{dataset.config['domain']}, seed {dataset.config['seed']}"
+    print_tables(Console(), [Table(title, ("", *dataset.splits), lines)])
 
 
 def main() -> None:

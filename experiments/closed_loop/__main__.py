@@ -23,8 +23,8 @@ from experiments.closed_loop.rows import Agent
 from experiments.closed_loop.scenarios import ModelSet, Scenario
 from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
-from experiments.paper.solved import constant_disturbance, needed_disturbance
 from experiments.runner import command
+from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
@@ -36,7 +36,7 @@ NAME = "closed_loop"
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
-DISTURBANCES = {"needed": needed_disturbance, "always": constant_disturbance}
+DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
 
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:

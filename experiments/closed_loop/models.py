@@ -13,9 +13,10 @@ from experiments.closed_loop.rows import SOURCES, Agent
 from experiments.closed_loop.scenarios import ModelSet
 from experiments.closed_loop.true_model import true_field
 from experiments.paper.config import Config
-from experiments.paper.solved import Solve, solved
+from experiments.paper.solved import solved
 from experiments.paper.study import adapted, flown, places, pretrained, source_splits, target_splits
 from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.adaptation import Method
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.normalisation import BatchNorm
@@ -55,18 +56,14 @@ def train(
 
 
 def least_squares(
-    source: AbstractVectorField, size: int, solve: Solve, config: Config, console: Console, domains: Sequence[Domain]
+    source: AbstractVectorField, size: int, method: Method, config: Config, console: Console, domains: Sequence[Domain]
 ) -> tuple[Trained, Stages]:
-    """Fit θ_p and a constant disturbance of the source models to each domain by least squares.
-
-    Args:
-        solve: `needed_disturbance` or `constant_disturbance`.
-    """
+    """Fit θ_p and a constant disturbance of the source models to each domain by least squares."""
     stages, own = stages_of(config, console), replace(config, sizes=(size,))
 
     def fit(domain: Domain) -> AbstractVectorField:
         target = flown(domain, target_splits(config), config, stages)
-        return solved(f"least squares {domain.name}", solve, source, own, stages, target).fields
+        return solved(f"least squares {domain.name}", method, source, own, stages, target).fields
 
     return Trained(source, {(domain.name, size): fit(domain) for domain in domains}), stages
 

@@ -11,7 +11,7 @@ from jaxtyping import Int, PRNGKeyArray
 from experiments.paper.config import Config, Encoding, Stopping, column
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, perturbed_by
+from hybrid_jax.dynamics.rigid_body import ForcedBody, perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
@@ -25,10 +25,7 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 FORCES = 6  # v̇ and ω̇ are the last outputs of every residual network
-FORCED = {
-    "wrench": "accelerations",
-    "rotors": "rotors",
-}  # outputs of `make_residual` that are forces
+FORCED = {"wrench": "accelerations", "rotors": "rotors"}  # outputs of `make_residual` that are forces
 PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range(7)  # purposes of a seed's keys
 
 
@@ -45,9 +42,27 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
 # Equinox passes the options to jax.jit, but does not declare them.
 @eqx.filter_jit(compiler_options=FASTEST_COMPILE)  # pyright: ignore[reportCallIssue]
 def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
+    forced = config.residual_outputs in FORCED
+    # In tenths of the hover speed, from hover: of the magnitude of the other inputs.
+    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+
     def build(seed):
-        physics = _first_guess(vehicle, config, _key(seed, PHYSICS))
-        network = _network(vehicle, config, _key(seed, NETWORK))
+        if config.perturbed_by is None:
+            low, high = config.guess
+            physics = perturbed(vehicle, _key(seed, PHYSICS), low=low, high=high)
+        else:
+            physics = perturbed_by(vehicle, _key(seed, PHYSICS), config.perturbed_by)
+        physics = ForcedBody(physics.log_ratios, vehicle) if forced else physics
+        network = make_residual(
+            _key(seed, NETWORK),
+            inputs=config.residual_inputs,
+            outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
+            hidden=config.hidden,
+            norm=config.norm,
+            scaling=hover if config.inputs == "hover" else InputScaling(),
+            linear=config.residual_linear,
+            vehicle=vehicle,
+        )
         return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
 
     return eqx.filter_vmap(build)(seeds)
@@ -60,12 +75,11 @@ def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState,
 
 def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, RunConfig]:
     """Pre-training from the seeds' fields, with all rates times a factor."""
-    rate, rule = _pretraining_rule(model, config)
-    everything = np.arange(config.source_train)
-    plan = _plan(model, config, rate, rule, everything, config.source_train)
+    patience = config.patience
+    rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
+    plan = _plan(model, config, config.rates.pretraining, rule, np.arange(config.source_train), config.source_train)
     plan = replace(plan, rates=jax.tree.map(lambda rate: factor * rate, plan.rates))
-    starts = _starts(fields, np.arange(config.seeds), PRETRAINING)
-    return starts, stack([plan] * config.seeds)
+    return _starts(fields, np.arange(config.seeds), PRETRAINING), stack([plan] * config.seeds)
 
 
 def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, RunConfig]:
@@ -84,12 +98,7 @@ def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Confi
 def augmentation(
     experts: AbstractVectorField, past: Trajectories, encoding: Encoding, config: Config
 ) -> tuple[FitState, RunConfig]:
-    """One run per seed: the encoder of Expert Augmentation, on source flights and on rollouts of the expert.
-
-    Args:
-        experts: the pre-trained hybrids of all seeds.
-        past: the first part of each source window, the input of the encoder.
-    """
+    """One run per seed: the encoder of Expert Augmentation, which sees the past, the first part of source windows."""
 
     def build(expert, seed):
         key = _key(seed, ENCODER)
@@ -107,40 +116,6 @@ def sampled_indices(seed: int, config: Config) -> np.ndarray:
     return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
 
 
-def input_scaling(vehicle: Vehicle, config: Config) -> InputScaling:
-    """The scaling of rotor speeds at the input of a network."""
-    # In tenths of the hover speed, from hover: of the magnitude of the other inputs.
-    hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
-    return {"hover": hover, "raw": InputScaling()}[config.inputs]
-
-
-def _first_guess(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> RigidBody:
-    if config.perturbed_by is None:
-        body = perturbed(vehicle, key, low=config.guess[0], high=config.guess[1])
-    else:
-        body = perturbed_by(vehicle, key, config.perturbed_by)
-    return ForcedBody(body.log_ratios, vehicle) if config.residual_outputs in FORCED else body
-
-
-def _network(vehicle: Vehicle, config: Config, key: PRNGKeyArray) -> AbstractVectorField:
-    return make_residual(
-        key,
-        inputs=config.residual_inputs,
-        outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
-        hidden=config.hidden,
-        norm=config.norm,
-        scaling=input_scaling(vehicle, config),
-        linear=config.residual_linear,
-        vehicle=vehicle,
-    )
-
-
-def _pretraining_rule(model: str, config: Config) -> tuple[float, Stopping]:
-    patience = config.patience
-    no_physics = model == "no_physics"
-    return config.rates.pretraining, patience.no_physics_pretraining if no_physics else patience.hybrid_pretraining
-
-
 def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[float, Stopping]:
     """The rate of θ_d and the stopping rule of a size."""
     rates, patience, i = config.rates, config.patience, column(size)
@@ -150,13 +125,11 @@ def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[
     return rates.hybrid[i], Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
 
 
-def _plan(model: str, config: Config, rate: float, rule: Stopping, subset: np.ndarray, size: int) -> RunConfig:
+def _plan(model: str, config: Config, rate: Any, rule: Stopping, subset: np.ndarray, size: int) -> RunConfig:
     physics: Any = config.rates.physics
-    network: Any = rate
-    rates = {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
-    return make_run_config(
-        rates, subset, size, rule.minimum, rule.patience, config.max_epochs, config.regulariser_weight
-    )
+    rates = {"hybrid": Hybrid(physics, rate), "no_physics": rate, "physics_only": physics}[model]
+    weight, cap = config.regulariser_weight, config.max_epochs
+    return make_run_config(rates, subset, size, rule.minimum, rule.patience, cap, weight)
 
 
 def _with_offset(plan: RunConfig, field: AbstractVectorField, config: Config) -> RunConfig:

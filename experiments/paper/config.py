@@ -137,24 +137,26 @@ class Config(Run):
         Run.__post_init__(self)
         check_numbers("--", self)
         factors("--guess", self.guess)
-        if not self.sizes or min(self.sizes) < self.batch_size:
-            raise ValueError(f"--sizes must each be at least --batch-size {self.batch_size}, got {self.sizes}")
-        if self.norm == "batch" and self.batch_size < 2 and self.has_networks():
-            raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
+        if not self.sizes or len({*self.sizes}) < len(self.sizes):
+            raise ValueError(f"--sizes must be at least one, each different, got {self.sizes}")
+        batch = f"--batch-size {self.batch_size}"
+        if min(self.sizes) < self.batch_size:
+            raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
         if self.source_train < self.batch_size:
-            raise ValueError(f"--source-train must be at least --batch-size {self.batch_size}, got {self.source_train}")
-        if len(set(self.sizes)) < len(self.sizes):
-            raise ValueError(f"--sizes must be different, got {self.sizes}")
-        if self.pool is not None and self.pool < max(self.sizes):
+            raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
+        chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
+        if NO_PHYSICS in chosen and self.residual_outputs != "all":
+            refused = f"--residual-outputs {self.residual_outputs}"
+            raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")
+        # Physics alone has nothing to normalise.
+        if self.norm == "batch" and self.batch_size < 2 and chosen != {PHYSICS_ONLY}:
+            raise ValueError(f"--batch-size must be at least 2 with --norm batch, got {self.batch_size}")
+        if self.pooled() < max(self.sizes):
             raise ValueError(f"--pool must be at least the largest of --sizes {self.sizes}, got {self.pool}")
         for name in ("rates.hybrid", "rates.no_physics", "patience.hybrid_minimum", "patience.hybrid_patience"):
             group, entry = name.split(".")
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
-
-    def has_networks(self) -> bool:
-        """Whether any trained model has f_d."""
-        return True
 
     def pooled(self) -> int:
         """The number of target trajectories from which a seed draws."""
@@ -176,17 +178,10 @@ class AdaptationConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--models", self.models)
-        if NO_PHYSICS in self.models and self.residual_outputs != "all":
-            raise ValueError(
-                f"--residual-outputs {self.residual_outputs}: no_physics must write all derivatives, leave it out"
-            )
-
-    def has_networks(self) -> bool:
-        return set(self.models) != {PHYSICS_ONLY}
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
-    """A configuration of a kind with the shared options of another one, except sizes and pool, and the changes."""
+    """A configuration with the shared options of another one, except sizes and pool, and the changes."""
     shared = {name: getattr(like, name) for name in Config.__dataclass_fields__ if name not in ("sizes", "pool")}
     return kind(**shared | changes)
 

@@ -1,7 +1,7 @@
 """Figures of the paper's experiments: scores and θ_p against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -11,19 +11,11 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import THETA_TOLERANCE
-from experiments.paper.lanes import THETA, Cell, by_domain, cells, gain, method_label, ranked
+from experiments.paper.lanes import THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
+from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import (
-    DRAWABLE,
-    FLOOR_LABEL,
-    STYLE,
-    Line,
-    colour,
-    error_legend,
-    error_panel,
-    legend_below,
-)
+from experiments.reporting.plots import DRAWABLE, STYLE, Line, colour, error_legend, error_panel, legend_below
 from experiments.reporting.results import Column, Results, Row
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
@@ -36,7 +28,7 @@ MEANING = "mean ± one standard deviation over seeds; hollow: over the finite se
 
 
 class _Curve(NamedTuple):
-    """At each N: of the finite values mean, mean ± one std and smallest; and how many of how many are not finite."""
+    """At each N: of the finite values mean, mean ± std and smallest; and how many of how many are not finite."""
 
     n: np.ndarray
     mean: np.ndarray
@@ -52,46 +44,31 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
-    """Figs. 3 and 5: test error and ρ against N, mean and one standard deviation over seeds.
-
-    Args:
-        floor: an error that no model at hand can get below, such as the share of a wind's sine; 0 if there is none.
-
-    Raises:
-        ValueError: no rows.
-    """
-    _require(rows)
+    """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
     figure = Figure(figsize=(9, 4.8), layout="constrained")
     left, right = figure.subplots(1, 2)
     _draw_errors(left, _curves(rows, "test_mse"), floor)
     _draw_gains(right, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
+    sizes = adapted_sizes(rows)
     for axes in (left, right):
         axes.set_xlabel("N, target trajectories trained on")
-        _tick_sizes(axes, rows)
+        axes.set_xticks(sizes, [str(n) for n in sizes])
     return legend_below(figure, title, MEANING, columns=3)
 
 
 @mpl.rc_context(STYLE)
-def theta(rows: Results, truth: Mapping[str, float], title: str = "Physical parameters after training") -> Figure:
-    """Ix, Iy and k relative to the truth against N, mean and one standard deviation over seeds.
-
-    Args:
-        truth: the true value of each; none is 0.
-
-    Raises:
-        ValueError: no trained row has parameters.
-    """
+def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
+    """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
-    if not len(known):
-        raise ValueError("rows must hold some with theta: there is nothing to draw")
+    sizes = adapted_sizes(known)
     figure = Figure(figsize=(9, 4.1), layout="constrained")
     panels = figure.subplots(1, len(THETA))
     for axes, name in zip(panels, THETA, strict=True):
         _draw_biases(axes, _curves(known, lambda row, name=name: _bias(row, name, truth)))
         axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
-        _tick_sizes(axes, known)
+        axes.set_xticks(sizes, [str(n) for n in sizes])
     panels[0].set_ylabel("recovered / true − 1  [%]")
-    return legend_below(figure, title, MEANING, columns=4)
+    return legend_below(figure, "Physical parameters after training", MEANING, columns=4)
 
 
 @mpl.rc_context(STYLE)
@@ -99,83 +76,67 @@ def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProx
     """Table 2: the test errors of all seeds of every method, the smallest mean on top, a panel for each domain.
 
     Args:
-        floors: domain → an error that no model at hand can get below, such as the share of a wind's sine.
-
-    Raises:
-        ValueError: no rows.
+        floors: domain → an error that no model can get below.
     """
-    _require(rows)
-    panels = {domain: ranked(group) for domain, group in by_domain(rows).items()}
-    counts = [len(methods) for methods in panels.values()]
+    several_sizes = len(adapted_sizes(rows)) > 1
+    panels = {}
+    for domain, group in by_domain(rows).items():
+        panels[domain] = lines = []
+        for cell, own in ranked(group).items():
+            name = f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell)
+            marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
+            lines.append(Line(name, own.numbers("test_mse"), colour(cell[0]), marked))
+    counts = [len(lines) for lines in panels.values()]
     figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
     column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
-    several_sizes = len({*rows["n_train"]} - {0}) > 1
-    for axes, (domain, methods) in zip(column, panels.items(), strict=True):
-        lines = [_method_line(cell, group, several_sizes) for cell, group in methods.items()]
-        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+    _draw_panels(column, panels, floors)
     return error_legend(figure, title, None in rows["test_mse"])
 
 
 @mpl.rc_context(STYLE)
 def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
-    """The test errors of the fine-tuned models of one choice: a panel for each domain, a line for each value and N.
+    """The fine-tuned models of one choice, as in `ranking`: a line for each value and N.
 
     Args:
         rows: with the tags value and default.
-        floors: domain → an error that no model can get below.
-
-    Raises:
-        ValueError: no rows.
     """
-    _require(rows)
-    tuned = rows.where(mode=FINE_TUNED)
-    panels = {domain: _ablation_lines(group) for domain, group in by_domain(tuned).items()}
+    panels = {domain: _ablation_lines(group) for domain, group in by_domain(rows.where(mode=FINE_TUNED)).items()}
     count = max(len(lines) for lines in panels.values())
     figure = Figure(figsize=(11, 1.9 + 0.32 * count), layout="constrained")
     row = figure.subplots(1, len(panels), squeeze=False)[0]
-    for axes, (domain, lines) in zip(row, panels.items(), strict=True):
-        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+    _draw_panels(row, panels, floors)
     for axes in row[1:]:
         axes.tick_params(labelleft=False)  # the lines are those of the first panel
     return error_legend(figure, title, None in rows["test_mse"])
 
 
-def _require(rows: Results) -> None:
-    if not len(rows):
-        raise ValueError("rows must not be empty: there is nothing to draw")
-
-
-def _method_line(cell: Cell, rows: Results, several_sizes: bool) -> Line:
-    name = f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell)
-    marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
-    return Line(name, rows.numbers("test_mse"), colour(cell[0]), marked)
+def _draw_panels(panels: Iterable[Axes], lines: Mapping[str, Sequence[Line]], floors: Mapping[str, float]) -> None:
+    for axes, (domain, own) in zip(panels, lines.items(), strict=True):
+        error_panel(axes, own, label(domain).capitalize(), floors.get(domain, 0.0))
 
 
 def _ablation_lines(rows: Results) -> list[Line]:
-    sizes, lines = sorted({*rows["n_train"]}), []
+    sizes, lines = adapted_sizes(rows), []
     for n in sizes:
         for group in rows.where(n_train=n).group("value").values():
-            name, default = value_label(group[0]), group[0]["default"]
-            tint, marked = (colour(HYBRID), "mean of the default") if default else ("0.35", "")
-            full = f"{name}, N = {n}" if len(sizes) > 1 else name
-            lines.append(Line(full, group.numbers("test_mse"), tint, marked if n == sizes[0] else ""))
+            tint, marked = (colour(HYBRID), "mean of the default") if group[0]["default"] else ("0.35", "")
+            name = f"{value_label(group[0])}, N = {n}" if len(sizes) > 1 else value_label(group[0])
+            lines.append(Line(name, group.numbers("test_mse"), tint, marked if n == sizes[0] else ""))
     return lines
 
 
 def _curves(rows: Results, value: Column) -> _Curves:
     points: dict[tuple[str, str], list[tuple[float, ...]]] = {}
     for (model, mode, n), group in cells(rows).items():
-        points.setdefault((model, mode), []).append((n, *_point(group.numbers(value))))
+        values = group.numbers(value)
+        finite = values[np.abs(values) < DRAWABLE]
+        mean, low, high, smallest = (math.nan,) * 4
+        if len(finite):
+            mean, std = finite.mean(), finite.std(ddof=1) if len(finite) > 1 else 0.0
+            low, high, smallest = mean - std, mean + std, finite.min()
+        point = (n, mean, low, high, smallest, len(values) - len(finite), len(values))
+        points.setdefault((model, mode), []).append(point)
     return {key: _Curve(*np.array(found, float).T) for key, found in points.items()}
-
-
-def _point(values: np.ndarray) -> tuple[float, ...]:
-    finite = values[np.abs(values) < DRAWABLE]
-    failed = len(values) - len(finite)
-    if not len(finite):
-        return math.nan, math.nan, math.nan, math.nan, failed, len(values)
-    mean, std = finite.mean(), finite.std(ddof=1) if len(finite) > 1 else 0.0
-    return mean, mean - std, mean + std, finite.min(), failed, len(values)
 
 
 def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
@@ -193,7 +154,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
             axes.axhspan(curve.low[0], curve.high[0], color=colour(model), alpha=0.12, linewidth=0)
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if floor > 1 / DRAWABLE:
-        axes.axhline(floor, color="0.4", linestyle="-.", label=FLOOR_LABEL)
+        axes.axhline(floor, color="0.4", linestyle="-.", label=plots.FLOOR_LABEL)
 
 
 def _draw_gains(axes: Axes, curves: _Curves) -> None:
@@ -224,11 +185,10 @@ def _draw_curves(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at
         inside = (curve.mean >= bottom) & (curve.mean <= top)
         mean, low, high = (np.where(inside, np.clip(part, bottom, top), np.nan) for part in curve[1:4])
         style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markersize": 5}
-        whiskers = np.stack([mean - low, high - mean])
-        axes.errorbar(x, mean, whiskers, capsize=3, label=label(model, mode), **style)
+        axes.errorbar(x, mean, np.stack([mean - low, high - mean]), capsize=3, label=label(model, mode), **style)
         lost = top if lost_at_top else bottom
-        for index, at in enumerate(x):
-            _mark_failure(axes, at, [part[index] for part in curve], lost, colour(model))
+        for at, *point in zip(x, *curve, strict=True):
+            _mark_failure(axes, at, point, lost, colour(model))
 
 
 def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, colour: str) -> None:
@@ -247,13 +207,6 @@ def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, co
         box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5}
         style = {"va": align, "fontsize": 8, "color": colour, "bbox": box, "zorder": 6}
         axes.annotate(words, (at, y), offset, textcoords="offset points", **style)
-
-
-def _tick_sizes(axes: Axes, rows: Results) -> None:
-    sizes = sorted({*rows["n_train"]} - {0})
-    axes.set_xticks(sizes, [str(size) for size in sizes])
-    if not sizes:
-        axes.set_xticks([])
 
 
 def _bias(row: Row, name: str, truth: Mapping[str, float]) -> float:

@@ -11,7 +11,8 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.names import HYBRID, label
 from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below
-from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.sim.survey import tilt
+from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, VELOCITY
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
 VIEW_RATIO = 1.6  # width of a view over the extent of the truth
@@ -28,67 +29,46 @@ def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], ti
     Args:
         truth: states from the start on.
         predicted: N → model → its states from the same start; any number of them, also ones that are not finite.
-
-    Raises:
-        ValueError: no prediction, or states of another shape.
     """
-    if not predicted:
-        raise ValueError("predicted must not be empty: there is nothing to draw")
-    truth = _states("truth", truth)
     figure = Figure(figsize=(3.1 * max(len(predicted), 2), 4.1), layout="constrained")
     panels = figure.subplots(1, len(predicted), sharey=True, squeeze=False)[0]
     for axes, (n, models) in zip(panels, sorted(predicted.items()), strict=True):
-        _draw_paths(axes, truth, {name: _states(f"predicted[{n}][{name!r}]", x) for name, x in models.items()})
+        _draw_paths(axes, truth, models)
         axes.set(title=f"N = {n} trajectories", xlabel="x [m]")
     panels[0].set_ylabel("y [m]")
     return legend_below(figure, title, columns=4)
 
 
 @mpl.rc_context(STYLE)
-def example_flight(
-    states: States, inputs: Float[np.ndarray, "t 4"], dt: float, title: str = "An example flight of the data"
-) -> Figure:
+def example_flight(states: States, inputs: Float[np.ndarray, "t 4"], dt: float) -> Figure:
     """Fig. 7: the path in space, and altitude, speed, tilt and rotor speeds over time.
 
     Args:
         inputs: rotor speeds [rad/s], each held for dt [s].
-
-    Raises:
-        ValueError: states or inputs of another shape, or dt not positive.
     """
-    states, inputs = _states("states", states), np.asarray(inputs, float)
-    shape = (len(states) - 1, INPUT_SIZE)
-    if inputs.shape != shape or not dt > 0:
-        raise ValueError(f"inputs must have the shape {shape} and dt be positive, got {inputs.shape} and {dt}")
     time = dt * np.arange(len(states))
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.15, 1))
     _draw_space(figure.add_subplot(grid[:, 0], projection="3d"), states)
-    first = figure.add_subplot(grid[0, 1])
-    panels = [first, *(figure.add_subplot(grid[row, 1], sharex=first) for row in range(1, 4))]
-    speed = np.linalg.norm(states[:, VELOCITY], axis=1)
-    named = (("altitude\n[m]", states[:, POSITION][:, 2]), ("speed\n[m/s]", speed), ("tilt\n[°]", tilt(states)))
-    for axes, (name, values) in zip(panels, named, strict=False):
+    panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
+    lines = {
+        "altitude\n[m]": states[:, POSITION][:, 2],
+        "speed\n[m/s]": np.linalg.norm(states[:, VELOCITY], axis=1),
+        "tilt\n[°]": tilt(states[:, QUATERNION]),
+    }
+    for axes, (name, values) in zip(panels, lines.items(), strict=False):
+        axes.sharex(panels[-1])
         axes.plot(time, values, color=colour(HYBRID))
         axes.set_ylabel(name)
         axes.tick_params(labelbottom=False)
-    _draw_rotors(panels[-1], time, inputs)
+    rotors = panels[-1]
+    for index, (name, tint) in enumerate(zip(INPUT_NAMES, COLOURS.values(), strict=False)):
+        rotors.stairs(inputs[:, index], time, baseline=None, color=tint, label=name, linewidth=1)
+    rotors.set(xlabel="time [s]", ylabel="rotors\n[rad/s]")
+    rotors.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=7, columnspacing=1, handlelength=1, frameon=True)
     figure.align_ylabels(panels)
-    figure.suptitle(title, fontsize=12)
+    figure.suptitle("An example flight of the data", fontsize=12)
     return figure
-
-
-def tilt(states: States) -> Float[np.ndarray, " t+1"]:
-    """The angle between body z and world z [°], from the unit quaternions (w, x, y, z)."""
-    quaternions = states[:, QUATERNION]
-    return np.degrees(2 * np.arctan2(np.hypot(*quaternions[:, 1:3].T), np.hypot(*quaternions[:, [0, 3]].T)))
-
-
-def _states(name: str, states: Any) -> States:
-    states = np.asarray(states, float)
-    if states.ndim != 2 or states.shape[1] != STATE_SIZE or len(states) < 2:
-        raise ValueError(f"{name} must have the shape (t + 1, {STATE_SIZE}) with t of at least 1, got {states.shape}")
-    return states
 
 
 def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
@@ -101,20 +81,16 @@ def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None
         drawn = states[: len(near) if near.all() else int(np.argmin(near)), :2]
         shown, tint = label(name), colour(name)
         axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=shown)
-        _mark_if_outside(axes, states[:, :2], centre, half, shown, tint)
+        if np.all(np.abs(states[:, :2] - centre) <= half):
+            continue
+        with np.errstate(over="ignore"):
+            off = np.linalg.norm(states[:, :2] - centre, axis=1).max()
+        words = f"{shown} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{shown} ends: not finite"
+        y = 0.02 + 0.12 * len(axes.texts)
+        axes.text(0.03, y, words, transform=axes.transAxes, color=tint, fontsize=8, va="bottom")
     axes.plot(*path.T, color="black", linestyle="--", linewidth=1.5, label="truth", zorder=4)
     axes.plot(*start, marker="o", color="black", markerfacecolor="white", linestyle="", label="start", zorder=5)
     axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
-
-
-def _mark_if_outside(axes: Axes, path: np.ndarray, centre: np.ndarray, half: float, name: str, tint: str) -> None:
-    if np.all(np.abs(path - centre) <= half):
-        return
-    with np.errstate(over="ignore"):
-        off = np.linalg.norm(path - centre, axis=1).max()
-    words = f"{name} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{name} ends: not finite"
-    y = 0.02 + 0.12 * len(axes.texts)
-    axes.text(0.03, y, words, transform=axes.transAxes, color=tint, fontsize=8, va="bottom")
 
 
 def _draw_space(axes: Any, states: States) -> None:
@@ -127,10 +103,3 @@ def _draw_space(axes: Any, states: States) -> None:
     axes.set_zlim(bottom=0)
     axes.locator_params(nbins=5)
     axes.set_box_aspect(None, zoom=0.8)  # room for the label of z
-
-
-def _draw_rotors(axes: Axes, time: np.ndarray, inputs: np.ndarray) -> None:
-    for index, (name, tint) in enumerate(zip(INPUT_NAMES, COLOURS.values(), strict=False)):
-        axes.stairs(inputs[:, index], time, baseline=None, color=tint, label=name, linewidth=1)
-    axes.set(xlabel="time [s]", ylabel="rotors\n[rad/s]")
-    axes.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=7, columnspacing=1, handlelength=1, frameon=True)

@@ -11,7 +11,7 @@ import numpy as np
 import hybrid_jax
 from experiments.paper.solved import Solved
 from experiments.reporting import names
-from experiments.reporting.names import label
+from experiments.reporting.names import HYBRID, SOURCE_ONLY, label
 from experiments.reporting.results import Results, Row
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.sim.flight import DT
@@ -21,16 +21,11 @@ from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED, FitState
 THETA = ("Ix", "Iy", "k")
 DOMAINS = (names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)
 BASELINES = (
-    names.EXPERT_AUGMENTATION,
-    names.THETA_P_ONLY,
-    names.THETA_D_ONLY,
-    names.LAST_LAYER,
-    names.LEAST_SQUARES,
-    names.CONSTANT_DISTURBANCE,
-    names.LINEAR_RESIDUAL,
-)
-MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
-MODES = (names.FINE_TUNED, names.TARGET_ONLY, names.SOURCE_ONLY)
+    names.EXPERT_AUGMENTATION, names.THETA_P_ONLY, names.THETA_D_ONLY, names.LAST_LAYER, names.LEAST_SQUARES,
+    names.CONSTANT_DISTURBANCE, names.LINEAR_RESIDUAL,
+)  # fmt: skip
+MODELS = (HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
+MODES = (names.FINE_TUNED, names.TARGET_ONLY, SOURCE_ONLY)
 CELL = ("model", "mode", "n_train")
 TAGS = ("domain", *CELL, "seed")
 Cell = tuple[str, str, int]  # model, mode, n_train
@@ -41,8 +36,7 @@ class Lanes:
     """The trained models of one kind in one mode, one for each size and seed.
 
     Attributes:
-        sizes, seeds: of each.
-        fields: the trained models, stacked.
+        fields: the models, stacked.
         errors: L^T_MSE of each on the test flights.
         val_mse: L_MSE of each on the validation windows.
         epochs, status: of its training; see `training`.
@@ -61,10 +55,6 @@ class Lanes:
     status: np.ndarray
     theta: Mapping[str, np.ndarray] | None
     intervals: Mapping[str, np.ndarray] | None = None
-
-    def field(self, index: int) -> AbstractVectorField:
-        """One of the models."""
-        return lane(self.fields, index)
 
 
 def trained(
@@ -92,23 +82,38 @@ def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray] | None:
 
 
 def rows_of(groups: Sequence[Lanes], domain: str) -> Results:
-    """A row for each model, without ρ; see `with_rho`.
+    """A row for each model, tested in a domain; without ρ, see `with_rho`."""
 
-    Args:
-        domain: in which the models were tested.
-    """
-    return Results([_row(lanes, i, domain) for lanes in groups for i in range(len(lanes.sizes))], TAGS)
+    def row(lanes: Lanes, i: int) -> Row:
+        theta = {name: float(value[i]) for name, value in (lanes.theta or {}).items()}
+        ends = {name: pair[i] for name, pair in (lanes.intervals or {}).items()}
+        # An interval with an end that is not finite bounds nothing.
+        bounds = {name: pair.tolist() if np.isfinite(pair).all() else None for name, pair in ends.items()}
+        return {
+            "domain": domain,
+            "model": lanes.model,
+            "mode": lanes.mode,
+            "n_train": int(lanes.sizes[i]),
+            "seed": int(lanes.seeds[i]),
+            "test_mse": float(lanes.errors[i]),
+            "rho": None,
+            "val_mse": float(lanes.val_mse[i]),
+            "epochs": int(lanes.epochs[i]),
+            "status": STATUS_NAMES.get(int(lanes.status[i]), STATUS_NAMES[STOPPED]),
+            "theta": theta or None,
+            "theta_interval": bounds or None,
+        }
+
+    return Results([row(lanes, i) for lanes in groups for i in range(len(lanes.sizes))], TAGS)
 
 
 def with_rho(rows: Results) -> Results:
-    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9).
-
-    L^S is the source-only error of the same domain, seed and model; for one of BASELINES, that of the hybrid.
+    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`.
 
     Raises:
         ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.
     """
-    source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=names.SOURCE_ONLY)}
+    source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=SOURCE_ONLY)}
 
     def rho(row: Row) -> float | None:
         key = row["domain"], source_of(row["model"]), row["seed"]
@@ -123,7 +128,7 @@ def with_rho(rows: Results) -> Results:
 
 def source_of(model: str) -> str:
     """The model whose pre-training an adaptation starts from."""
-    return names.HYBRID if model in BASELINES else model
+    return HYBRID if model in BASELINES else model
 
 
 def gain(row: Row) -> float:
@@ -149,6 +154,11 @@ def by_domain(rows: Results) -> dict[str, Results]:
     return rows.sort(domain=DOMAINS).group("domain")
 
 
+def adapted_sizes(rows: Results) -> list[int]:
+    """Each N of adapted models, ascending."""
+    return sorted({*rows["n_train"]} - {0})
+
+
 def ranked(rows: Results) -> dict[Cell, Results]:
     """`cells`, the smallest mean error first; among infinite means the smallest error first."""
 
@@ -162,43 +172,14 @@ def ranked(rows: Results) -> dict[Cell, Results]:
 def method_label(cell: Cell) -> str:
     """A cell as a method for readers, without its N: an adapted model needs no mode, nor does a baseline."""
     model, mode, _ = cell
-    return (
-        label(model)
-        if mode == names.FINE_TUNED or (mode == names.SOURCE_ONLY and model in BASELINES)
-        else label(model, mode)
-    )
+    plain = mode == names.FINE_TUNED or (mode == SOURCE_ONLY and model in BASELINES)
+    return label(model) if plain else label(model, mode)
 
 
 def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:
-    """Save every trained model, with what is known about it."""
-    known = rows.group(*CELL, "seed")
-    for lanes in groups:
-        for i, (size, seed) in enumerate(zip(lanes.sizes, lanes.seeds, strict=True)):
-            row = known[lanes.model, lanes.mode, size, seed][0]
-            about = {name: row[name] for name in ("model", "mode", "n_train", "seed", "test_mse", "val_mse")}
-            name = f"{lanes.model}-{lanes.mode}-{size}-seed{seed}.npz"
-            hybrid_jax.save(folder / name, lanes.field(i), about | {"dt": DT})
-
-
-def _row(lanes: Lanes, i: int, domain: str) -> dict[str, Any]:
-    theta, ends = lanes.theta, lanes.intervals
-    bounds = None if ends is None else {name: _interval(pair[i]) for name, pair in ends.items()}
-    return {
-        "domain": domain,
-        "model": lanes.model,
-        "mode": lanes.mode,
-        "n_train": int(lanes.sizes[i]),
-        "seed": int(lanes.seeds[i]),
-        "test_mse": float(lanes.errors[i]),
-        "rho": None,
-        "val_mse": float(lanes.val_mse[i]),
-        "epochs": int(lanes.epochs[i]),
-        "status": STATUS_NAMES.get(int(lanes.status[i]), STATUS_NAMES[STOPPED]),
-        "theta": None if theta is None else {name: float(value[i]) for name, value in theta.items()},
-        "theta_interval": bounds,
-    }
-
-
-def _interval(ends: np.ndarray) -> list[float] | None:
-    """Both ends, or None if one is not finite: the interval then bounds nothing."""
-    return [float(end) for end in ends] if np.isfinite(ends).all() else None
+    """Save every trained model, with what its row says about it; the rows as `rows_of` orders them."""
+    models = [lane(lanes.fields, i) for lanes in groups for i in range(len(lanes.sizes))]
+    for model, row in zip(models, rows, strict=True):
+        about = {name: row[name] for name in ("model", "mode", "n_train", "seed", "test_mse", "val_mse")}
+        path = folder / "{model}-{mode}-{n_train}-seed{seed}.npz".format(**row)
+        hybrid_jax.save(path, model, about | {"dt": DT})

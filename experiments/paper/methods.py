@@ -1,6 +1,6 @@
-"""The methods of Table 2 and more baselines: each a function from a case to trained and tested models."""
+"""The methods of Table 2 and more baselines: from a case to trained and tested models."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -11,24 +11,25 @@ import numpy as np
 
 from experiments.paper.conditions import adaptation, settings
 from experiments.paper.config import Config
-from experiments.paper.lanes import Lanes, physics_in, solution, theta_of, trained
-from experiments.paper.solved import Solve, by_lane, constant_disturbance, least_squares, solved, subsets
+from experiments.paper.lanes import Lanes, physics_in, solution, source_of, theta_of, trained
+from experiments.paper.solved import SOLVED, solved, subsets
 from experiments.paper.study import domain_name, places
 from experiments.reporting import names
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation import ridge
+from hybrid_jax.adaptation import covariance_of, intervals
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, unfreeze
+from hybrid_jax.dynamics.base import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.sweep.training import evaluate
-from hybrid_jax.training.fitting import STOPPED, FitState
+from hybrid_jax.training.fitting import FitState
 from hybrid_jax.trajectories import Trajectories, split
 
 PAST = 10  # intervals of a test window before the ones to predict
+WITHOUT_INTERVALS = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, names.LAST_LAYER, names.LINEAR_RESIDUAL)
 Method = Literal[
     "hybrid", "no_physics", "physics_only", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer",
     "least_squares", "constant_disturbance", "linear_residual",
@@ -62,106 +63,82 @@ class Case:
         return self.stages.timed(f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)))
 
 
-def tuned(model: str, mark: Callable[[Any], AbstractVectorField] = lambda field: field) -> Callable[[Case, str], Lanes]:
-    """Fine-tune a pre-trained model by Adam, except the parts that `mark` freezes."""
-
-    def method(case: Case, name: str) -> Lanes:
-        config = case.config
-        starts, plans = adaptation(model, names.FINE_TUNED, mark(case.pretrained[model].best), config)
-        final = case.stages.run(f"{names.FINE_TUNED} {name} {case.name}", starts, plans, settings(config), case.target)
-        whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
-        errors = case.tested(name, whole.best)
-        return with_intervals(case, trained(name, names.FINE_TUNED, *places(config.sizes, config), whole, errors))
-
-    return method
+def source_only(case: Case, model: str) -> Lanes:
+    """A pre-trained model, unchanged."""
+    final = case.pretrained[model]
+    errors = case.tested(f"{names.SOURCE_ONLY} {model}", final.best)
+    return trained(model, names.SOURCE_ONLY, *places((0,), case.config), final, errors)
 
 
-def found_by(solve: Solve) -> Callable[[Case, str], Lanes]:
-    """Adapt the hybrid by a solver instead of training."""
-
-    def method(case: Case, name: str) -> Lanes:
-        config, start = case.config, case.pretrained[names.HYBRID].best
-        found = solved(f"{names.FINE_TUNED} {name} {case.name}", solve, start, config, case.stages, case.target)
-        errors = case.tested(name, found.fields)
-        return with_intervals(case, solution(name, *places(config.sizes, config), found, errors))
-
-    return method
-
-
-def source_only(model: str) -> Callable[[Case], Lanes]:
-    """The pre-trained model, unchanged."""
-
-    def method(case: Case) -> Lanes:
-        final = case.pretrained[model]
-        errors = case.tested(f"{names.SOURCE_ONLY} {model}", final.best)
-        return trained(model, names.SOURCE_ONLY, *places((0,), case.config), final, errors)
-
-    return method
+def adapted(case: Case, method: Method) -> Lanes:
+    """The source models adapted by a method: fine-tuned by Adam, by an encoder, or by a method of the library."""
+    if method == names.EXPERT_AUGMENTATION:
+        return _augmented(case)
+    config, stage, model = case.config, f"{names.FINE_TUNED} {method} {case.name}", source_of(method)
+    start, (sizes, seeds) = case.pretrained[model].best, places(config.sizes, config)
+    if method in SOLVED:
+        found = solved(stage, SOLVED[method], start, config, case.stages, case.target)
+        return _with_intervals(case, solution(method, sizes, seeds, found, case.tested(method, found.fields)))
+    if method == names.THETA_P_ONLY:
+        start = Hybrid(start.physics, Frozen(start.residual))
+    elif method == names.THETA_D_ONLY:
+        start = Hybrid(Frozen(start.physics), start.residual)
+    final = case.stages.run(stage, *adaptation(model, names.FINE_TUNED, start, config), settings(config), case.target)
+    whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
+    errors = case.tested(method, whole.best)
+    return _with_intervals(case, trained(method, names.FINE_TUNED, sizes, seeds, whole, errors))
 
 
-def augmented(case: Case, name: str) -> Lanes:
+def _augmented(case: Case) -> Lanes:
     """Expert Augmentation: the encoder estimates θ_p of each test window from its past; it uses no target data."""
-    assert case.experts is not None
-    solver = settings(case.config).solver
-    windows = case.target.splits["test_with_past"]
+    name, experts, windows = names.EXPERT_AUGMENTATION, case.experts, case.target.splits["test_with_past"]
+    assert experts is not None
 
-    def one(model, windows: Trajectories):
-        past, _ = split(windows, PAST)
-        typical = jnp.mean(jax.lax.map(model.estimate, past, batch_size=min(250, len(past))), axis=0)
-        return prediction_mse(model, windows, PAST, solver), physics_of(model.with_parameters(typical))
+    def test():
+        return jax.device_get(_encoded(experts.best, windows, settings(case.config).solver))
 
-    experts = case.experts
-    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: by_lane(one, experts.best, windows))
+    errors, physics = case.stages.timed(f"test {name} {case.name}", test)
     lanes = trained(name, names.SOURCE_ONLY, *places((0,), case.config), experts, errors)
     return replace(lanes, theta=theta_of(physics))
 
 
-def with_intervals(case: Case, lanes: Lanes) -> Lanes:
+@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+def _encoded(experts, windows: Trajectories, solver):
+    """The test error of each model, and its physics with the mean of the estimates of θ_p."""
+    past, _ = split(windows, PAST)
+
+    def one(model):
+        typical = model.solve(None, past, past, None).field
+        return prediction_mse(model, windows, PAST, solver), physics_of(typical)
+
+    return jax.lax.map(one, experts)
+
+
+def _with_intervals(case: Case, lanes: Lanes) -> Lanes:
     """The models with the 95 % interval of θ_p from the windows of their adaptation, if θ_p was adapted.
 
     The interval treats the network as fixed. It would do so with a disturbance too, so models that fitted one get none.
     """
-    without = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, *CLOSED_FORM)
-    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in without:
+    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in WITHOUT_INTERVALS:
         return lanes
-    solver = settings(case.config).solver
-
-    def one(lane, pool: Trajectories):
-        field, subset = lane
-        found = intervals(field, covariance_of(field, pool[subset], solver=solver))
-        return {name: jnp.stack([interval.low, interval.high]) for name, interval in found.items()}
+    config, pool = case.config, case.target.splits["train"]
 
     def of_size(index: int, size: int):
-        seeds = case.config.seeds
-        fields = lane(lanes.fields, np.arange(index * seeds, (index + 1) * seeds))
-        return by_lane(one, (fields, subsets(size, case.config)), case.target.splits["train"])
+        fields = lane(lanes.fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
+        return jax.device_get(_intervals((fields, subsets(size, config)), pool, settings(config).solver))
 
     parts = case.stages.timed(
         f"intervals {lanes.model} {case.name}",
-        lambda: [of_size(index, size) for index, size in enumerate(case.config.sizes)],
+        lambda: [of_size(index, size) for index, size in enumerate(config.sizes)],
     )
     return replace(lanes, intervals=jax.tree.map(lambda *ends: np.concatenate(ends), *parts))
 
 
-def _ridge(method) -> Callable[[Case, str], Lanes]:
-    def solve(field, train, validation, shared):
-        return ridge.fit_ridge(method, field, train, validation, settings=shared).field, 0, STOPPED
+@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+def _intervals(lanes, pool: Trajectories, solver):
+    def one(lane):
+        field, subset = lane
+        found = intervals(field, covariance_of(field, pool[subset], solver=solver))
+        return {name: jnp.stack([interval.low, interval.high]) for name, interval in found.items()}
 
-    return found_by(solve)
-
-
-CLOSED_FORM = {
-    names.LAST_LAYER: _ridge(ridge.last_layer),
-    names.LINEAR_RESIDUAL: _ridge(ridge.linear_residual),
-}
-METHODS: Mapping[str, Callable[[Case, str], Lanes]] = {
-    names.HYBRID: tuned(names.HYBRID),
-    names.NO_PHYSICS: tuned(names.NO_PHYSICS),
-    names.PHYSICS_ONLY: tuned(names.PHYSICS_ONLY),
-    names.EXPERT_AUGMENTATION: augmented,
-    names.THETA_P_ONLY: tuned(names.HYBRID, lambda field: Hybrid(field.physics, Frozen(field.residual))),
-    names.THETA_D_ONLY: tuned(names.HYBRID, lambda field: Hybrid(Frozen(field.physics), field.residual)),
-    names.LEAST_SQUARES: found_by(least_squares),
-    names.CONSTANT_DISTURBANCE: found_by(constant_disturbance),
-    **CLOSED_FORM,
-}
+    return jax.lax.map(one, lanes)

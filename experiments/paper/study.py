@@ -1,7 +1,7 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ from experiments.paper.conditions import adaptation, annealing, fresh_fields, pr
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
 from experiments.paper.sensors import measured
-from experiments.paper.solved import Solve, constant_disturbance, solved
-from experiments.reporting.names import CONSTANT_DISTURBANCE, FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
+from experiments.paper.solved import SOLVED, Solved, solved
+from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
 from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
@@ -31,7 +31,6 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
-SOLVED: Mapping[str, Solve] = {CONSTANT_DISTURBANCE: constant_disturbance}  # models that are not trained
 
 
 @dataclass(frozen=True)
@@ -42,37 +41,35 @@ class Study:
     target: Dataset
     lanes: list[Lanes]
     rows: Results
-    seconds: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
+    seconds: dict[str, float]
+    notes: list[str]
 
 
 def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
-    """Run the protocol on a target domain; finished stages come from the cache.
-
-    Args:
-        vehicle: as known before the change; models start around its nominal θ_p.
-    """
+    """Run the protocol on a target domain, from models around the nominal θ_p of the vehicle before the change."""
     stages = stages_of(config, console)
-
-    def get(file: Path | None, of: Domain, splits: dict[str, SplitSpec]) -> Dataset:
-        if file is not None:
-            return measured(from_first(lambda: chosen_flights(file, of, splits)), config.noise, config.data_seed)
-        return flown(of, splits, config, stages)
-
     lanes: list[Lanes] = []
     learned: dict[str, FitState] = {}
     sources = dict.fromkeys(source_of(model) for model in config.models)
     unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
     with PrecompilePool({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
-        source = get(config.source_flights, SOURCE, source_splits(config))
-        target = get(config.target_flights, domain, target_splits(config))
+        source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
+        target = flown(domain, target_splits(config), config, stages, config.target_flights)
         for model in config.models:
             start = source_of(model)
             if start not in learned:
                 programs.wait_for(start)
                 learned[start] = pretrained(start, vehicle, config, stages, source)
-                lanes.append(_tested(start, SOURCE_ONLY, learned[start], config, stages, target))
-            lanes += _adapted_lanes(model, learned[start].best, vehicle, config, stages, target)
+                lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
+            fields, finals = learned[start].best, dict[str, FitState | Solved]()
+            if model in SOLVED:
+                name = f"{FINE_TUNED} {model} {domain_name(target)}"
+                finals[FINE_TUNED] = solved(name, SOLVED[model], fields, config, stages, target)
+            else:
+                finals[FINE_TUNED] = adapted(model, FINE_TUNED, fields, config, stages, target)
+                fresh = fresh_fields(model, vehicle, config)
+                finals[TARGET_ONLY] = adapted(model, TARGET_ONLY, fresh, config, stages, target)
+            lanes += [tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
     rows = with_rho(rows_of(lanes, domain_name(target)))
     return Study(source, target, lanes, rows, stages.seconds, stages.notes())
 
@@ -95,12 +92,28 @@ def adapted(
     return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, capacity(config))
 
 
-def flown(domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages) -> Dataset:
-    """The flights of a domain, from the cache or the simulator, with the configured measurement noise."""
-    found = stages.timed(
-        f"flights {domain.name}",
-        lambda: from_first(lambda: flights(domain, splits, config.data_seed, config.cache)),
-    )
+def tested(model: str, mode: str, found: FitState | Solved, config: Config, stages: Stages, target: Dataset) -> Lanes:
+    """The models with their L^T_MSE on the test flights."""
+    fields = found.fields if isinstance(found, Solved) else found.best
+    windows, count = target.splits["test"], capacity(config)[0]
+    errors = stages.timed(f"test {mode} {model}", lambda: evaluate(fields, windows, EVERY, settings(config), count))
+    where = places((0,) if mode == SOURCE_ONLY else config.sizes, config)
+    if isinstance(found, Solved):
+        return solution(model, *where, found, errors)
+    return trained(model, mode, *where, found, errors)
+
+
+def flown(
+    domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages, file: Path | None = None
+) -> Dataset:
+    """The flights of a domain with the configured measurement noise: of a file, or from the cache or the simulator."""
+
+    def read() -> Dataset:
+        if file is not None:
+            return chosen_flights(file, domain, splits)
+        return flights(domain, splits, config.data_seed, config.cache)
+
+    found = stages.timed(f"flights {domain.name}", lambda: from_first(read))
     return measured(found, config.noise, config.data_seed)
 
 
@@ -110,11 +123,8 @@ def from_first(read: Callable[[], Dataset]) -> Dataset:
     def parts() -> tuple[Any, Arrays]:
         found = read()
         arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
-        return [
-            dict(found.metadata),
-            {name: windows.dt for name, windows in found.splits.items()},
-            found.origin,
-        ], arrays
+        steps = {name: windows.dt for name, windows in found.splits.items()}
+        return [dict(found.metadata), steps, found.origin], arrays
 
     (metadata, steps, origin), arrays = hosts.from_first(parts)
     splits = {name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=dt) for name, dt in steps.items()}
@@ -141,17 +151,6 @@ def capacity(config: Config) -> tuple[int, int]:
     return config.seeds * len(config.sizes), max(config.source_train, config.pooled())
 
 
-def _adapted_lanes(
-    model: str, source: AbstractVectorField, vehicle: Vehicle, config: Config, stages: Stages, target: Dataset
-) -> list[Lanes]:
-    """A model after adaptation to the target: fine-tuned and target-only, or solved."""
-    if model in SOLVED:
-        return [_solved(model, source, config, stages, target)]
-    starts = {FINE_TUNED: source, TARGET_ONLY: fresh_fields(model, vehicle, config)}
-    finals = {mode: adapted(model, mode, start, config, stages, target) for mode, start in starts.items()}
-    return [_tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
-
-
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     """Compile all programs that training and testing a model will run; they depend on shapes only."""
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
@@ -164,25 +163,6 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
-
-
-def _tested(model: str, mode: str, final: FitState, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    errors = _errors(f"test {mode} {model}", final.best, config, stages, target)
-    return trained(model, mode, *places((0,) if mode == SOURCE_ONLY else config.sizes, config), final, errors)
-
-
-def _solved(model: str, source: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    name = f"{FINE_TUNED} {model}"
-    found = solved(f"{name} {domain_name(target)}", SOLVED[model], source, config, stages, target)
-    errors = _errors(f"test {name}", found.fields, config, stages, target)
-    return solution(model, *places(config.sizes, config), found, errors)
-
-
-def _errors(stage: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> np.ndarray:
-    """L^T_MSE of stacked fields on the test flights."""
-    return stages.timed(
-        stage, lambda: evaluate(fields, target.splits["test"], EVERY, settings(config), capacity(config)[0])
-    )
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

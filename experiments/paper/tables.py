@@ -1,67 +1,24 @@
-"""The tables of the paper's experiments: errors and ρ by N, the ranking beside Table 2, θ_p, ablations; notes."""
+"""The tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable, Mapping
+from typing import Any
 
 from experiments.paper.claims import FEW
-from experiments.paper.lanes import (
-    CELL,
-    DOMAINS,
-    MODELS,
-    THETA,
-    Cell,
-    by_domain,
-    cells,
-    gain,
-    method_label,
-    ranked,
-)
-from experiments.reporting.names import (
-    EXPERT_AUGMENTATION,
-    EXTERNAL_FORCE,
-    FINE_TUNED,
-    HYBRID,
-    PARAMETER_SHIFT,
-    PHYSICS_ONLY,
-    SOURCE_ONLY,
-    TARGET_ONLY,
-    label,
-)
+from experiments.paper.lanes import MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.reporting import names
+from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
-from experiments.reporting.stats import Spread, spread
-from experiments.reporting.tables import (
-    EMPTY,
-    Table,
-    cross_table,
-    mean_over_seeds,
-    over_seeds,
-    spread_text,
-    tabulate,
-)
+from experiments.reporting.stats import spread
+from experiments.reporting.tables import EMPTY, Table, cross_table, mean_over_seeds, over_seeds, spread_text, tabulate
 
-EXPERT, PHYSICS = (EXPERT_AUGMENTATION, SOURCE_ONLY, 0), (PHYSICS_ONLY, FINE_TUNED, FEW)
+TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
+EXPERT = (names.EXPERT_AUGMENTATION, SOURCE_ONLY, 0)
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "k": "N/(rad/s)²"}
-
-
-class Quoted(NamedTuple):
-    """An error printed in the paper: a mean with its std, or the smallest of ten seeds."""
-
-    error: float
-    std: float | None = None
-
-
-PAPER: Mapping[str, Mapping[Cell, Quoted]] = {
-    PARAMETER_SHIFT: {
-        (HYBRID, FINE_TUNED, FEW): Quoted(3.26e-3, 2.66e-5),
-        EXPERT: Quoted(3.68e-3),
-        PHYSICS: Quoted(3.76e-3),
-    },
-    EXTERNAL_FORCE: {
-        (HYBRID, FINE_TUNED, FEW): Quoted(2.64e-3, 1.56e-4),
-        EXPERT: Quoted(4.02e-3),
-        PHYSICS: Quoted(4.53e-3),
-    },
+# Errors printed in the paper: a mean with its std, or the smallest of ten seeds.
+PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] = {
+    names.PARAMETER_SHIFT: {TUNED: (3.26e-3, 2.66e-5), EXPERT: (3.68e-3, None), PHYSICS: (3.76e-3, None)},
+    names.EXTERNAL_FORCE: {TUNED: (2.64e-3, 1.56e-4), EXPERT: (4.02e-3, None), PHYSICS: (4.53e-3, None)},
 }
 
 
@@ -80,30 +37,29 @@ def rho_text(rows: Results) -> str:
 
 def by_size(rows: Results) -> list[Table]:
     """Test error and ρ in each domain: a line per N, a column per model and mode."""
-    return [table for place, group in _places(rows) for table in _by_size(group, place)]
 
-
-def _by_size(rows: Results, place: str) -> list[Table]:
-    of = mean_over_seeds(rows)
-    trained = rows.where(lambda row: row["mode"] != SOURCE_ONLY)
-    pairs = {(row["model"], FINE_TUNED if row["mode"] == SOURCE_ONLY else row["mode"]) for row in trained or rows}
-    columns = {
-        # A source-only model is what fine-tuning starts from: it stands at the head of that column.
-        label(model, mode): {"model": model, "mode": (FINE_TUNED, SOURCE_ONLY) if mode == FINE_TUNED else mode}
-        for model in MODELS
-        for mode in (FINE_TUNED, TARGET_ONLY)
-        if (model, mode) in pairs
-    }
-
-    def table(rows: Results, title: str, text: Callable[[Results], str]) -> Table:
+    def table(
+        rows: Results, title: str, columns: Mapping[str, Mapping[str, Any]], text: Callable[[Results], str]
+    ) -> Table:
         groups = rows.sort(n_train=None).group("n_train")
         lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": group for n, group in groups.items()}
         return cross_table(title, lines, columns, text, "N, target trajectories")
 
-    return [
-        table(rows, f"Test error L^T_MSE{place} ({of}; less is better)", error_text),
-        table(trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
-    ]
+    tables = []
+    for place, group in _places(rows):
+        trained, of = group.where(mode=(FINE_TUNED, TARGET_ONLY)), mean_over_seeds(group)
+        # A source-only model is what fine-tuning starts from: it stands at the head of that column.
+        modes = {FINE_TUNED: (FINE_TUNED, SOURCE_ONLY), TARGET_ONLY: (TARGET_ONLY,)}
+        columns = {
+            label(model, mode): {"model": model, "mode": seen}
+            for model in MODELS
+            for mode, seen in modes.items()
+            if len((trained or group).where(model=model, mode=seen))
+        }
+        error = f"Test error L^T_MSE{place} ({of}; less is better)"
+        rho = f"Improvement ρ over source-only{place} ({of}; 1 is perfect)"
+        tables += [table(group, error, columns, error_text), table(trained, rho, columns, rho_text)]
+    return tables
 
 
 def ranking(rows: Results) -> list[Table]:
@@ -112,64 +68,46 @@ def ranking(rows: Results) -> list[Table]:
     A ratio is the paper's: the mean of the fine-tuned hybrid, the smallest error of any other method, over the smallest
     of fine-tuned physics-only (at the smallest N, if there are several).
     """
-    return [_ranking(domain, group) for domain, group in by_domain(rows).items()]
-
-
-def _ranking(domain: str, rows: Results) -> Table:
-    found, quoted = ranked(rows), PAPER[domain]
-    physics = min((cell for cell in found if cell[:2] == PHYSICS[:2]), default=None)
-    below = math.nan if physics is None else found[physics].spread("test_mse").smallest
-
-    def quote(cell: Cell) -> tuple[str, str]:
-        if cell not in quoted:
-            return EMPTY, EMPTY
-        error, std = quoted[cell]
-        shown = f"{error:.2e} (smallest)" if std is None else f"{error:.2e} ± {std:.2e}"
-        return shown, _ratio_text(cell, error, quoted[PHYSICS].error)
-
-    def line(cell: Cell, values: Spread) -> Sequence[str]:
-        smallest = "∞" if math.isinf(values.smallest) else f"{values.smallest:.2e}"
-        ratio = _ratio_text(cell, values.mean if _by_mean(cell) else values.smallest, below)
-        n = str(cell[2]) if cell[2] else EMPTY
-        return method_label(cell), n, smallest, error_text(found[cell]), ratio, *quote(cell)
-
-    of = f"experiment {DOMAINS.index(domain) + 1} of the paper; {over_seeds(rows)}; less is better"
     header = ("method", "N", "smallest", "mean ± std", "ratio to physics-only's smallest", "paper", "paper's ratio")
-    lines = [line(cell, group.spread("test_mse")) for cell, group in found.items()]
-    return Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines)
+    tables = []
+    for domain, group in by_domain(rows).items():
+        found, quoted = ranked(group), PAPER[domain]
+        physics = min((cell for cell in found if cell[:2] == PHYSICS[:2]), default=None)
+        best = math.nan if physics is None else found[physics].spread("test_mse").smallest
+        lines = []
+        for cell, of_cell in found.items():
+            values, kind = of_cell.spread("test_mse"), "mean" if cell[:2] == TUNED[:2] else "smallest"
+            own = _ratio(values.mean if kind == "mean" else values.smallest, best, kind)
+            paper = EMPTY, EMPTY
+            if cell in quoted:
+                error, std = quoted[cell]
+                shown = f"{error:.2e} (smallest)" if std is None else f"{error:.2e} ± {std:.2e}"
+                paper = shown, _ratio(error, quoted[PHYSICS][0], kind)
+            smallest = f"{values.smallest:.2e}".replace("inf", "∞")
+            lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
+        of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better"
+        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines))
+    return tables
 
 
-def _by_mean(cell: Cell) -> bool:
-    """Whether the paper quotes the mean of a method; of the others it quotes the best seed."""
-    return cell[:2] == (HYBRID, FINE_TUNED)
-
-
-def _ratio_text(cell: Cell, above: float, below: float) -> str:
-    if not 0 < below < math.inf:
-        return EMPTY
-    ratio = above / below
-    return f"{'∞' if math.isinf(ratio) else f'{ratio:.3g}'} ({'mean' if _by_mean(cell) else 'smallest'})"
+def _ratio(above: float, below: float, kind: str) -> str:
+    return f"{above / below:.3g} ({kind})".replace("inf", "∞") if 0 < below < math.inf else EMPTY
 
 
 def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
-    """θ_p of each cell that has it, mean ± std over seeds, and the truth: a table for each domain.
-
-    Args:
-        truth: Ix, Iy [kg m²], k [N/(rad/s)²], or these by domain.
-    """
-    places = _places(rows.where(lambda row: row["theta"] is not None))
-    return [_parameters(group, place, truth_in(truth, group[0]["domain"])) for place, group in places]
-
-
-def truth_in(truth: Mapping[str, Any] | None, domain: str) -> Mapping[str, float] | None:
-    """The true Ix, Iy, k in a domain, given these, or these by domain."""
-    return truth if truth is None or set(truth) == set(THETA) else truth.get(domain)
+    """θ_p of each cell that has it, mean ± std over seeds, and the truth (or that by domain): a table per domain."""
+    known = _places(rows.where(lambda row: row["theta"] is not None))
+    if truth is None or set(truth) == set(THETA):
+        return [_parameters(group, place, truth) for place, group in known]
+    return [_parameters(group, place, truth.get(group[0]["domain"])) for place, group in known]
 
 
 def _parameters(rows: Results, place: str, truth: Mapping[str, float] | None) -> Table:
-    groups = {(label(m), label(mode), str(n) if n else EMPTY): group for (m, mode, n), group in cells(rows).items()}
-    true: Mapping[str, float | None] = dict.fromkeys(THETA) if truth is None else truth
-    columns = {f"{k} [{UNITS[k]}]": lambda group, k=k: _theta_text(group, k, true[k]) for k in THETA}
+    groups = {(label(m), label(mode), str(n or EMPTY)): group for (m, mode, n), group in cells(rows).items()}
+    columns = {
+        f"{k} [{UNITS[k]}]": lambda group, k=k: _theta_text(group, k, None if truth is None else truth[k])
+        for k in THETA
+    }
     given = any(row["theta_interval"] is not None for row in rows)
     of = f" ({over_seeds(rows)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
     table = tabulate(f"Recovered physical parameters θ_p{place}{of}", groups, columns, ("model", "mode", "N"))
@@ -185,15 +123,14 @@ def _theta_text(rows: Results, name: str, truth: float | None) -> str:
         return f"not finite in {values.non_finite} of {values.count} seeds"
     text = spread_text(values, ".4g", ".2g")
     intervals = [each[name] for each in rows["theta_interval"] if each is not None]
-    return f"{text}, {_interval_text(intervals, truth)}" if intervals else text
-
-
-def _interval_text(intervals: Sequence[Any], truth: float | None) -> str:
+    if not intervals:
+        return text
     finite = [interval for interval in intervals if interval]
     if not finite:
-        return "95 % interval not finite"
-    some = "" if len(finite) == len(intervals) else f" in {len(finite)} of {len(intervals)} seeds"
-    text = f"95 % ± {spread([(high - low) / 2 for low, high in finite]).mean:.2g}{some}"
+        return f"{text}, 95 % interval not finite"
+    text += f", 95 % ± {spread([(high - low) / 2 for low, high in finite]).mean:.2g}"
+    if len(finite) < len(intervals):
+        text += f" in {len(finite)} of {len(intervals)} seeds"
     if truth is None:
         return text
     return f"{text} ({sum(low <= truth <= high for low, high in finite)} of {len(intervals)} true)"
@@ -204,22 +141,11 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
 
     Args:
         rows: with the tags choice, value and default.
-        truth: domain → the true Ix, Iy [kg m²], k [N/(rad/s)²].
+        truth: the true θ_p by domain.
     """
-    return [_ablation(choice, group, truth) for choice, group in rows.group("choice").items()]
-
-
-def _ablation(choice: str, rows: Results, truth: Mapping[str, Mapping[str, float]]) -> Table:
-    groups = {
-        (f"{label(domain)}, {n}", value_label(group[0])): group.where(domain=domain, n_train=(0, n))
-        for domain in by_domain(rows)
-        for n in sorted({*rows["n_train"]} - {0})
-        for group in rows.group("value").values()
-    }
 
     def bias(rows: Results) -> str:
-        true = truth[rows[0]["domain"]]
-        tuned = rows.where(mode=FINE_TUNED)
+        true, tuned = truth[rows[0]["domain"]], rows.where(mode=FINE_TUNED)
         return ", ".join(f"{100 * (tuned.spread(f'theta.{k}').mean / true[k] - 1):+.1f}" for k in true)
 
     columns = {
@@ -228,8 +154,17 @@ def _ablation(choice: str, rows: Results, truth: Mapping[str, Mapping[str, float
         "fine-tuned": lambda group: error_text(group.where(mode=FINE_TUNED)),
         "off in Ix, Iy, k [%]": bias,
     }
-    title = f"{choice.capitalize()} (L_MSE, {over_seeds(rows)}; less is better)"
-    return tabulate(title, groups, columns, ("target, N", choice))
+    tables = []
+    for choice, rows_of_choice in rows.group("choice").items():
+        groups = {
+            (f"{label(domain)}, {n}", value_label(group[0])): group.where(domain=domain, n_train=(0, n))
+            for domain in by_domain(rows_of_choice)
+            for n in adapted_sizes(rows_of_choice)
+            for group in rows_of_choice.group("value").values()
+        }
+        title = f"{choice.capitalize()} (L_MSE, {over_seeds(rows_of_choice)}; less is better)"
+        tables.append(tabulate(title, groups, columns, ("target, N", choice)))
+    return tables
 
 
 def value_label(row: Row) -> str:
@@ -239,31 +174,24 @@ def value_label(row: Row) -> str:
 
 def run_notes(rows: Results) -> list[str]:
     """A sentence on runs that reached the cap on epochs, one on those that diverged, one on errors not finite."""
-    epochs = sorted({row["epochs"] for row in rows if row["status"] == "diverged"})
-    shown = f", in epoch {', '.join(map(str, epochs))}," if epochs else ""
-    return [
-        _tally(rows, "reached the cap on epochs before early stopping", lambda row: row["status"] == "capped"),
-        _tally(
-            rows,
-            f"met a non-finite loss{shown} and count with their best epoch before it",
-            lambda row: row["status"] == "diverged",
-        ),
-        _tally(
-            rows,
-            "have a test error that is not finite; it counts as infinite (∞)",
-            lambda row: row["test_mse"] is None,
-        ),
-    ]
-
-
-def _tally(rows: Results, words: str, chosen: Callable[[Row], bool]) -> str:
-    found = rows.where(chosen)
-    counted = [
-        f"{label(model, mode)}, N = {n}{place}: {len(cell)}"
-        for place, group in _places(rows)
-        for (model, mode, n), cell in group.where(chosen).group(*CELL).items()
-    ]
-    return f"{len(found)} of {len(rows)} runs {words}" + (f" ({'; '.join(counted)})." if counted else ".")
+    diverged = rows.where(status="diverged")
+    epochs = ", ".join(map(str, sorted({*diverged["epochs"]})))
+    when = f", in epoch {epochs}," if epochs else ""
+    kinds = {
+        "reached the cap on epochs before early stopping": rows.where(status="capped"),
+        f"met a non-finite loss{when} and count with their best epoch before it": diverged,
+        "have a test error that is not finite; it counts as infinite (∞)": rows.where(test_mse=None),
+    }
+    notes = []
+    several = len(rows.group("domain")) > 1
+    for words, found in kinds.items():
+        counted = [
+            f"{label(model, mode)}, N = {n}{f', {label(domain)}' if several else ''}: {len(cell)}"
+            for domain, group in by_domain(found).items()
+            for (model, mode, n), cell in cells(group).items()
+        ]
+        notes.append(f"{len(found)} of {len(rows)} runs {words}" + (f" ({'; '.join(counted)})." if counted else "."))
+    return notes
 
 
 def _places(rows: Results) -> list[tuple[str, Results]]:

@@ -6,12 +6,7 @@
     result.parameters["log_length"].value, result.parameters["log_length"].low
 
 By default least squares fits the physical parameters θ_p and, if the windows need one, a constant disturbance; the
-network stays as it is. `METHODS` lists the other methods by name; a method is a value, and `Method` says how to write
-one.
-
-- adapting, result, methods: `adapt`, what it returns, and the methods.
-- least_squares, disturbance_selection, uncertainty: the pure functions behind least squares and its intervals.
-- ridge, expert_augmentation: corrections in closed form; an encoder that estimates θ_p from the past.
+network stays as it is. `METHODS` lists the other methods by name; `Method` says how to write one.
 """
 
 from hybrid_jax.adaptation.adapting import adapt

@@ -1,5 +1,7 @@
 """`adapt`: one call that adapts any field to windows of a changed system, by any method."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -8,11 +10,12 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import check_windows
 from hybrid_jax.adaptation.methods import METHODS, Method, Solution, scale_of
 from hybrid_jax.adaptation.result import NOT_LEAST_SQUARES, STATUS, UNDETERMINED, Adaptation, Parameter
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals, named_parameters
+from hybrid_jax.adaptation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
 from hybrid_jax.integrate import checked
+from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.training.channels import MULTIROTOR, Channel, ChannelLoss
 from hybrid_jax.training.fitting import DIVERGED
@@ -55,10 +58,9 @@ def adapt(
     Raises:
         ValueError: an unknown method, malformed, too few or other windows, or a field that the method cannot adapt.
     """
-    name, method = _method(method)
+    name, method = _named(method)
     check_windows(field, windows)
-    if not 0 < (checks.real(level) or 0) < 1:
-        raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
+    check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     for part, data in (("windows", windows), ("validation", held_out)):
@@ -66,8 +68,10 @@ def adapt(
         checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
-        name = type(physics_of(field)).__name__
-        raise ValueError(f"field: {name} has {size} parameters, no named physics to fit; use method='fine_tune'")
+        physics = type(physics_of(field)).__name__
+        raise ValueError(f"field: {physics} has {size} parameters, no named physics to fit; use method='fine_tune'")
+    if (reason := check_savable(field)) is not None:
+        warnings.warn(reason, stacklevel=2)
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
@@ -93,10 +97,7 @@ def adapt(
 
 
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
-    """A loss in which the error of each channel is relative to its RMS change over a window.
-
-    Channels are the states, or the vectors in the state of a rigid body.
-    """
+    """A loss relative to the RMS change over a window of each state, or of each vector in the state of a rigid body."""
     d = windows.x0.shape[-1]
     parts = MULTIROTOR.values() if moves_a_rigid_body(field) else [slice(i, i + 1) for i in range(d)]
     x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
@@ -108,7 +109,7 @@ def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLos
     return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
 
 
-def _method(method: str | Method) -> tuple[str, Method]:
+def _named(method: str | Method) -> tuple[str, Method]:
     if isinstance(method, str):
         if method not in METHODS:
             raise ValueError(f"method must be one of {', '.join(METHODS)}, or a value, got {method!r}")
@@ -120,8 +121,10 @@ def _method(method: str | Method) -> tuple[str, Method]:
 
 def _split(windows: Trajectories, validation: Trajectories | None, needed: bool) -> tuple[Trajectories, Trajectories]:
     """The windows to train on and those to validate with; the same where none are needed."""
-    if validation is not None or not needed:
-        return windows, windows if validation is None else validation
+    if validation is not None:
+        return windows, validation
+    if not needed:
+        return windows, windows
     if len(windows) < 2:
         raise ValueError("windows: one is too few to hold some out; pass validation=")
     last = len(windows) - max(1, len(windows) // HELD_OUT)

@@ -4,8 +4,6 @@ More parameters always fit the same windows better. Without a steady disturbance
 does not help on the next flight. So each window is predicted by a fit to all others, with and without a disturbance
 (leave-one-out cross-validation; Stone 1974), and the simpler model is kept unless it is worse by more than one standard
 error of the difference (Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3).
-The fits without one window are solved from the normal equations at the minimum, which is exact for linear residuals
-(PRESS; Allen 1974). Windows must be independent; the errors within one need not be.
 """
 
 import equinox as eqx
@@ -14,15 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares
-from hybrid_jax.adaptation.uncertainty import inverse, normal_equations
+from hybrid_jax.adaptation.uncertainty import CHUNK, NormalEquations, inverse, normal_equations
+from hybrid_jax.dynamics import disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.dynamics.disturbance import (
-    disturbance_of,
-    physics_of,
-    with_disturbance,
-    with_physics,
-    without_disturbance,
-)
 from hybrid_jax.trajectories import Trajectories
 
 
@@ -48,43 +40,37 @@ def select_disturbance(
     Pure, as `fit_least_squares`. A single window, or windows that do not determine the parameters, need no disturbance.
 
     Args:
-        windows: n independent ones.
-        indices: the disturbed states, see `with_disturbance`; for the rest see `fit_least_squares`.
+        windows: independent ones; the errors within one need not be.
+        indices: the disturbed states, see `with_disturbance`.
 
-    Raises:
-        ValueError: as `fit_least_squares`.
+    For the rest, and ValueErrors, see `fit_least_squares`.
     """
-    with_one = fit_least_squares(with_disturbance(field, indices), windows, solver, max_steps, scale)
-    without = fit_least_squares(without_disturbance(field), windows, solver, max_steps, scale)
-    return _selection(without, with_one, windows, solver, scale)
+    starts = disturbance.with_disturbance(field, indices), disturbance.without_disturbance(field)
+    fits = [fit_least_squares(start, windows, solver, max_steps, scale) for start in starts]
+    equations = [normal_equations(fit.field, windows, solver, CHUNK, None, scale) for fit in fits]
+    return _selection(fits, equations, windows.horizon)
 
 
 @eqx.filter_jit
-def _selection(
-    without: LeastSquaresFit, with_one: LeastSquaresFit, windows: Trajectories, solver, scale: Scale
-) -> DisturbanceSelection:
-    gains = left_out(without.field, windows, solver, scale) - left_out(with_one.field, windows, solver, scale)
-    gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(windows))
+def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
+    disturbed, plain = fits
+    gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)
+    gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))
     needed = gain > error  # False where one of them is not finite
-    zero = jax.tree.map(jnp.zeros_like, disturbance_of(with_one.field))
-    undisturbed = with_physics(without.field, Hybrid(physics_of(without.field), zero))
-    padded = eqx.tree_at(lambda fit: fit.field, without, undisturbed)
-    kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, with_one, padded)
+    zero = jax.tree.map(jnp.zeros_like, disturbance.disturbance_of(disturbed.field))
+    padded = disturbance.with_physics(plain.field, Hybrid(disturbance.physics_of(plain.field), zero))
+    plain = eqx.tree_at(lambda fit: fit.field, plain, padded)
+    kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
     return DisturbanceSelection(kept, needed, gain, error)
 
 
-def left_out(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver = None, scale: Scale = None
-) -> Float[Array, " n"]:
-    """L_MSE of each window as predicted by a fit of θ_p to all others, to first order in the change of θ_p.
+def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
+    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they do not determine θ_p.
 
-    Not finite where the others do not determine the parameters.
-
-    Args:
-        field: one whose θ_p minimises L_MSE of all windows.
+    Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
     """
-    gram, score, square = normal_equations(field, windows, solver, scale=scale)
+    gram, score, square = equations
     others = jnp.sum(gram, axis=0) - gram, jnp.sum(score, axis=0) - score
     steps = -jnp.einsum("npq,nq->np", jax.vmap(inverse)(others[0]), others[1])
     bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
-    return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / windows.horizon
+    return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

@@ -1,14 +1,14 @@
 """Expert Augmentation (Wehenkel et al. 2023; paper, Sec. 4.7): estimate θ_p from the past, without target data.
 
-A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box around its own. These rollouts are
-labelled with their θ_p, and an encoder learns from them, and from source windows, to estimate θ_p from the past. In the
-target the encoder reads the past of a flight, and the expert with that θ_p predicts what comes next.
-
-The box is made of factors, so the physics must hold its parameters as logarithms, as `RigidBody` does.
+A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box around its own. An encoder learns
+from these rollouts, labelled with their θ_p, and from source windows to estimate θ_p from the past of a flight; the
+expert with that θ_p predicts what comes next. The box is made of factors, so the physics must hold its parameters as
+logarithms, as `RigidBody` does.
 """
 
-from dataclasses import dataclass
-from typing import ClassVar
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax
@@ -47,24 +47,18 @@ class Encoder(eqx.Module):
 
 @portable
 class ExpertAugmented(eqx.Module):
-    """A hybrid whose θ_p an encoder estimates from the past of each flight.
-
-    It is also a method of `adapt`: the mean of its estimates over the heads of the windows.
-    """
+    """A hybrid whose θ_p an encoder estimates from the past of each flight; also a method of `adapt`."""
 
     encoder: Encoder
     expert: Frozen  # the hybrid of the source
-    box: tuple[float, float] = eqx.field(static=True)  # lowest and highest factor on each of the expert's parameters
+    box: tuple[float, float] = eqx.field(static=True)
     uses_validation: ClassVar[bool] = False
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        """The expert with the mean estimate of θ_p; the field is not used."""
+        """The expert with the mean estimate of θ_p over the heads of the windows; the field is not used."""
         channels = 2 * train.x0.shape[-1] + train.u.shape[-1]
         past = self.encoder.weights[0].shape[1] // channels
-        if train.horizon < past:
-            raise ValueError(f"windows: {train.horizon} intervals, at least the {past} that the encoder reads expected")
-        estimates = jax.lax.map(self.estimate, cut(train, past), batch_size=min(250, len(train)))
-        return Solution(self.with_parameters(jnp.mean(estimates, axis=0)))
+        return Solution(self.with_parameters(_mean_over(self.estimate, cut(train, past))))
 
     def estimate(self, past: Trajectories) -> Float[Array, " p"]:
         """θ̂_p of one flight in the physics' own parametrisation; always inside the box."""
@@ -95,6 +89,7 @@ def expert_augmented(
 
     Args:
         past: windows of source flight, as long as those that the encoder will read; they set the scale of its inputs.
+        box: lowest and highest factor on each of the expert's parameters.
 
     Raises:
         ValueError: the box is not 0 < low <= high, or past windows that are malformed.
@@ -123,7 +118,7 @@ def encoder_inputs(past: Trajectories) -> Float[Array, " r"]:
 
 
 class Labelled(eqx.Module):
-    """Windows with the seed of the θ_p with which the expert flies each instead; RECORDED for those as recorded."""
+    """Windows, each with the seed of the θ_p with which the expert flies it, or RECORDED."""
 
     windows: Trajectories
     augmentation_seed: Int[Array | np.ndarray, "*n"]
@@ -140,17 +135,10 @@ class Augmentation:
     """The objective of an `ExpertAugmented`: L_MSE of its predictions + weight × MSE(θ̂_p, θ_p) on augmented flights.
 
     Every source window is used twice: as recorded, and as the expert flies it with a θ_p from the box.
-
-    Attributes:
-        past: intervals at the head of a window that the encoder reads; the rest is predicted.
-        seed: of the random θ_p.
-
-    Raises:
-        ValueError: no positive past, or a negative seed.
     """
 
-    past: int = 10
-    seed: int = 0
+    past: int = 10  # intervals at the head of a window that the encoder reads; the rest is predicted
+    seed: int = 0  # of the random θ_p
 
     def __post_init__(self):
         checks.count("past", self.past)
@@ -176,8 +164,7 @@ class Augmentation:
         return field
 
     def validate(self, field: ExpertAugmented, data: Labelled, settings: Settings) -> Float[Array, ""]:
-        errors = jax.lax.map(lambda one: self._errors(field, one, settings)[0], data, batch_size=min(250, len(data)))
-        return jnp.mean(errors)
+        return _mean_over(lambda one: self._errors(field, one, settings)[0], data)
 
     def augmented(
         self, field: ExpertAugmented, one: Labelled, settings: Settings
@@ -186,29 +173,27 @@ class Augmentation:
         key = jax.random.fold_in(jax.random.key(self.seed), one.augmentation_seed)
         own = field.own()
         drawn = field.inside(jax.random.uniform(key, own.shape, minval=-1.0, maxval=1.0))
-        windows, recorded = one.windows, one.augmentation_seed == RECORDED
-        other = rollout(field.with_parameters(drawn), windows.x0, windows.u, windows.dt, settings.solver)
-        states = jnp.where(recorded, windows.x, other)
-        return Trajectories(windows.x0, windows.u, states, windows.dt), jnp.where(recorded, own, drawn)
+        window, recorded = one.windows, one.augmentation_seed == RECORDED
+        other = rollout(field.with_parameters(drawn), window.x0, window.u, window.dt, settings.solver)
+        return replace(window, x=jnp.where(recorded, window.x, other)), jnp.where(recorded, own, drawn)
 
     def _errors(self, field: ExpertAugmented, one: Labelled, settings: Settings):
         """L_MSE of the prediction of one window, and the mean squared error of θ̂_p."""
         window, theta = self.augmented(field, one, settings)
-        past, future = split(window, self.past)
-        predicted = field.predict(past, future.u, settings.solver)
-        return mse(predicted, jnp.asarray(future.x)), jnp.mean(jnp.square(field.estimate(past) - theta))
+        error = _window_mse(field, window, self.past, settings.solver)
+        return error, jnp.mean(jnp.square(field.estimate(split(window, self.past)[0]) - theta))
 
 
 def prediction_mse(field: ExpertAugmented, windows: Trajectories, past: int, solver=None) -> Float[Array, ""]:
-    """L_MSE of the prediction after the first `past` intervals of each window, mean over windows.
-
-    Raises:
-        ValueError: windows that are malformed, or not longer than `past`.
-    """
+    """L_MSE of the prediction after the first `past` intervals of each window, mean over windows."""
     check(windows, "windows")
+    return _mean_over(lambda window: _window_mse(field, window, past, solver), windows)
 
-    def one(window: Trajectories) -> Float[Array, ""]:
-        before, after = split(window, past)
-        return mse(field.predict(before, after.u, solver), jnp.asarray(after.x))
 
-    return jnp.mean(jax.lax.map(one, windows, batch_size=min(250, len(windows))))
+def _window_mse(field: ExpertAugmented, window: Trajectories, past: int, solver) -> Float[Array, ""]:
+    before, after = split(window, past)
+    return mse(field.predict(before, after.u, solver), jnp.asarray(after.x))
+
+
+def _mean_over(function: Callable[[Any], Float[Array, "*p"]], windows: Any) -> Float[Array, "*p"]:
+    return jnp.mean(jax.lax.map(function, windows, batch_size=min(250, len(windows))), axis=0)

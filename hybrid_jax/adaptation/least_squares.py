@@ -1,8 +1,8 @@
 """Nonlinear least squares for the physical parameters θ_p; a hybrid's residual stays as it is.
 
-With a handful of parameters the Jacobian of all windows costs as much as a few rollouts, so Levenberg–Marquardt
-(Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands. θ_p is in the physics' own
-parametrisation: for a `RigidBody` the log-ratios.
+Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands, and with few
+parameters a Jacobian costs as much as a few rollouts. θ_p is in the physics' own parametrisation: for a `RigidBody` the
+log-ratios.
 """
 
 from collections.abc import Callable
@@ -63,11 +63,11 @@ def fit_least_squares(
 ) -> LeastSquaresFit:
     """Minimise L_MSE in inference mode over the θ_p of the field's physics.
 
-    Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. The precision
-    is that of θ_p: about 1e-3 standard errors in float32.
+    Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. In float32 the
+    precision is about 1e-3 standard errors.
 
     Args:
-        windows: of any length; in a compiled program their values are not checked.
+        windows: of any length.
         scale: divides the error of each state.
 
     Raises:
@@ -79,22 +79,14 @@ def fit_least_squares(
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
-    """Refuse malformed windows, and those of a rigid body without unit quaternions.
-
-    Raises:
-        ValueError: what is wrong with `name`, and where.
-    """
+    """Refuse malformed windows, and those of a rigid body without unit quaternions."""
     check(windows, name)
     if moves_a_rigid_body(field):
         check_attitudes(windows, name)
 
 
 def check_determined(field: AbstractVectorField, n: int) -> None:
-    """Refuse n windows if the physics has as many parameters or more.
-
-    Raises:
-        ValueError: it has, or it has none.
-    """
+    """Refuse n windows if the physics has as many parameters or more, or none."""
     p = ravel_parameters(field)[0].size
     if n <= p:
         name = type(physics_of(field)).__name__
@@ -170,5 +162,4 @@ def _mse(residuals: Float[Array, "n t d"]) -> Float[Array, ""]:
 
 
 def _nonzero(size: Float[Array, "*p"]) -> Float[Array, "*p"]:
-    """The size, or 1 where it is zero: a parameter without effect then stays where it is."""
-    return jnp.where(size > 0, size, 1)
+    return jnp.where(size > 0, size, 1)  # a parameter without effect then stays where it is

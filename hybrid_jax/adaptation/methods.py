@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol
+from typing import ClassVar, Literal, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
@@ -39,40 +39,27 @@ class Method(Protocol):
             def solve(self, field, train, validation, settings):
                 return Solution(min(self.candidates, key=lambda one: rollout_mse(one, validation)))
 
-    Two class attributes are optional: `uses_validation = False` keeps all windows for training, and `has_intervals =
-    True` says that the method minimises L_MSE over the physics' parameters alone, so that they have valid intervals.
+    Two class attributes are optional: `uses_validation = False` keeps all windows for training; `has_intervals = True`
+    says that the method minimises L_MSE over the physics' parameters alone, so that they have valid intervals.
     """
 
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field to the windows `train`, judged by `validation` if it must choose or stop.
+        """Adapt a field to the windows `train`; `validation` is for early stopping and choices.
 
-        Methods of the library compile and map over stacked fields.
-
-        Args:
-            settings: the solver, the objective, and the size of minibatches.
-
-        Raises:
-            ValueError: a field or windows that the method cannot use, before work begins.
+        Methods of the library compile and map over stacked fields. ValueError: a field or windows that it cannot use.
         """
         ...
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Least squares on θ_p and a constant disturbance; the residual stays as it is.
+    """Least squares on θ_p and a constant disturbance; the residual stays as it is."""
 
-    Attributes:
-        disturbance: True, False, or "auto": if the windows need one (see `select_disturbance`); with no more windows
-            than parameters there is none.
-        indices: the disturbed states; by default v̇ and ω̇ of a rigid body, every state of another system.
-        max_steps: of each fit.
-    """
-
-    disturbance: Literal["auto"] | bool = "auto"
-    indices: tuple[int, ...] | None = None
-    max_steps: int = 100
+    disturbance: Literal["auto"] | bool = "auto"  # "auto": if the windows need one, see `select_disturbance`
+    indices: tuple[int, ...] | None = None  # the disturbed states, see `with_disturbance`
+    max_steps: int = 100  # of each fit
     uses_validation: ClassVar[bool] = False
     has_intervals: ClassVar[bool] = True
 
@@ -82,70 +69,54 @@ class LeastSquares:
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         n, d = train.x0.shape
-        scale, solver = scale_of(settings.objective, d), settings.solver
-        check_determined(field, n)
+        options = settings.solver, self.max_steps, scale_of(settings.objective, d)
         larger = sized(with_disturbance(field, self.indices), d)
-        if self.disturbance is True:
-            check_determined(larger, n)
-        if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:
-            found = select_disturbance(field, train, solver, self.max_steps, scale, self.indices).fit
+        start = larger if self.disturbance is True else field
+        check_determined(start, n)
+        if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # else there are too few to decide
+            found = select_disturbance(field, train, *options, self.indices).fit
         else:
-            start = larger if self.disturbance is True else field
-            found = fit_least_squares(start, train, solver, self.max_steps, scale)
+            found = fit_least_squares(start, train, *options)
         status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
         return Solution(found.field, found.steps, status)
 
 
 @dataclass(frozen=True)
 class FineTune:
-    """Adam from the source's parameters, with early stopping on the validation windows.
+    """Adam from the source's parameters, with early stopping on the validation windows."""
 
-    Attributes:
-        rates: learning rates, a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual.
-        frozen: the part that stays as it is: "physics", "residual" or none.
-        regulariser_weight: λ of `settings.regulariser`, if there is one.
-        seed: of the order of minibatches.
-    """
-
-    rates: PyTree = None
-    frozen: Literal["physics", "residual"] | None = None
+    rates: PyTree = None  # a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual
+    frozen: Literal["physics", "residual"] | None = None  # the part that stays as it is
     min_epochs: int = 100
     patience: int = 20
     max_epochs: int = 2000
-    regulariser_weight: float = 1e-3
-    seed: int = 0
+    regulariser_weight: float = 1e-3  # λ of `settings.regulariser`, if there is one
+    seed: int = 0  # of the order of minibatches
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        if self.frozen is not None and not isinstance(field, Hybrid):
+        if self.frozen and not isinstance(field, Hybrid):
             raise ValueError(f"field must be a Hybrid where its {self.frozen} is frozen, got {type(field).__name__}")
-        marked = field if self.frozen is None else _replaced(field, self.frozen, Frozen(getattr(field, self.frozen)))
+        marked = replace(field, **{self.frozen: Frozen(getattr(field, self.frozen))}) if self.frozen else field
         if not any(jax.tree.leaves(trainable(marked))):
             raise ValueError(f"field: {type(field).__name__} has nothing to train")
         n, rates = len(train), self.rates
         if rates is None:
             rates = Hybrid(1e-2, 1e-3) if isinstance(field, Hybrid) else 1e-3  # pyright: ignore[reportArgumentType]
-        rule = (self.min_epochs, self.patience, self.max_epochs, self.regulariser_weight)
+        rule = self.min_epochs, self.patience, self.max_epochs, self.regulariser_weight
         config = make_run_config(rates, jnp.arange(n), n, *rule)
         settings = replace(settings, batch_size=min(settings.batch_size, n))
         data, held_out = (settings.objective.prepare(windows, "windows") for windows in (train, validation))
         state = start(marked, jax.random.key(self.seed))
         state = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs)
-        best = state.best
-        if self.frozen is not None:
-            best = _replaced(best, self.frozen, getattr(field, self.frozen))
+        best = replace(state.best, **{self.frozen: getattr(field, self.frozen)}) if self.frozen else state.best
         return Solution(best, state.epoch, state.status)
 
 
 @dataclass(frozen=True)
 class Ridge:
-    """A linear correction by ridge regression, with the penalty that predicts the validation windows best.
+    """A linear correction by ridge regression, with the penalty that predicts the validation windows best."""
 
-    Attributes:
-        update: `ridge.last_layer`, `ridge.linear_residual` or a function like them.
-        penalties: the grid.
-    """
-
-    update: ridge.Update
+    update: ridge.Update  # `ridge.last_layer`, `ridge.linear_residual` or a function like them
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
@@ -175,11 +146,7 @@ METHODS: Mapping[str, Method] = {
 
 
 def scale_of(objective: Objective, d: int) -> Scale:
-    """The error of each of d states that counts as 1 in the objective; None if each counts in its own unit.
-
-    Raises:
-        ValueError: an objective that is no sum of squares.
-    """
+    """The error of each of d states that counts as 1 in the objective; None if each counts in its own unit."""
     if not isinstance(objective, ChannelLoss):
         return None
     if objective.huber is not None:
@@ -191,7 +158,3 @@ def scale_of(objective: Objective, d: int) -> Scale:
 
 
 _fit_ridge = eqx.filter_jit(ridge.fit_ridge)
-
-
-def _replaced(field: Any, part: str, value: AbstractVectorField) -> Any:
-    return eqx.tree_at(lambda field: getattr(field, part), field, value)

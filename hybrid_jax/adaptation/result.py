@@ -35,13 +35,13 @@ class Adaptation:
     Attributes:
         method: the name, or the class of a method that was passed as a value.
         parameters: of physics and disturbance, by name; see `uncertainty.named_parameters`.
-        disturbance: the constant disturbance of ẋ, one number for each state, if there is one.
+        disturbance: the constant part of ẋ, one number for each state, if there is one.
         mse_before, mse_after: L_MSE of source and adapted field on all windows.
         windows: their number.
         steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
-        status: "converged", "stopped at the limit of steps" or "diverged".
+        status: one of `STATUS`.
         level: confidence level of the intervals.
-        without_intervals: why there are no intervals, if there are none.
+        without_intervals: why there are none, if so.
     """
 
     field: AbstractVectorField

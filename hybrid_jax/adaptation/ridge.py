@@ -1,9 +1,8 @@
 """Adaptation in closed form: a linear correction of a pre-trained field by ridge regression.
 
-The error of a field over a recorded interval gives its defect, the mean derivative that it lacks. Regressed on features
-of state and input, the defects give a correction without training. `last_layer` uses the features that the network
-learned in the source (O'Connell et al. 2022, Neural-Fly, where an adaptive law does it in flight); `linear_residual`
-uses state and input themselves.
+The error of a field over a recorded interval gives its defect, the mean derivative that it lacks. It is regressed on
+the hidden units of the source's network in `last_layer` (O'Connell et al. 2022, Neural-Fly, where an adaptive law does
+it in flight), on state and input in `linear_residual`.
 """
 
 from collections.abc import Callable
@@ -12,7 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import Solver
@@ -29,7 +28,7 @@ Update = Callable[[AbstractVectorField, Trajectories, Penalty, Solver], Abstract
 
 
 class RidgeFit(NamedTuple):
-    """The field at the penalty that was chosen, which should not be an end of the grid, and its validation loss."""
+    """The field at the chosen penalty, which should not be an end of the grid, and its validation loss."""
 
     field: AbstractVectorField
     penalty: Float[Array, ""]
@@ -42,14 +41,13 @@ def last_layer(
     """The field with the output layer of its network changed by ΔW, Δb.
 
     They minimise Σ ‖e − (ΔW φ̄ + Δb)‖² + penalty ‖(ΔW, Δb)‖² over all intervals, with e the field's defect and φ̄ the
-    mean of the hidden units, in inference mode, at the two ends of the interval: ridge regression towards the source.
+    mean of the hidden units, in inference mode, at the two ends of the interval.
 
     Args:
         field: a `ResidualNetwork`, or a `Hybrid` whose residual is one.
-        penalty: positive.
 
     Raises:
-        ValueError: another field, windows that are malformed, or a penalty that is known and not positive.
+        ValueError: another field, malformed windows, or a penalty that is not positive.
     """
     network = field.residual if isinstance(field, Hybrid) else field
     if not isinstance(network, ResidualNetwork):
@@ -71,11 +69,10 @@ def linear_residual(
 ) -> Hybrid:
     """The field plus a linear map of [x, u], regressed on the defects as in `last_layer`.
 
-    Args:
-        penalty: positive; on the map of the standardised [x, u], so that units do not matter.
+    The penalty is on the map of the standardised [x, u], so that units do not matter.
 
     Raises:
-        ValueError: windows that are malformed, or a penalty that is known and not positive.
+        ValueError: malformed windows, or a penalty that is not positive.
     """
     check(windows, "windows")
     checks.positive("penalty", penalty)
@@ -94,16 +91,10 @@ def fit_ridge(
     penalties: tuple[float, ...] = PENALTIES,
     settings: Settings | None = None,
 ) -> RidgeFit:
-    """The updated field at the penalty with the least validation loss.
-
-    Pure: `jax.jit` compiles it, `jax.vmap` maps it over stacked fields and training windows.
-
-    Args:
-        update: `last_layer` or `linear_residual`.
-        settings: solver and objective; by default RK4 and L_MSE.
+    """The updated field at the penalty with the least validation loss; pure: it compiles and maps.
 
     Raises:
-        ValueError: windows that are malformed, or penalties that are not positive numbers.
+        ValueError: malformed windows, or penalties that are not positive numbers.
     """
     check(train, "train")
     check(validation, "validation")
@@ -114,38 +105,24 @@ def fit_ridge(
     settings, grid = Settings() if settings is None else settings, jnp.asarray(penalties, float)
     # The decomposition inside `ridge` does not depend on the penalty, so vmap computes it once for the whole grid.
     candidates = eqx.filter_vmap(lambda penalty: update(field, train, penalty, settings.solver))(grid)
-    best, losses = best_candidate(candidates, validation, settings)
     arrays, rest = eqx.partition(candidates, eqx.is_array)
+    losses = jax.lax.map(lambda one: settings.objective.validate(eqx.combine(one, rest), validation, settings), arrays)
+    best = jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf))  # one that diverges is not chosen
     return RidgeFit(eqx.combine(jax.tree.map(lambda leaf: leaf[best], arrays), rest), grid[best], losses[best])
-
-
-def best_candidate(
-    candidates: AbstractVectorField, windows: Trajectories, settings: Settings
-) -> tuple[Int[Array, ""], Float[Array, " c"]]:
-    """The index of the stacked field with the least validation loss, and the losses of all c.
-
-    A field that diverges is never chosen; if all do, the first is.
-    """
-    arrays, rest = eqx.partition(candidates, eqx.is_array)
-    validate = settings.objective.validate
-    losses = jax.lax.map(lambda one: validate(eqx.combine(one, rest), windows, settings), arrays)
-    return jnp.argmin(jnp.where(jnp.isfinite(losses), losses, jnp.inf)), losses
 
 
 def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"]]:
     """The state before, the input held and the state after, of all intervals of all windows."""
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
-    before, u, x = (jnp.reshape(a, (-1, a.shape[2])) for a in (before, u, x))
-    return before, u, x
+    return before.reshape(-1, x.shape[2]), u.reshape(-1, u.shape[2]), x.reshape(-1, x.shape[2])
 
 
 def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:
     """e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
 
-    With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e: a missing acceleration also changes the position,
-    and would be corrected there a second time. The same step backwards from x₁ is off by the opposite amount, so the
-    mean of the two has no such error. An exact field has no defect.
+    With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e, as a missing acceleration also changes the
+    position. The same step backwards from x₁ is off by the opposite amount, and the mean of the two has no such error.
     """
     (before, u, after), dt = transitions(windows), windows.dt
     before, u, solver = checked(field, before, u[:, None], dt, solver, windows=True)
@@ -170,8 +147,8 @@ def ridge(
 ) -> tuple[Float[Array, "d n"], Float[Array, " d"]]:
     """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖², for a positive penalty.
 
-    Solved by the singular values of [z, 1]: the normal equations would square its condition number, about 1e4 for
-    hidden units, beyond float32; and one decomposition serves every penalty.
+    One singular value decomposition of [z, 1] serves every penalty. The normal equations would square its condition
+    number, about 1e4 for hidden units, beyond float32.
     """
     design = jnp.concatenate([z, jnp.ones((len(z), 1), z.dtype)], axis=1)
     with jax.default_matmul_precision("highest"):  # a GPU's default rounds factors to 10 bits

@@ -1,19 +1,9 @@
 """Covariance and confidence intervals of the physical parameters θ_p, from the Gauss–Newton matrix of L_MSE.
 
-θ̂_p minimises Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p of all states of one window. With
-H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2) the covariance of θ̂_p is
-
-- sandwich: H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Windows are the clusters: only they must be
-  independent, while the errors within a window may be correlated and of any size and unit (Huber 1967; White 1980; for
-  clusters Liang and Zeger 1986; the factor is MacKinnon and White's HC1, 1985).
-- homoscedastic: σ² H⁻¹, valid only if all entries of all r_i are white noise of one variance.
-
-For a loss other than the square, such as that of channels.py, its slope and curvature at each error enter M and H
-(M-estimation; Huber 1967).
-
-**Both are conditional on θ_d**: the network of a hybrid is taken as known. Where it was trained on the same windows the
-intervals are too narrow. Neither contains bias: effects that the model cannot express, such as an unmodelled drag, move
-θ̂_p by an amount that no interval shows; `experiments/coverage.py` measures both.
+θ̂_p minimises Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p of all states of one window. The covariance
+is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are too narrow. It
+contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an amount that no
+interval shows; `experiments/coverage.py` measures both.
 """
 
 from collections.abc import Callable
@@ -26,22 +16,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.least_squares import (
-    Scale,
-    Solver,
-    check_determined,
-    check_windows,
-    prediction_errors,
-    ravel_parameters,
-)
+from hybrid_jax.adaptation import least_squares
+from hybrid_jax.adaptation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, physics_of
+from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
 from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
 
 Kind = Literal["sandwich", "homoscedastic"]
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
+
+CHUNK = 250  # windows in memory at a time
+
+_quantile = jax.jit(jax.scipy.special.ndtri)
 
 
 class Interval(NamedTuple):
@@ -52,12 +40,20 @@ class Interval(NamedTuple):
     high: Float[Array, "*runs"]
 
 
+class NormalEquations(NamedTuple):
+    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
+
+    gram: Float[Array, "n p p"]  # JᵀJ
+    score: Float[Array, "n p"]  # Jᵀr
+    square: Float[Array, " n"]  # rᵀr
+
+
 def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
     kind: Kind = "sandwich",
     solver: Solver = None,
-    chunk: int = 250,
+    chunk: int = CHUNK,
     error: ErrorLoss | None = None,
     scale: Scale = None,
 ) -> Float[Array, "p p"]:
@@ -68,6 +64,11 @@ def covariance_of(
 
     Args:
         field: at, or near, the minimum over θ_p.
+        kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
+            sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
+            within one may be correlated and of any unit (Huber 1967; White 1980; for clusters Liang and Zeger 1986; the
+            factor is MacKinnon and White's HC1, 1985). For another loss than the square, its slope and curvature enter
+            M and H (Huber 1967). homoscedastic is σ² H⁻¹, valid if all errors are white noise of one variance.
         chunk: windows that are held in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
         scale: divides the error of each state, as in `fit_least_squares`.
@@ -76,44 +77,31 @@ def covariance_of(
         ValueError: no more windows than parameters, an unknown kind, the homoscedastic one of another loss than the
             square, or windows that are malformed.
     """
-    check_windows(field, windows)
+    least_squares.check_windows(field, windows)
     checks.count("chunk", chunk)
-    check_determined(field, len(windows))
+    least_squares.check_determined(field, len(windows))
     if kind not in Kind.__args__:
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
     if error is not None and kind == "homoscedastic":
         raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
-    return _covariance_of(field, windows, kind, solver, chunk, error, scale)
+    return _covariance(normal_equations(field, windows, solver, chunk, error, scale), kind, windows.x[0].size)
 
 
 @eqx.filter_jit
-def _covariance_of(
-    field, windows: Trajectories, kind: Kind, solver, chunk: int, error: ErrorLoss | None, scale: Scale
-) -> Float[Array, "p p"]:
-    gram, score, square = normal_equations(field, windows, solver, chunk, error, scale)
+def _covariance(equations: NormalEquations, kind: Kind, entries: int) -> Float[Array, "p p"]:
+    gram, score, square = equations
     n, p = score.shape
     bread = inverse(jnp.sum(gram, axis=0))
     if kind == "homoscedastic":
-        return jnp.sum(square) / (n * windows.x[0].size - p) * bread
+        return jnp.sum(square) / (n * entries - p) * bread
     half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
     return n / (n - p) * half.T @ half
 
 
-class NormalEquations(NamedTuple):
-    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
-
-    gram: Float[Array, "n p p"]  # JᵀJ
-    score: Float[Array, "n p"]  # Jᵀr
-    square: Float[Array, " n"]  # rᵀr
-
-
+# A program of its own: selecting a disturbance and the covariance share it.
+@eqx.filter_jit
 def normal_equations(
-    field: AbstractVectorField,
-    windows: Trajectories,
-    solver: Solver = None,
-    chunk: int = 250,
-    error: ErrorLoss | None = None,
-    scale: Scale = None,
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
 ) -> NormalEquations:
     """The normal equations of each window at a field's θ_p; for arguments see `covariance_of`."""
     theta, unravel = ravel_parameters(field)
@@ -124,19 +112,14 @@ def normal_equations(
             return r, r
 
         jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
-        bent, slope = (jacobian, r) if error is None else _expanded(error, jacobian, r)
+        bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
+        if error is not None:
+            bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
+            slope = jax.vmap(jax.grad(error))(r)
         effect, r = jacobian.reshape(-1, theta.size), r.ravel()
         return NormalEquations(effect.T @ bent.reshape(-1, theta.size), effect.T @ slope.ravel(), r @ r)
 
     return jax.lax.map(one, windows, batch_size=min(chunk, len(windows)))
-
-
-def _expanded(
-    error: ErrorLoss, jacobian: Float[Array, "t d p"], r: Float[Array, "t d"]
-) -> tuple[Float[Array, "t d p"], Float[Array, "t d"]]:
-    """(C J, g) with the gradient g and the Hessian C of the loss at each error; 2 J and 2 r for the square."""
-    curvature = jax.vmap(jax.hessian(error))(r)
-    return jnp.einsum("tde,tep->tdp", curvature, jacobian), jax.vmap(jax.grad(error))(r)
 
 
 def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
@@ -149,14 +132,27 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
         ValueError: a level that is not between 0 and 1; a covariance of another number of parameters or, where it is
             known, one that is not finite or has a negative variance.
     """
-    if not 0 < (checks.real(level) or 0) < 1:
-        raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
+    check_level(level)
     physics = physics_of(field)
     theta, unravel = ravel_parameters(physics)
-    away = jax.scipy.special.ndtri((1 + level) / 2) * _deviations(covariance, theta.size)
+    array, p = checks.real_array("covariance", covariance), theta.size
+    if array.shape != (p, p):
+        raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
+    variances = jnp.diagonal(checks.floating("covariance", array))
+    if not checks.is_traced(variances) and (variances < 0).any():
+        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
+    away = _quantile((1 + level) / 2) * jnp.sqrt(variances)
     left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
-    ends = {name: (jnp.minimum(end, right[name]), jnp.maximum(end, right[name])) for name, end in left.items()}
-    return {name: Interval(value, *ends[name]) for name, value in named_parameters(physics).items()}
+    return {
+        name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
+        for name, value in named_parameters(physics).items()
+    }
+
+
+def check_level(level: float) -> None:
+    """Refuse a confidence level that is not between 0 and 1."""
+    if not 0 < (checks.real(level) or 0) < 1:
+        raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
 
 
 def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
@@ -167,9 +163,13 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
     the class. Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance have the
     names of a rigid body's states, or indices: disturbance[vx], disturbance[0].
     """
-    physics = physics_of(field)
-    if isinstance(physics, Hybrid) and isinstance(physics.residual, ConstantDisturbance):
-        return named_parameters(physics.physics) | _disturbance_entries(physics.physics, physics.residual)
+    physics, disturbance = physics_of(field), disturbance_of(field)
+    if isinstance(physics, Hybrid) and disturbance is not None:
+        found, values = named_parameters(physics.physics), jnp.atleast_1d(disturbance.value)
+        labels = disturbance.indices or range(len(values))
+        if isinstance(physics.physics, AbstractRigidBody):
+            labels = [STATE_NAMES[i] for i in disturbance.indices or range(-len(values), 0)]
+        return found | {f"disturbance[{label}]": value for label, value in zip(labels, values, strict=True)}
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(physics, trainable(physics)))
     values = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     theta = getattr(type(physics), "theta", None)
@@ -180,23 +180,6 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
         for name, value in values.items()
         for at in np.ndindex(value.shape)
     }
-
-
-def _disturbance_entries(physics, disturbance: ConstantDisturbance) -> dict[str, Float[Array, ""]]:
-    values = jnp.atleast_1d(disturbance.value)
-    indices = disturbance.indices or range(-len(values), 0)
-    labels = [STATE_NAMES[i] for i in indices] if isinstance(physics, AbstractRigidBody) else disturbance.indices
-    return {f"disturbance[{label}]": value for label, value in zip(labels or range(len(values)), values, strict=True)}
-
-
-def _deviations(covariance: Float[Array, "p p"], p: int) -> Float[Array, " p"]:
-    array = checks.real_array("covariance", covariance)
-    if array.shape != (p, p):
-        raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
-    variances = jnp.diagonal(checks.floating("covariance", array))
-    if not checks.is_traced(variances) and (variances < 0).any():
-        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    return jnp.sqrt(variances)
 
 
 def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:

@@ -22,14 +22,9 @@ ACCELERATIONS = STATE_SIZE - VELOCITY.start  # v̇ and ω̇ of a rigid body; ṗ
 class ConstantDisturbance(AbstractVectorField):
     """ẋ = d at the disturbed states and zero at the others, for all x and u.
 
-    The code serves a batch as it stands: x (d,) and u (m,) may carry trailing batch axes.
-
     Attributes:
         value: one number for each disturbed state, in the unit of its derivative. A scalar holds for every state.
         indices: the disturbed states; by default the last `len(value)` states.
-
-    Raises:
-        ValueError: another number of indices than of values.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -57,21 +52,19 @@ class ConstantDisturbance(AbstractVectorField):
 
 
 def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tuple[int, ...] | None = None) -> Hybrid:
-    """ẋ = f(x, u) + d: a field of any kind and a `ConstantDisturbance`."""
+    """ẋ = f(x, u) + d."""
     return Hybrid(field, ConstantDisturbance(value, indices))
 
 
 def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None = None) -> AbstractVectorField:
-    """The field with a constant disturbance of zero in its physics, for `fit_least_squares` to fit.
-
-    A field that has one already is returned as it is.
+    """The field with a constant disturbance in its physics, of zero if it has none yet.
 
     Args:
         indices: the disturbed states; by default v̇ and ω̇ of a rigid body, and every state of another system.
     """
-    physics = physics_of(field)
     if disturbance_of(field) is not None:
         return field
+    physics = physics_of(field)
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
     shape = (ACCELERATIONS,) if moves_a_rigid_body(physics) else ()
     zero = jnp.zeros(shape if indices is None else (len(indices),), jnp.result_type(*dtypes, jnp.float32))
@@ -93,7 +86,7 @@ def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
 
 
 def physics_of(field: AbstractVectorField) -> AbstractVectorField:
-    """f_p: the physics of a hybrid, with its constant disturbance if it has one; or the field itself."""
+    """f_p, with its constant disturbance if it has one: the physics of a hybrid, or the field itself."""
     while isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
         field = field.physics
     return field

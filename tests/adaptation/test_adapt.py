@@ -3,6 +3,7 @@
 import inspect
 import json
 import textwrap
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import equinox as eqx
@@ -16,10 +17,8 @@ from systems import car, car_inputs, car_start, windows
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
-from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, physics_of, with_disturbance
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, physics_of
 from hybrid_jax.metrics import rollout_mse
 
 NETWORK = jax.tree.map(lambda leaf: 0.1 * leaf, hj.residual_network(2, 1, jax.random.key(0), hidden=4, norm="none"))
@@ -61,15 +60,6 @@ def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
     assert result.parameters["disturbance[1]"].low > 1
     again = adapt(result.field, noisy(flown(truth)), method=LeastSquares(disturbance=False))
     np.testing.assert_allclose(again.disturbance, result.disturbance, rtol=1e-2)  # it is part of the physics by then
-
-
-def test_the_functions_behind_it_serve_the_pendulum_too():
-    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), NETWORK)
-    data = flown(truth)
-    fitted = fit_least_squares(with_disturbance(hj.Hybrid(pendulum(0.7), NETWORK)), data).field
-    found = intervals(fitted, covariance_of(fitted, data))
-    values = [np.log(LENGTH), *PUSH]
-    np.testing.assert_allclose([interval.value for interval in found.values()], values, atol=1e-3)
 
 
 def test_a_car_s_stiffnesses_are_found_from_noisy_windows():
@@ -162,6 +152,19 @@ class Nothing(AbstractVectorField):
         return x
 
 
+class Shaped(AbstractVectorField):
+    shape: Callable
+
+    def __call__(self, x, u):
+        return self.shape(x)
+
+
+def test_a_field_that_cannot_be_saved_is_adapted_with_one_warning():
+    with pytest.warns(UserWarning, match="field/shape is the callable") as warned:
+        adapt(Shaped(lambda x: -x), swings(40), method="source")
+    assert len(warned) == 1
+
+
 class Weights(AbstractVectorField):
     gains: Float[Array, " n"]
 
@@ -179,16 +182,8 @@ class Weights(AbstractVectorField):
         (pendulum(), {"method": "last_layer"}, "last_layer needs a field whose residual is a ResidualNetwork"),
         (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
         (Nothing(), {"method": "fine_tune"}, "field: Nothing has nothing to train"),
-        (
-            Weights(jnp.zeros(60)),
-            {},
-            "field: Weights has 60 parameters, no named physics to fit; use",
-        ),
-        (
-            Weights(jnp.zeros(45)),
-            {},
-            "windows: 40 are too few for the 45 parameters of Weights, at least 46",
-        ),
+        (Weights(jnp.zeros(60)), {}, "field: Weights has 60 parameters, no named physics to fit; use"),
+        (Weights(jnp.zeros(45)), {}, "windows: 40 are too few for the 45 parameters of Weights, at least 46"),
         (hj.rigid_body(hj.IRIS), {}, "field: RigidBody does not take a state"),
     ],
 )

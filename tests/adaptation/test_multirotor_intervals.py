@@ -1,22 +1,18 @@
 """Intervals of a multirotor's terms, entry by entry, and of losses that weigh channels and outliers."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from test_least_squares import Push, pushes
 
-from hybrid_jax import rotation
-from hybrid_jax.adaptation.least_squares import fit_least_squares, prediction_errors, ravel_parameters
+from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
-from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.training.channels import Channel, ChannelLoss
-from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 LEARN = ("Ix", "k_rotors", "drag")
@@ -61,66 +57,6 @@ def test_a_disturbance_has_intervals_beside_the_parameters():
     np.testing.assert_allclose(found["disturbance[wz]"], Z * 0.01 * np.array([0, -1, 1]), rtol=1e-5)  # float32
 
 
-REPEATS, NOISE = 240, 0.01  # [m], [1], [m/s], [rad/s] alike
-
-
-@pytest.fixture(scope="module")
-def inside():
-    """Of each entry by name, and of all at once: in how many of the repeats the truth is inside."""
-    start = multirotor(IRIS, LEARN)
-    truth = jax.tree.map(lambda leaf: leaf + 0.1 * jnp.cos(jnp.arange(leaf.size).reshape(leaf.shape)), start)
-    true = {name: interval.value for name, interval in intervals(truth, np.eye(8)).items()}
-    clean = flights(jax.random.key(0), truth)
-
-    def one(key):
-        windows = eqx.tree_at(lambda w: w.x, clean, clean.x + NOISE * jax.random.normal(key, clean.x.shape))
-        field = descended(truth, windows)
-        around = intervals(field, covariance_of(field, windows))
-        return {name: (ends.low <= true[name]) & (true[name] <= ends.high) for name, ends in around.items()}
-
-    def repeats(keys):
-        return jax.lax.map(one, keys, batch_size=24)
-
-    return {
-        name: int(hits.sum()) for name, hits in jax.jit(repeats)(jax.random.split(jax.random.key(1), REPEATS)).items()
-    }
-
-
-def descended(field, windows, steps=3):
-    """Least squares by Gauss and Newton's steps from near the minimum: `fit_least_squares` takes long to compile."""
-    theta, rebuild = ravel_parameters(field)
-
-    def errors(theta):
-        r = jax.vmap(lambda window: prediction_errors(rebuild(theta), window))(windows).ravel()
-        return r, r
-
-    def step(theta, _):
-        jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
-        return theta - jnp.linalg.solve(jacobian.T @ jacobian, jacobian.T @ r), None
-
-    return rebuild(jax.lax.scan(step, theta, length=steps)[0])
-
-
-def flights(key, truth, count=60, steps=2, dt=0.04):
-    """Windows from random states in motion under rotor speeds that change."""
-    of_state, of_input = jax.random.split(key)
-    x0 = 2 * jax.random.normal(of_state, (count, 13))
-    q = rotation.normalise(x0[:, 3:7] * 0.2 + jnp.array([1.0, 0, 0, 0]))
-    x0 = x0.at[:, 3:7].set(q)
-    u = IRIS.hover_speed * (1 + 0.2 * jax.random.normal(of_input, (count, steps, 4)))
-    return Trajectories(x0, u, rollout_batch(truth, x0, u, dt), dt)
-
-
-def test_they_cover_the_truth_of_vectors_as_often_as_they_say(inside):
-    assert len(inside) == 8
-    deviation = np.sqrt(REPEATS * 0.95 * 0.05)
-    for name, hits in inside.items():
-        # Four standard deviations of the binomial law, and the 1 % that 60 windows for 8 parameters cost a sandwich.
-        assert 0.94 * REPEATS - 4 * deviation < hits <= REPEATS, name
-    # All together, as if independent, which they nearly are: within four again, from either side.
-    assert abs(sum(inside.values()) - 8 * 0.945 * REPEATS) < 4 * np.sqrt(8) * deviation
-
-
 def weighed(windows, design, gains, scales, huber):
     """H⁻¹ M H⁻¹ of a linear problem in double precision, by derivatives of the whole loss."""
     n, _, p = design.shape
@@ -147,17 +83,3 @@ def test_a_loss_of_channels_has_its_own_covariance(huber):
     found = covariance_of(Push(jnp.asarray(gains)), windows, error=objective.error)
     expected = weighed(windows, design, gains, np.array([0.1, 0.05]), huber)
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * abs(expected).max())  # float32 sums
-
-
-def test_equal_scales_are_no_weights():
-    windows, _ = pushes(40, 0.1)
-    field = fit_least_squares(Push(jnp.ones(2)), windows).field
-    objective = ChannelLoss((Channel(0, 2, 3.0),))
-    plain = covariance_of(field, windows)
-    np.testing.assert_allclose(covariance_of(field, windows, error=objective.error), plain, rtol=1e-5)
-
-
-def test_white_noise_of_one_size_goes_with_squares_alone():
-    windows, _ = pushes(40, 0.1)
-    with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
-        covariance_of(Push(jnp.ones(2)), windows, "homoscedastic", error=ChannelLoss((Channel(0, 1, 1.0),)).error)

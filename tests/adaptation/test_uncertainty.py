@@ -100,6 +100,8 @@ def test_what_makes_no_sense_is_refused():
         covariance_of(pendulum(), SWINGS[:1])
     with pytest.raises(ValueError, match="kind must be one of sandwich, homoscedastic, got 'plain'"):
         covariance_of(pendulum(), SWINGS, "plain")
+    with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
+        covariance_of(pendulum(), SWINGS, "homoscedastic", error=jnp.sum)
     for level in (0.0, 1.0, 95, float("nan")):
         with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
             intervals(rigid_body(IRIS), COVARIANCE, level)

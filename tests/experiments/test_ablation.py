@@ -85,8 +85,6 @@ def test_figure_has_a_panel_per_domain_and_a_line_per_value():
     drawn = ablation(ROWS.where(choice="norm"), "norm", {"external_force": 0.05})
     assert [axes.get_title() for axes in drawn.axes] == ["Parameter shift", "External force"]
     assert [label.get_text() for label in drawn.axes[0].get_yticklabels()] == ["batch (default)", "none"]
-    with pytest.raises(ValueError, match="nothing to draw"):
-        ablation(Results(), "norm", {})
 
 
 def test_noise_has_its_size_and_spares_the_test_split():

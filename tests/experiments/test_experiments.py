@@ -1,20 +1,33 @@
-"""Both experiments from their command lines, in the smallest preset: what they leave, and what they refuse."""
+"""Both experiments from their command lines, in the smallest preset: their files, and the input they refuse."""
 
 import csv
+import io
 import json
+import re
 import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from smoke import ROOT, command, experiments, refused, smallest, unbegun
+from rich.console import Console
+from scipy.integrate import cumulative_trapezoid
+from smoke import ROOT, experiments, refused, smallest, unbegun
 
 import hybrid_jax
 from experiments.external_force import sine_floor
+from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in, source_of
+from experiments.paper.outcome import draw
+from experiments.paper.study import study
 from experiments.reporting.report import load_report
+from experiments.runner.precompile import placeholder
+from hybrid_jax.dynamics.rigid_body import nominal
+from hybrid_jax.sim.domain import PARAMETER_SHIFT
+from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.vehicle import IRIS
 
 EXPERIMENTS = ("param_shift", "external_force")
 ROW = {
@@ -36,18 +49,19 @@ def finished(folder):
     return runs
 
 
-def record(folder, name, out="out"):
-    return json.loads((folder / out / name / "report.json").read_text())
+def record(folder, name):
+    return json.loads((folder / "out" / name / "report.json").read_text())
 
 
 @pytest.mark.parametrize("name", EXPERIMENTS)
-def test_the_report_keeps_its_contract(name, folder, finished):
+def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
     report = record(folder, name)
     assert report["experiment"] == name
     assert report["config"]["preset"] == "smoke"
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     # Three models: source-only once a seed, two modes for each size and seed; and the one that is solved.
     assert len(report["rows"]) == 3 * (1 + 2) + 1
+    source = {row["model"]: row["test_mse"] for row in report["rows"] if row["mode"] == "source_only"}
     for row in report["rows"]:
         assert set(row) == set(ROW)
         assert all(isinstance(row[key], kind) for key, kind in ROW.items()), row
@@ -57,27 +71,15 @@ def test_the_report_keeps_its_contract(name, folder, finished):
         assert (row["theta"] is None) == (row["model"] == "no_physics")
         assert row["theta"] is None or set(row["theta"]) == {"Ix", "Iy", "k"}
         assert row["n_train"] == (0 if row["mode"] == "source_only" else 20)
+        error = source[source_of(row["model"])]
+        np.testing.assert_allclose(row["rho"], (error - row["test_mse"]) / error, rtol=1e-12)
     for claim in report["claims"]:
         assert set(claim) == {"id", "text", "holds", "measured"}
         assert isinstance(claim["holds"], bool)
-    load_report(folder / "out" / name)
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_rho_is_the_gain_over_the_source_only_row(name, folder, finished):
-    rows = record(folder, name)["rows"]
-    source = {row["model"]: row["test_mse"] for row in rows if row["mode"] == "source_only"}
-    for row in rows:
-        error = source[source_of(row["model"])]
-        expected = (error - row["test_mse"]) / error
-        np.testing.assert_allclose(row["rho"], expected, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", EXPERIMENTS)
-def test_tables_and_figures_are_there(name, folder, finished):
     out = folder / "out" / name
+    load_report(out)
     with (out / "rows.csv").open() as file:
-        assert len(list(csv.DictReader(file))) == 10
+        assert len(list(csv.DictReader(file))) == len(report["rows"])
     assert "hybrid" in (out / "report.md").read_text()
     for figure in ("scores", "example_flight", "theta", "predictions"):
         assert (out / f"{figure}.png").read_bytes().startswith(b"\x89PNG")
@@ -87,20 +89,16 @@ def test_tables_and_figures_are_there(name, folder, finished):
 
 
 def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
-    rng = np.random.default_rng(0)
-    x0 = np.zeros((2, 13), np.float32)
-    x0[:, 3] = 1
-    u = np.asarray(rng.uniform(600, 700, (2, 5, 4)), np.float32)
+    at_rest = placeholder(SplitSpec(2, 5))
     rows = record(folder, "param_shift")["rows"]
-    files = sorted((folder / "out" / "param_shift" / "models").iterdir())
-    assert len(files) == len(rows)
+    assert len(list((folder / "out" / "param_shift" / "models").iterdir())) == len(rows)
     for row in rows:
         name = f"{row['model']}-{row['mode']}-{row['n_train']}-seed{row['seed']}.npz"
         model = hybrid_jax.load(folder / "out" / "param_shift" / "models" / name)
         assert model.about["test_mse"] == row["test_mse"]
         if row["theta"] is not None:
             assert {key: float(value) for key, value in physics_in(model.field).theta().items()} == row["theta"]
-    predicted = model.predict(x0, u, model.about["dt"])
+    predicted = model.predict(at_rest.x0, at_rest.u + IRIS.hover_speed, model.about["dt"])
     assert predicted.shape == (2, 5, 13)
     assert np.isfinite(predicted).all()
 
@@ -112,38 +110,34 @@ def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
     assert all("pre-training" in line for line in reused)
 
 
-def test_a_second_run_reuses_every_stage_and_finds_the_same_rows(folder, finished):
-    again = command("param_shift", folder=folder, out=folder / "again")
-    assert again.returncode == 0, again.stderr
-    assert again.stderr.count("as found in the cache") == 9  # three models: pre-training and two adaptations
-    assert record(folder, "param_shift", "again")["rows"] == record(folder, "param_shift")["rows"]
-
-
-def test_other_input_scaling_is_another_pretraining(folder, finished):
-    """Nothing but what is static in the network differs; and a report without physics has no figure of θ_p."""
-    other = command("param_shift", "--inputs", "raw", "--models", "no_physics", folder=folder, out=folder / "raw")
-    assert other.returncode == 0, other.stderr
-    assert "as found in the cache" not in other.stderr
-    assert "theta.png" not in record(folder, "param_shift", "raw")["figures"]
-
-
-def test_physics_alone_is_an_experiment_too(folder, finished):
-    run = command("param_shift", "--models", "physics_only", folder=folder, out=folder / "physics")
-    assert run.returncode == 0, run.stderr
-    assert len(record(folder, "param_shift", "physics")["rows"]) == 3
+@pytest.mark.parametrize(("model", "figure"), [("no_physics", "predictions"), ("physics_only", "theta")])
+def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figure, folder, finished):
+    config = replace(SMOKE, models=(model,), cache=folder / "cache")
+    text = io.StringIO()
+    found = study(PARAMETER_SHIFT, IRIS, config, Console(file=text))
+    assert text.getvalue().count("as found in the cache") == 3  # pre-training and two adaptations
+    before = [row for row in record(folder, "param_shift")["rows"] if row["model"] == model]
+    for row, expected in zip(found.rows, before, strict=True):
+        assert [row[key] for key in ("mode", "val_mse", "theta")] == [
+            expected[key] for key in ("mode", "val_mse", "theta")
+        ]
+        assert row["test_mse"] == pytest.approx(expected["test_mse"], rel=1e-5)
+    drawn = draw(PARAMETER_SHIFT, config, found, nominal(PARAMETER_SHIFT.vehicle), 0.0)
+    assert set(drawn) == {"scores", "example_flight", figure}
 
 
 @pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
-def test_a_signal_saves_what_was_done_and_a_second_run_beside_it_is_refused(sent, code, folder, finished):
+def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder, finished):
     forever = ["--patience.hybrid-pretraining.minimum", "10000000", "--max-epochs", "10000000"]
     options = ["--preset", "smoke", "--models", "physics_only", *forever, "--cache", str(folder / "cache")]
     run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
             assert any("runs active" in line for line in process.stderr)  # said after a few seconds of training
-            second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
-            assert "another run is writing" in refused(second, "param_shift")
+            if sent == signal.SIGTERM:
+                second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
+                assert "another run is writing" in refused(second, "param_shift")
             process.send_signal(sent)
             rest = process.stderr.read()
             assert process.wait(timeout=60) == code
@@ -172,7 +166,7 @@ def test_wrong_options_are_refused_in_one_line(options, named, tmp_path):
 def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
     out = tmp_path / "precious"
     out.write_text("mine")
-    assert "--out" in refused(command("external_force", folder=tmp_path, out=out), "external_force")
+    assert "--out" in refused(unbegun("external_force", *smallest(folder=tmp_path, out=out)), "external_force")
     assert out.read_text() == "mine"
     assert [path.name for path in tmp_path.iterdir()] == ["precious"]
 
@@ -181,29 +175,23 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
 def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
     (file,) = (folder / "cache").glob(pattern)
     content = file.read_bytes()
-    report = (folder / "out" / "param_shift" / "report.json").read_bytes()
     file.write_bytes(content[: len(content) // 2])
     try:
-        run = command("param_shift", folder=folder)
-        assert str(file) in refused(run, "param_shift")
+        with pytest.raises(ValueError, match=re.escape(str(file))):
+            study(PARAMETER_SHIFT, IRIS, replace(SMOKE, cache=folder / "cache"), Console(quiet=True))
         assert file.read_bytes() == content[: len(content) // 2]
-        assert (folder / "out" / "param_shift" / "report.json").read_bytes() == report
     finally:
         file.write_bytes(content)
 
 
-def test_the_sine_s_floor_is_what_a_model_blind_to_time_must_miss():
+def test_sine_floor_is_the_mean_error_over_phases():
     """Integrated numerically over phases: the path that A/m sin(ω t + φ) alone makes from rest."""
     mass, times = 1.5, 0.1 * np.arange(1, 11)
     phases = 2 * np.pi * np.arange(400) / 400  # equally spaced: the mean over a phase is exact
     fine = np.linspace(0, 1, 10_001)
     push = np.sin(2 * np.pi / 3 * fine + phases[:, None]) / mass
 
-    def integral(values):
-        steps = (values[:, 1:] + values[:, :-1]) / 2 * (fine[1] - fine[0])
-        return np.concatenate([np.zeros((len(values), 1)), np.cumsum(steps, axis=1)], axis=1)
-
-    velocity = integral(push)
-    squares = (velocity**2 + integral(velocity) ** 2)[:, 1000::1000]
+    velocity = cumulative_trapezoid(push, fine, initial=0)
+    squares = (velocity**2 + cumulative_trapezoid(velocity, fine, initial=0) ** 2)[:, 1000::1000]
     # The trapezoidal rule at a step of 1e-4 is good to 1e-8.
     np.testing.assert_allclose(sine_floor(mass, times), squares.mean(), rtol=1e-6)

@@ -6,20 +6,16 @@ import numpy as np
 import pytest
 
 from experiments.make_flights import chosen_flights
+from experiments.runner.precompile import placeholder
 from hybrid_jax.io.datasets import Dataset, save_dataset
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.record import SplitSpec
-from hybrid_jax.state import QUATERNION
-from hybrid_jax.trajectories import Trajectories
 
 
 def windows(count, steps):
-    rng = np.random.default_rng(count)
-    shapes = (count, 13), (count, steps, 4), (count, steps, 13)
-    x0, u, x = (rng.normal(size=shape).astype(np.float32) for shape in shapes)
-    for states in (x0, x):
-        states[..., QUATERNION] /= np.linalg.norm(states[..., QUATERNION], axis=-1, keepdims=True)
-    return Trajectories(x0, u, x, dt=0.01)
+    flights = placeholder(SplitSpec(count, steps))
+    flights.x[..., 0] = np.arange(count)[:, None]
+    return flights
 
 
 @pytest.fixture

@@ -2,17 +2,20 @@
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
-from experiments.paper.conditions import adaptation, fresh_fields, pretraining
+from experiments.paper.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
 from experiments.paper.study import pretrained
+from experiments.runner.precompile import placeholder
+from experiments.runner.stages import _identity
 from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
@@ -46,27 +49,34 @@ def test_the_paper_preset_is_the_paper():
     assert all(preset.preset == name for name, preset in PRESETS.items())
 
 
-@pytest.mark.parametrize("mode", ["fine_tuned", "target_only"])
-def test_hybrid_lanes_have_the_table_s_rates_and_patience(mode):
-    for n, _, plan in plans_by_lane("hybrid", mode):
-        rate, minimum, patience = HYBRID[n]
-        assert numbers(plan) == (n, minimum, patience, 2000)
-        np.testing.assert_allclose((plan.rates.physics, plan.rates.residual), (1e-2, rate), rtol=1e-6)  # float32
+@pytest.mark.parametrize(
+    ("model", "mode", "table"),
+    [
+        ("hybrid", "fine_tuned", HYBRID),
+        ("hybrid", "target_only", HYBRID),
+        ("no_physics", "fine_tuned", NO_PHYSICS),
+        ("no_physics", "target_only", NO_PHYSICS_TARGET_ONLY),
+        ("physics_only", "fine_tuned", HYBRID),
+    ],
+)
+def test_runs_have_the_table_s_rates_and_patience(model, mode, table):
+    for n, _, plan in plans_by_lane(model, mode):
+        rate, *rule = table[n]
+        assert numbers(plan) == (n, *rule, 2000)
+        expected = {"hybrid": [1e-2, rate], "no_physics": [rate], "physics_only": [1e-2]}[model]
+        np.testing.assert_allclose(jax.tree.leaves(plan.rates), expected, rtol=1e-6)  # float32
         np.testing.assert_allclose(plan.regulariser_weight, 1e-3, rtol=1e-6)
 
 
-@pytest.mark.parametrize(("mode", "table"), [("fine_tuned", NO_PHYSICS), ("target_only", NO_PHYSICS_TARGET_ONLY)])
-def test_no_physics_lanes_have_the_table_s_rates_and_patience(mode, table):
-    for n, _, plan in plans_by_lane("no_physics", mode):
-        rate, minimum, patience = table[n]
-        assert numbers(plan) == (n, minimum, patience, 2000)
-        np.testing.assert_allclose(plan.rates, rate, rtol=1e-6)
-
-
-def test_physics_only_is_the_hybrid_without_its_network():
-    for n, _, plan in plans_by_lane("physics_only", "fine_tuned"):
-        assert numbers(plan) == (n, *HYBRID[n][1:], 2000)
-        np.testing.assert_allclose(plan.rates, 1e-2, rtol=1e-6)
+def test_other_input_scaling_is_another_pretraining():
+    """Nothing but what is static in the network differs."""
+    windows = placeholder(SplitSpec(2, 10))
+    data = Dataset({"train": windows, "validation": windows}, {})
+    identities = {
+        _identity(*pretraining("no_physics", IRIS, config), settings(config), data)
+        for config in (SMOKE, replace(SMOKE), replace(SMOKE, inputs="raw"))
+    }
+    assert len(identities) == 2
 
 
 @pytest.mark.parametrize(
@@ -177,28 +187,19 @@ def test_minibatches_of_one_window_are_for_what_does_not_normalise_them():
         assert replace(PAPER, batch_size=1, **change).batch_size == 1
 
 
-def test_smoke_is_small_but_whole():
-    assert SMOKE.models == PAPER.models
-    assert isinstance(SMOKE.cache, Path)
-
-
-@pytest.mark.parametrize("model", ["hybrid", "no_physics"])
+@pytest.mark.parametrize("model", ["hybrid", "no_physics", "physics_only"])
 def test_the_output_bias_has_a_rate_of_its_own_if_asked_for(model):
-    """And all else the rate that it had."""
+    """And all else the rate that it had; physics alone has no such bias."""
     offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
     for (_, _, usual), (_, _, found) in zip(
         plans_by_lane(model, "fine_tuned"), plans_by_lane(model, "fine_tuned", offset), strict=False
     ):
-        network = found.rates.residual if model == "hybrid" else found.rates
-        rate = usual.rates.residual if model == "hybrid" else usual.rates
-        np.testing.assert_array_equal(network.bias_out, np.float32([rate] * 7 + [0.3] * 6))
-        others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
-        assert {float(each) for each in others} == {float(rate)}
-        if model == "hybrid":
-            assert {float(each) for each in jax.tree.leaves(found.rates.physics)} == {float(usual.rates.physics)}
-
-
-def test_physics_alone_has_no_output_bias():
-    offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
-    for _, _, plan in plans_by_lane("physics_only", "fine_tuned", offset):
-        assert {float(each) for each in jax.tree.leaves(plan.rates)} == {np.float32(SMALL.rates.physics)}
+        if model != "no_physics":
+            physics = (plan.rates.physics if model == "hybrid" else plan.rates for plan in (found, usual))
+            rates, before = ({float(each) for each in jax.tree.leaves(part)} for part in physics)
+            assert rates == before
+        if model != "physics_only":
+            network, rate = (plan.rates.residual if model == "hybrid" else plan.rates for plan in (found, usual))
+            np.testing.assert_array_equal(network.bias_out, np.float32([rate] * 7 + [0.3] * 6))
+            others = jax.tree.leaves(eqx.tree_at(lambda network: network.bias_out, network, rate))
+            assert {float(each) for each in others} == {float(rate)}
