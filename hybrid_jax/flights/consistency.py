@@ -4,7 +4,7 @@ Where they disagree, common mistakes are undone one at a time, and the one that 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
@@ -23,9 +23,9 @@ from hybrid_jax.flights.readings import (
     rates,
     smoother,
     velocities,
-)
+)  # fmt: skip
 from hybrid_jax.flights.segments import at_rest, gaps, repeats, sound_intervals
-from hybrid_jax.state import INPUT_NAMES, QUATERNION, VELOCITY
+from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
@@ -94,23 +94,22 @@ def _samples(log: FlightLog) -> list[Check]:
     clock = "the time is in ms or µs: declare its unit"
     split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones"
     return [
-        Check("interval between samples", log.dt, "s", LONGEST_INTERVAL, *_at_most(log.dt, LONGEST_INTERVAL, clock)),
-        Check("gaps", lost, "share of intervals", 0.01, *_at_most(lost, 0.01, split)),
-        Check("repeated samples", stale, "share of samples", 0.01, *_at_most(stale, 0.01, split)),
+        _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
+        _at_most("gaps", lost, "share of intervals", 0.01, split),
+        _at_most("repeated samples", stale, "share of samples", 0.01, split),
     ]
 
 
-def _at_most(value: float, limit: float, suggestion: str) -> tuple[str, str]:
-    return (OK, NOTHING) if value <= limit else (FAILS, suggestion)
+def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) -> Check:
+    return Check(name, value, unit, limit, *((OK, NOTHING) if value <= limit else (FAILS, suggestion)))
 
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """Check time on the ground, and in flight the mean specific force along body z over k Σu² / m."""
     name, resting = "specific force over thrust per mass", at_rest(log)
     flying = sound_intervals(log) & ~resting[:-1]
-    grounded = float(resting.mean())
     advice = "cut it out: in_flight(log), or --cleaning.in-flight"
-    ground = Check("time on the ground", grounded, "share of samples", 0.01, *_at_most(grounded, 0.01, advice))
+    ground = _at_most("time on the ground", float(resting.mean()), "share of samples", 0.01, advice)
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
@@ -139,12 +138,10 @@ def _columns(log: FlightLog) -> Check:
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
     columns: dict[str, np.ndarray] = dict(zip(COLUMNS[-len(values) :], values, strict=True))
     moving = [name for name, values in columns.items() if (values != values[0]).any()]
-    motors = [name for name in INPUT_NAMES if name in moving]
-    alike = [(a, b) for a, b in combinations(motors, 2) if (columns[a] == columns[b]).all()]
-    kinds = [[name for name in columns if name[0] == kind] for kind in "vwu"]
-    still = [name for kind in kinds if {*kind} & {*moving} for name in kind if name not in moving]
+    kinds = {name[0] for name in moving}  # v, w, u: a vehicle at rest does not change any of a kind
+    alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
-    problems += [f"{name} never changes" for name in still]
+    problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
     verdict = (FAILS, f"{'; '.join(problems)}: name the measured columns") if problems else (OK, NOTHING)
     return Check("columns", float(len(problems)), "suspect", 0.0, *verdict)
 
@@ -183,7 +180,7 @@ def _lag(lag: float, limit: float) -> Check:
     advice = f"shift the motors {abs(lag):.1f} ms {way}: delay_motors(log, {lag / 1000:.4f})"
     if lag > 0:
         advice += ", or lag_motors if they are commands"
-    return Check("lag of the gyro behind the motors", lag, "ms", limit, *_at_most(abs(lag), limit, advice))
+    return replace(_at_most("lag of the gyro behind the motors", abs(lag), "ms", limit, advice), value=lag)
 
 
 def _compare(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
@@ -195,7 +192,8 @@ def _compare(log: FlightLog, name: str, readings: Readings, limit: float, least:
         return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value = _relative_error(a, b)
     advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
-    advice = advice or next(filter(None, (law(a, b, least) for law in laws)), "")
+    for law in laws:
+        advice = advice or law(a, b, least)
     return Check(name, value, "relative error", limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
@@ -210,7 +208,9 @@ def _nearer(pairs: Readings, limit: float, least: float) -> str:
 
 
 def _axes_agree(a: Vectors, b: Vectors, least: float) -> str:
-    apart = [axis for axis, ratio in zip("xyz", _by_axis(a, b, least), strict=True) if ratio > AXIS_LIMIT]
+    pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
+    moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
+    apart = [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]
     return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
 
 
@@ -218,12 +218,6 @@ def _one_scale(a: Vectors, b: Vectors, least: float) -> str:
     gain = float((a * b).sum() / (b * b).sum())
     message = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
     return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else message
-
-
-def _by_axis(a: Vectors, b: Vectors, least: float) -> list[float]:
-    """The relative error of each axis; 0 with little motion along it."""
-    columns = [(a[:, [axis]], b[:, [axis]]) for axis in range(3)]
-    return [_relative_error(*pair) if max(map(_size, pair)) > CLEAR * least else 0.0 for pair in columns]
 
 
 def _size(values: Float[np.ndarray, "n d"]) -> float:

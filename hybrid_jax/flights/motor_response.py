@@ -18,7 +18,6 @@ LONGEST_LAG = 0.1  # s, either way
 FAST, SLOW = 0.03, 0.2  # s
 YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
 ORDERS = np.array(list(permutations(range(4))))
-TIME_CONSTANTS = np.concatenate([[0.0], np.geomspace(0.005, 0.2, 24)])  # s
 
 
 @dataclass(frozen=True)

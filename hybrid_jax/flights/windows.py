@@ -14,7 +14,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mappe
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, is_even, segments
+from hybrid_jax.flights.segments import even_segments, segments
 from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
@@ -25,10 +25,7 @@ from hybrid_jax.vehicle import Vehicle
 class LogWindows:
     """Windows of several flights in float32, and the number of windows of each flight.
 
-    Attributes:
-        windows: the windows of all flights, flight by flight.
-        sizes: the number of windows of each flight.
-        stride: samples between the starts of two windows.
+    Windows are ordered by flight; `stride` is the number of samples between the starts of two.
     """
 
     windows: Trajectories
@@ -80,7 +77,7 @@ def load_windows(
     for log in logs:
         _report_failures(log, vehicle, strict)
     if dt is not None:
-        logs = [log if log.dt == dt and is_even(log) else resample(log, dt)[0] for log in logs]
+        logs = [_at_interval(log, dt) for log in logs]
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
@@ -201,6 +198,14 @@ def _report_failures(log: FlightLog, vehicle: Vehicle, strict: bool) -> None:
             if strict:
                 raise ValueError(message)
             warnings.warn(message, stacklevel=3)
+
+
+def _at_interval(log: FlightLog, dt: float) -> FlightLog:
+    try:
+        even_segments(log)
+    except ValueError:
+        return resample(log, dt)[0]
+    return log if log.dt == dt else resample(log, dt)[0]
 
 
 def _float32(windows: Trajectories) -> Trajectories:

@@ -116,6 +116,8 @@ def test_random_samples_are_nested_and_contiguous_ones_are_runs():
             runs = [found[(found >= a) & (found < b)] for a, b in pairwise(starts)]
             assert all((np.diff(run) == 1).all() for run in runs)
             assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
+    begins = {int(sampled_indices([3, 6, 4], 4, "contiguous", seed)[0]) for seed in range(200)}
+    assert begins == {3, 4, 5, 9}  # all that leave room in one flight
     with pytest.raises(ValueError, match="--n 151: the training flights have only 150 windows"):
         sampled_indices(sizes, 151, "contiguous", 0)
 

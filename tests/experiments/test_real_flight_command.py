@@ -107,10 +107,10 @@ def test_duplicate_flights_are_refused(tmp_path):
     [
         ({"n": (50,)}, "--n must each be at least --batch-size 100"),
         ({"n": (1_000_000_000,)}, "--n must be at most"),
-        ({"horizon": (0,)}, "--horizon must be at least 1"),
+        ({"horizon": (0,)}, "--horizon must be an integer of at least 1"),
         ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
         ({"learn": ("wings",)}, "learn must be names of"),
-        ({"epochs": 0.0}, "--epochs must be a positive number"),
+        ({"epochs": 0.0}, "--epochs must be a positive finite number"),
     ],
 )
 def test_invalid_options_are_refused(options, message):
