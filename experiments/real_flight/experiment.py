@@ -14,12 +14,12 @@ from experiments.real_flight.report import write_report
 from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
 from experiments.real_flight.simulated_logs import write_logs
 from experiments.real_flight.study import run_folds
+from experiments.real_flight.tables import failed_checks
 from experiments.real_flight.train import Experiment
 from experiments.runner.stages import stages_of
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, learned_by_field, vehicle_model_of
 from hybrid_jax.flights.cleaning import choose_time_constant
-from hybrid_jax.flights.consistency import FAILS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
@@ -70,11 +70,7 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
 
 
 def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
-    """Read the vehicle file.
-
-    Returns:
-        The vehicle of the source, that of target and test, and whether the rotors' time constant is to be chosen.
-    """
+    """Read the vehicle of the source, that of target and test, and whether the rotors' time constant is chosen."""
     tables = read_tables(path)
     before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
     learn = config.learn or (before.learn if "learn" in tables else LEARN)
@@ -84,12 +80,9 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 def print_failed_checks(logs: Mapping[str, LogSet], console: Console) -> None:
     """Print one line per failed check; the report holds the whole table."""
-    for each in logs.values():
-        for record in each.records:
-            for check in record["checks"]:
-                if check["verdict"] == FAILS:
-                    line = f"{each.label}/{record['flight']}: {check['name']}: {check['suggestion']}"
-                    console.print(line, highlight=False, soft_wrap=True, style="yellow")
+    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        line = f"{flight}: {check['name']}: {check['suggestion']}"
+        console.print(line, highlight=False, soft_wrap=True, style="yellow")
 
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:

@@ -68,11 +68,7 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
 
 
 def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlightConfig) -> None:
-    """Refuse, before anything is trained, flights that are too short.
-
-    Args:
-        source: the source flights, where the folds hold flights to adapt to.
-    """
+    """Refuse, before anything is trained, flights that are too short; with a source, folds hold flights to adapt to."""
     longest = max(RECIPES[name].window for name in config.tried)
     for fold in (*([source] if source else []), *folds):
         require_length(fold.train, longest)
@@ -101,12 +97,10 @@ def padded(windows: Trajectories, count: int) -> Trajectories:
 
 
 def sampled_indices(sizes: Sequence[int], size: int, draw: str, seed: int) -> Int[np.ndarray, " size"]:
-    """Sample the indices of the training windows of one run.
+    """Sample the indices of the training windows of one run, from flights of so many windows each.
 
-    Args:
-        sizes: number of windows of each flight.
-        draw: "random": any windows; smaller sizes are prefixes of larger ones. "contiguous": consecutive windows of one
-            flight, or where no flight is that long, whole flights and a part of another.
+    Random draws are of any windows; smaller sizes are prefixes of larger ones. Contiguous draws are consecutive windows
+    of one flight, or where no flight is that long, whole flights and a part of another.
     """
     _require_size(size, sum(sizes))
     if draw == "random":

@@ -18,32 +18,21 @@ from hybrid_jax.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class LogSet:
-    """The flights of one folder.
+    """The flights of one folder."""
 
-    Attributes:
-        label: "source", "target" or "test".
-        logs: after cleaning.
-        records: of each flight, as JSON values: samples and their SHA-256, gaps, checks of the raw log, changes made.
-    """
-
-    label: str
-    logs: list[FlightLog]
-    records: list[dict[str, Any]]
+    label: str  # source, target or test
+    logs: list[FlightLog]  # after cleaning
+    records: list[dict[str, Any]]  # of each flight, as JSON values: see `_record`
 
     def with_lag(self, time_constant: float) -> "LogSet":
         """The flights with rotors that follow the log's motor values with a first-order lag [s]."""
-        changed = [lag_motors(log, time_constant) for log in self.logs]
-        lines = [[*record["done"], line] for record, (_, line) in zip(self.records, changed, strict=True)]
-        records = [record | {"done": done} for record, done in zip(self.records, lines, strict=True)]
-        return LogSet(self.label, [log for log, _ in changed], records)
+        logs, lines = zip(*(lag_motors(log, time_constant) for log in self.logs), strict=True)
+        records = [each | {"done": [*each["done"], line]} for each, line in zip(self.records, lines, strict=True)]
+        return LogSet(self.label, list(logs), records)
 
 
 def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float, config: RealFlightConfig) -> LogSet:
-    """Read, check and clean all logs of a folder.
-
-    Args:
-        option: the option that named the folder, without dashes.
-        time_constant: first-order lag of the rotors behind the log's motor values [s].
+    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s].
 
     Raises:
         ValueError: file, row, field and what to do, in one line.

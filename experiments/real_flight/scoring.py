@@ -55,34 +55,19 @@ def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mappi
 
 
 def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]) -> list[Test]:
-    """Test all runs of a model.
+    """Test all runs of a model by `score` with a fold's arguments; `theta` is what `parameters` found."""
 
-    Args:
-        scoring: `score` with all but the field and the columns given.
-        theta: of each run, from `parameters`.
-    """
+    def one(run: int) -> Test:
+        columns = {"model": trained.model, "mode": trained.mode, "recipe": trained.recipe, **theta[run]}
+        columns |= {"n_train": trained.size(run), "seed": trained.seeds[run], "epochs": int(trained.epochs[run])}
+        status = STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED])
+        return scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
 
-    def columns(run: int) -> dict[str, Any]:
-        return {
-            "model": trained.model,
-            "mode": trained.mode,
-            "n_train": trained.size(run),
-            "seed": trained.seeds[run],
-            "recipe": trained.recipe,
-            "val_loss": trained.val_loss[run],
-            "epochs": int(trained.epochs[run]),
-            "status": STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED]),
-            **theta[run],
-        }
-
-    return [scoring(trained.run(run), **columns(run)) for run in range(len(trained))]
+    return list(map(one, range(len(trained))))
 
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:
-    """Estimate θ_p and its intervals for each run, from those of its training windows that share no sample.
-
-    There are no intervals where there are no more windows than parameters.
-    """
+    """Estimate θ_p of each run, and its intervals if enough of its training windows share no sample."""
     if not any(map(is_body, jax.tree.leaves(trained.fields, is_leaf=is_body))):
         return [{} for _ in trained.seeds]
     short = _short(data)
@@ -128,11 +113,7 @@ def body_of(field: AbstractVectorField) -> Multirotor:
 def linear_residuals(
     base: AbstractVectorField, data: TrainingData, subsets: Sequence[np.ndarray], test_base: AbstractVectorField
 ) -> list[AbstractVectorField]:
-    """Fit a linear residual of `base` to each subset of the training windows, all of one size.
-
-    Args:
-        test_base: field that the fitted residuals are added to, such as `base` with another payload.
-    """
+    """Fit a linear residual of `base` to each subset of the training windows, of one size; add it to `test_base`."""
     fitted = jax.device_get(_linear_residuals(base, _short(data), stack(list(subsets)), data.validation))
     return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 

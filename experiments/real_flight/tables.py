@@ -66,11 +66,7 @@ def fold_tables(rows: Results) -> list[Table]:
 
 
 def parameter_tables(rows: Results, nominal: Mapping[str, float]) -> list[Table]:
-    """Make a table of θ_p: mean over folds and seeds, spread, and mean 95 % interval.
-
-    Args:
-        nominal: of each parameter by name, as in the rows.
-    """
+    """Make a table of θ_p: nominal value, mean over folds and seeds, spread, and mean 95 % interval."""
     found = cells(rows.where(lambda row: bool(row["theta"])))
     most = max((n for _, _, n in found), default=0)
     kept = {cell: group for cell, group in found.items() if cell[1] != "scratch" and cell[2] in (0, most)}
@@ -78,7 +74,7 @@ def parameter_tables(rows: Results, nominal: Mapping[str, float]) -> list[Table]
     lines = [
         (
             name,
-            _number(nominal[name]) if name in nominal else EMPTY,
+            f"{nominal[name]:.3g}" if name in nominal else EMPTY,
             *(_parameter(rows, name) for rows in kept.values()),
         )
         for name in names
@@ -111,20 +107,25 @@ def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
     """Make tables of the logs: length, gaps, changes, every check, and what would repair the failed ones."""
     if not records:
         return []
-    lines, verdicts, failed = [], [], []
+    lines, verdicts = [], []
     for record in records:
         name = f"{record['folder']}/{record['flight']}"
         counts = (str(record[key]) for key in ("gaps", "repeated_samples", "used_samples"))
         length = (str(record["samples"]), f"{record['seconds']:.1f}", f"{record['dt']:g}")
         lines.append((name, *length, *counts, "; ".join(record["done"]) or "none"))
-        checks = [(check, _value(check)) for check in record["checks"]]
-        verdicts.append((name, *(f"{VERDICTS[check['verdict']]} {value}".strip() for check, value in checks)))
-        failed += [(name, c["name"], value, c["suggestion"]) for c, value in checks if c["verdict"] == FAILS]
+        verdicts.append((name, *(f"{VERDICTS[c['verdict']]} {_value(c)}".strip() for c in record["checks"])))
+    failed = [(flight, c["name"], _value(c), c["suggestion"]) for flight, c in failed_checks(records)]
     header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
     names = [str(SHORT.get(check["name"], check["name"])) for check in records[0]["checks"]]
     tables = [Table("Logs", header, lines), Table("Consistency of the raw logs", ("flight", *names), verdicts)]
     advice = Table("Failed checks, and how to repair them", ("flight", "check", "value", "suggestion"), failed)
     return [*tables, advice] if failed else tables
+
+
+def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The checks that failed, each with its flight."""
+    named = [(f"{record['folder']}/{record['flight']}", check) for record in records for check in record["checks"]]
+    return [(flight, check) for flight, check in named if check["verdict"] == FAILS]
 
 
 def _errors(label: str) -> dict[str, Callable[[Results], str]]:
@@ -141,16 +142,12 @@ def _parameter(rows: Results, name: str) -> str:
     if not len(having):
         return EMPTY
     values = having.numbers(lambda row: math.nan if row["theta"][name] is None else row["theta"][name])
-    text = _number(values.mean()) + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
+    text = f"{values.mean():.3g}" + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
     ends = [(row["theta_interval"] or {}).get(name) for row in having]
     known = np.array([end for end in ends if end is not None and None not in end], float)
-    text += f" [{_number(known[:, 0].mean())}, {_number(known[:, 1].mean())}]" if len(known) else ""
+    text += f" [{known[:, 0].mean():.3g}, {known[:, 1].mean():.3g}]" if len(known) else ""
     folds, all_folds = (len(group.unique("fold")) for group in (having, rows))
     return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
 
 
 def _value(check: Mapping[str, Any]) -> str:

@@ -86,9 +86,7 @@ def training_data(
 ) -> TrainingData:
     """Cut the windows of a fold; the loss is scaled by its training windows.
 
-    Args:
-        source: data before the change, whose loss is used; the fold's flights are those after it, and a window starts
-            at every sample.
+    After a change, `source` are the data before it: its loss is used, and a window starts at every sample.
     """
     how, config = RECIPES[recipe], experiment.config
     validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, config.validation)
@@ -123,9 +121,8 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
     """
     more = cut_windows(fold.validation, RECIPES[first.recipe].window, experiment.config.stride)
     both = concatenate([data.train.windows, more.windows])
-    data = replace(
-        data, train=LogWindows(both, [*data.train.sizes, *more.sizes], data.train.stride), capacity=len(both)
-    )
+    windows = LogWindows(both, [*data.train.sizes, *more.sizes], data.train.stride)
+    data = replace(data, train=windows, capacity=len(both))
     again = train_on_source(experiment, f"{name} again", first.model, first.recipe, data, len(first), first.best_epochs)
     return replace(first, fields=again.fields, epochs=first.epochs + again.epochs)
 
@@ -140,8 +137,7 @@ def adapt(
 ) -> TrainedModel:
     """Train a model on N windows after the change, one run for each size and seed, in this order.
 
-    Args:
-        mode: "fine_tuned" starts from the fields of `start`, "scratch" from untrained ones.
+    "fine_tuned" starts from the fields of `start`, "scratch" from untrained ones.
     """
     config, how, fields, steps = (
         experiment.config,
@@ -167,8 +163,7 @@ def in_stages(
 ) -> TrainedModel:
     """Train all runs through the stages; each stage starts from the previous stage's best validation checkpoint.
 
-    Args:
-        best_epochs: of each stage and run; stages then end after these, with their last fields.
+    With `best_epochs`, of each stage and run, a stage ends after these, with its last fields.
     """
     config, fields, finals = experiment.config, start.fields, []
     settings = Settings(config.batch_size, objective=data.objective)

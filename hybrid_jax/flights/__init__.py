@@ -27,7 +27,7 @@ from hybrid_jax.flights.cleaning import (
     lag_motors,
     low_pass,
     resample,
-)  # fmt: skip
+)
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.consistency import Check, check_log
 from hybrid_jax.flights.log import FlightLog

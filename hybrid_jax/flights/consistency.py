@@ -10,20 +10,11 @@ from itertools import combinations
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.flights.motor_response import respond
-from hybrid_jax.flights.readings import (
-    NOTHING,
-    UP,
-    Readings,
-    Vectors,
-    accelerations,
-    middle,
-    rates,
-    smoother,
-    velocities,
-)  # fmt: skip
+from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, smoother
 from hybrid_jax.flights.segments import at_rest, gaps, repeats, sound_intervals
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -52,21 +43,14 @@ Law = Callable[[Vectors, Vectors, float], str]  # two records and the least moti
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check.
+    """The result of one check."""
 
-    Attributes:
-        name: the two records compared.
-        value, unit, limit: measured value and its maximum (for correlations its minimum).
-        verdict: "ok", "fails" or "cannot tell".
-        suggestion: what to correct, if anything.
-    """
-
-    name: str
+    name: str  # of the two records compared
     value: float
     unit: str
-    limit: float
-    verdict: str
-    suggestion: str
+    limit: float  # maximum of the value; of correlations the minimum
+    verdict: str  # "ok", "fails" or "cannot tell"
+    suggestion: str  # what to correct, if anything
 
 
 def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
@@ -77,12 +61,13 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
+    slope, turn, push = readings.velocities(log), readings.rates(log), readings.accelerations(log)
     exact = _axes_agree, _one_scale  # of kinematics alone: wind and drag separate v̇ from thrust
     return [
         *_samples(log),
-        _compare(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
-        _compare(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
-        _compare(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
+        _compare(log, "dp/dt against v", slope, KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
+        _compare(log, "q̇ against ω", turn, KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
+        _compare(log, "v̇ against thrust along body z", push, THRUST_LIMIT, LEAST_MOTION["acceleration"]),
         *_thrust(log, vehicle),
         _columns(log),
         *_motors(log, vehicle),
@@ -148,45 +133,38 @@ def _columns(log: FlightLog) -> Check:
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     found, limit = respond(log, vehicle), 1000 * log.dt
+    order, spin, gyro = "motor order against roll and pitch", "spin against yaw", "lag of the gyro behind the motors"
     if found is None or sum(found.correlations[:2]) < 2 * ORDER_LIMIT:
         value = float("nan") if found is None else min(found.correlations[:2])
         return [
-            Check("motor order against roll and pitch", value, "correlation", ORDER_LIMIT, UNKNOWN, MORE_FLIGHT),
-            Check("spin against yaw", float("nan"), "correlation", 0.0, UNKNOWN, MORE_FLIGHT),
-            Check("lag of the gyro behind the motors", float("nan"), "ms", limit, UNKNOWN, MORE_FLIGHT),
+            Check(order, value, "correlation", ORDER_LIMIT, UNKNOWN, MORE_FLIGHT),
+            Check(spin, float("nan"), "correlation", 0.0, UNKNOWN, MORE_FLIGHT),
+            Check(gyro, float("nan"), "ms", limit, UNKNOWN, MORE_FLIGHT),
         ]
-    right = found.order == (0, 1, 2, 3)
     columns = " ".join(f"u{motor}" for motor in found.order)
-    order = (OK, NOTHING) if right else (FAILS, f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}")
+    right, advice = found.order == (0, 1, 2, 3), f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}"
+    ordered = (OK, NOTHING) if right else (FAILS, advice)
+    yaw = found.yaw_sign * found.correlations[2]
+    if sum(vehicle.spin):
+        turning = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
+    elif yaw < OPPOSED:
+        turning = FAILS, "flip the sign of every spin of the vehicle"
+    else:
+        turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
+    lag, late = 1000 * found.lag, found.lag > 0
+    shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: delay_motors(log, {found.lag:.4f})"
+    shift += ", or lag_motors if they are commands" if late else ""
     return [
-        Check("motor order against roll and pitch", min(found.as_is[:2]), "correlation", ORDER_LIMIT, *order),
-        _spin(found.yaw_sign * found.correlations[2], vehicle),
-        _lag(1000 * found.lag, limit),
+        Check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, *ordered),
+        Check(spin, yaw, "correlation", YAW_LIMIT, *turning),
+        replace(_at_most(gyro, abs(lag), "ms", limit, shift), value=lag),
     ]
 
 
-def _spin(yaw: float, vehicle: Vehicle) -> Check:
-    if sum(vehicle.spin):
-        verdict = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
-    elif yaw < OPPOSED:
-        verdict = FAILS, "flip the sign of every spin of the vehicle"
-    else:
-        verdict = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
-    return Check("spin against yaw", yaw, "correlation", YAW_LIMIT, *verdict)
-
-
-def _lag(lag: float, limit: float) -> Check:
-    way = "later" if lag > 0 else "earlier"
-    advice = f"shift the motors {abs(lag):.1f} ms {way}: delay_motors(log, {lag / 1000:.4f})"
-    if lag > 0:
-        advice += ", or lag_motors if they are commands"
-    return replace(_at_most("lag of the gyro behind the motors", abs(lag), "ms", limit, advice), value=lag)
-
-
-def _compare(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
+def _compare(log: FlightLog, name: str, pairs: Readings, limit: float, least: float, *laws: Law) -> Check:
     """Compare two records under every reading and by further laws."""
     smooth = smoother(log)
-    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in readings.items()}
+    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:
         return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)

@@ -33,8 +33,8 @@ def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"
     def length(part: slice):
         return jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1)
 
-    a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
     # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle, which is accurate for small angles.
+    a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
     chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
     angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
     return FlightErrors(length(POSITION), length(VELOCITY), angle, length(BODY_RATES))

@@ -75,7 +75,12 @@ def load_windows(
         checks.positive("dt", dt, "a positive number of seconds")
     logs = load_logs(folder, columns=columns, polynomial=polynomial)
     for log in logs:
-        _report_failures(log, vehicle, strict)
+        for check in check_log(log, vehicle):
+            message = f"{log.name}: {check.name}: {check.suggestion}"
+            if check.verdict == FAILS and strict:
+                raise ValueError(message)
+            if check.verdict == FAILS:
+                warnings.warn(message, stacklevel=2)
     if dt is not None:
         logs = [_at_interval(log, dt) for log in logs]
     require_common_interval(logs)
@@ -124,11 +129,8 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
 def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
     """Return the interval [s] between samples, which all logs must share.
 
-    Args:
-        option: how the caller lets a user resample, for the error message.
-
     Raises:
-        ValueError: a log with uneven samples, or two logs with different intervals.
+        ValueError: a log with uneven samples, or two logs with different intervals; `option` is how to resample them.
     """
     for log in logs:
         even_segments(log)
@@ -189,15 +191,6 @@ def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, f
     part = max(segments(log), key=lambda part: part.stop - part.start)
     windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
     return log, float(log.t[part.start] - log.t[0]), _float32(windows)
-
-
-def _report_failures(log: FlightLog, vehicle: Vehicle, strict: bool) -> None:
-    for check in check_log(log, vehicle):
-        if check.verdict == FAILS:
-            message = f"{log.name}: {check.name}: {check.suggestion}"
-            if strict:
-                raise ValueError(message)
-            warnings.warn(message, stacklevel=3)
 
 
 def _at_interval(log: FlightLog, dt: float) -> FlightLog:
