@@ -133,16 +133,28 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
         for mode in ("fine_tuned", "scratch") if model in FROM_SCRATCH else ("fine_tuned",):
             adapted = train.adapt(experiment, name, mode, start, target(chosen), config.n)
             add(adapted, parameters(adapted, target(chosen)))
-    # A linear residual of the rigid body, fitted to all source windows and tested on the present vehicle.
-    whole, before, after = [np.arange(len(data.train))], rigid_body_of(experiment.before), rigid_body_of(vehicle)
-    (linear,) = linear_residuals(before, data, whole, after)
-    outputs.add([score(linear, model="linear_residual", mode="zero_shot" if adapts else "source_only")])
-    if adapted:  # and fitted to the windows of each adapted run
-        for size, runs in groupby(range(len(adapted)), adapted.size):
-            own = list(runs)
-            fields = linear_residuals(after, target(chosen), [adapted.subsets[run] for run in own], after)
-            columns = {"model": "linear_residual", "mode": "scratch", "n_train": size}
-            outputs.add(score(each, **columns, seed=adapted.seeds[i]) for i, each in zip(own, fields, strict=True))
+    outputs.add(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))
+
+
+def _linear_baselines(
+    experiment: Experiment,
+    score: Callable[..., Test],
+    source: TrainingData,
+    target: tuple[TrainedModel, TrainingData] | None,
+) -> Iterator[Test]:
+    """Test linear residuals of the rigid body, fitted to all source windows and to those of each run on the target."""
+    before, after = (rigid_body_of(model) for model in (experiment.before, experiment.after))
+    now, mode = (after, "zero_shot") if target else (before, "source_only")
+    (field,) = linear_residuals(before, source, [np.arange(len(source.train))], now)
+    yield score(field, model="linear_residual", mode=mode)
+    if target is None:
+        return
+    adapted, data = target
+    for size, group in groupby(range(len(adapted)), adapted.size):
+        runs = list(group)
+        fields = linear_residuals(after, data, [adapted.subsets[run] for run in runs], after)
+        for run, each in zip(runs, fields, strict=True):
+            yield score(each, model="linear_residual", mode="scratch", n_train=size, seed=adapted.seeds[run])
 
 
 def _choose_recipe(experiment: Experiment, outputs: Outputs, fold: Fold, candidate: Callable[[str], TrainedModel]):

@@ -1,30 +1,15 @@
 """Read any CSV log through a TOML file that states the meaning of its columns; no unit or frame is assumed.
 
-[frames]
-world = "NED"                 # or "ENU" (any frame with z up)
-body = "FRD"                  # or "FLU"
-velocity = "world"            # or "body"
-[time]
-columns = ["timestamp"]
-unit = "us"                   # s, ms, us, ns
-[position]
-columns = ["x", "y", "z"]
-unit = "mm"                   # m, cm, mm
-[attitude]                    # body → world
-columns = ["q0", "q1", "q2", "q3"]
-unit = "wxyz"                 # or xyzw; or of three columns roll, pitch, yaw: rad, deg
-[velocity]
-columns = ["vx", "vy", "vz"]
-unit = "m/s"                  # m/s, cm/s, mm/s
-[body_rates]
-columns = ["p", "q", "r"]
-unit = "deg/s"                # rad/s, deg/s
-[motors]                      # in the order of the vehicle's rotors, whose spin is in the vehicle file
-columns = ["m3", "m1", "m4", "m2"]
-unit = "rpm"                  # rad/s, rpm, rev/s, or command with
-# polynomial = [150.0, 900.0] # rad/s = c0 + c1 command + c2 command² …
-[format]
-delimiter = ";"               # optional, by default a comma
+frames = {world = "NED", body = "FRD", velocity = "world"}      # or "ENU" (any world with z up), "FLU", "body"
+time = {columns = ["timestamp"], unit = "us"}                   # s, ms, us, ns
+position = {columns = ["x", "y", "z"], unit = "mm"}             # m, cm, mm
+attitude = {columns = ["q0", "q1", "q2", "q3"], unit = "wxyz"}  # body → world; wxyz, xyzw; roll, pitch, yaw: rad, deg
+velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}         # m/s, cm/s, mm/s
+body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}        # rad/s, deg/s
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, command; in the vehicle's order
+format = {delimiter = ";"}                                      # optional, by default a comma
+
+Motors in unit "command" need polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
 """
 
 import math

@@ -32,11 +32,7 @@ def read_csv(path: str | Path, *, max_rows: int = MAX_ROWS) -> FlightLog:
 
 
 def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
-    """Make the log of a file from its table in the order of `COLUMNS`; row i + 2 of the file holds table[i].
-
-    Raises:
-        ValueError: file, row, field and what to do, in one line.
-    """
+    """Check the table of a file, in the order of `COLUMNS`; row i + 2 of the file holds table[i]."""
     parts = table[:, 0], table[:, 1:14], table[:, 14:]
     require_possible(*parts, path, "row", 2)
     log = FlightLog(*parts, str(path))

@@ -39,18 +39,17 @@ def segments(log: FlightLog) -> list[slice]:
 
 
 def even_segments(log: FlightLog) -> list[slice]:
-    """Return the segments after checking that the samples of each are evenly spaced.
+    """Return the segments; refuse a log whose samples are not evenly spaced within each."""
+    uneven = unevenness(log)
+    if uneven.any():
+        at = log.t[int(uneven.argmax())]
+        raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return segments(log)
 
-    Raises:
-        ValueError: the time of the first uneven interval.
-    """
-    found = segments(log)
-    for part in found:
-        uneven = np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
-        if uneven.any():
-            at = log.t[part][int(uneven.argmax())]
-            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
-    return found
+
+def unevenness(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether a sound interval has another length than the median one."""
+    return sound_intervals(log) & (np.abs(np.diff(log.t) - log.dt) > JITTER * log.dt)
 
 
 def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:

@@ -14,7 +14,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mappe
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, segments
+from hybrid_jax.flights.segments import even_segments, segments, unevenness
 from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
@@ -82,7 +82,7 @@ def load_windows(
             if check.verdict == FAILS:
                 warnings.warn(message, stacklevel=2)
     if dt is not None:
-        logs = [_at_interval(log, dt) for log in logs]
+        logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
@@ -127,11 +127,7 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
 
 
 def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
-    """Return the interval [s] between samples, which all logs must share.
-
-    Raises:
-        ValueError: a log with uneven samples, or two logs with different intervals; `option` is how to resample them.
-    """
+    """Return the interval [s] between samples, which all logs must share; `option` is how a user can resample them."""
     for log in logs:
         even_segments(log)
         if log.dt != logs[0].dt:
@@ -157,11 +153,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
-    """Return the logs that hold a window of `steps` intervals.
-
-    Raises:
-        ValueError: no log does.
-    """
+    """Return the logs that hold a window of `steps` intervals; refuse logs of which none does."""
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
         names = ", ".join(flight_of(log) for log in logs)
@@ -183,22 +175,11 @@ def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, f
 
     Returns:
         The log, the start of the segment [s] after the log's first sample, and the windows.
-
-    Raises:
-        ValueError: no log holds one.
     """
     log = require_length(logs, steps)[0]
     part = max(segments(log), key=lambda part: part.stop - part.start)
     windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
     return log, float(log.t[part.start] - log.t[0]), _float32(windows)
-
-
-def _at_interval(log: FlightLog, dt: float) -> FlightLog:
-    try:
-        even_segments(log)
-    except ValueError:
-        return resample(log, dt)[0]
-    return log if log.dt == dt else resample(log, dt)[0]
 
 
 def _float32(windows: Trajectories) -> Trajectories:
