@@ -17,19 +17,20 @@ def verdicts(rows: Results) -> list[Verdict]:
     """Evaluate each hypothesis that the rows can answer, on the mean over seeds with folds pooled."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    best: Cell = ("hybrid", "fine_tuned", sizes[-1]) if sizes else ("hybrid", "source_only", 0)
+    mode, most = ("fine_tuned", sizes[-1]) if sizes else ("source_only", 0)
+    best = ("hybrid", mode, most)
     if best not in found:
         return []
     baselines = [cell for cell in found if cell[0] in BASELINES]
-    rivals: list[Cell] = [(model, best[1], best[2]) for model in ("no_physics", "physics_only")]
+    rivals = [(model, mode, most) for model in ("no_physics", "physics_only")]
     claims = [
         _better("F1", best, baselines, "every simple baseline"),
         _better("F2", best, rivals, "no-physics and physics-only"),
     ]
     if sizes:
-        few: Cell = ("hybrid", "fine_tuned", sizes[0])
+        few, scratch = (("hybrid", mode, sizes[0]) for mode in ("fine_tuned", "scratch"))
         claims += [
-            _better("F3", few, [("hybrid", "scratch", sizes[0])], "the same model from scratch"),
+            _better("F3", few, [scratch], "the same model from scratch"),
             _better("F4", few, [("hybrid", "zero_shot", 0)], "the source's model as it is"),
         ]
     return evaluate(claims, found)

@@ -1,12 +1,11 @@
 """The options of `python -m experiments.real_flight`, and its presets."""
 
-import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 from experiments.real_flight.recipes import Model, RecipeName
-from experiments.runner.options import Run, distinct
+from experiments.runner.options import Count, NotNegative, Positive, Run, check_numbers, distinct
 from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
@@ -17,8 +16,7 @@ LEARN = (
 NANODRONE_STEPS = 50
 MAX_WINDOWS = 10_000_000
 ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "staged")
-FOLDERS = ("source", "target", "test")
-FILES = ("vehicle", "columns")
+PATHS = ("source", "target", "test", "vehicle", "columns")
 
 
 @dataclass(frozen=True)
@@ -27,15 +25,15 @@ class Cleaning:
 
     in_flight: bool = False
     """Cut out periods of half a second and more with hardly any thrust: the vehicle is on the ground."""
-    resample: float | None = None
+    resample: Positive | None = None
     """New interval between samples [s]."""
-    longest_gap: float = 0.0
+    longest_gap: NotNegative = 0.0
     """With resample: interpolate across gaps and repeated samples up to this long [s]."""
-    low_pass: float | None = None
+    low_pass: Positive | None = None
     """Cut-off frequency [Hz] of a zero-phase low-pass filter of states and motors."""
     align: bool = False
     """Shift the motors of each log by their lag to the gyro, found by cross-correlation."""
-    delay: float = 0.0
+    delay: Annotated[float, checks.number] = 0.0
     """Instead of align: delay of the motors [s]."""
 
     def __post_init__(self):
@@ -43,11 +41,7 @@ class Cleaning:
             raise ValueError("--cleaning.align finds the delay itself: leave out --cleaning.delay")
         if self.longest_gap and self.resample is None:
             raise ValueError("--cleaning.longest-gap needs --cleaning.resample")
-        checks.not_negative("--cleaning.longest-gap", self.longest_gap)
-        checks.number("--cleaning.delay", self.delay)
-        for name in ("resample", "low_pass"):
-            if getattr(self, name) is not None:
-                checks.positive(f"--cleaning.{name.replace('_', '-')}", getattr(self, name))
+        check_numbers("--cleaning.", self)
 
 
 @dataclass(frozen=True)
@@ -83,14 +77,14 @@ class RealFlightConfig(Run):
     protocol: Literal["horizons", "nanodrone"] = "horizons"
     """horizons: RMSE after each of --horizon. nanodrone: also the mean error of each step, summed over steps 1 to 50.
     Both predict from every sample of every test flight, open loop with the recorded inputs."""
-    horizon: tuple[int, ...] = (10, 50)
+    horizon: tuple[Count, ...] = (10, 50)
     """Numbers of intervals after which errors are measured."""
-    n: tuple[int, ...] = (100, 300, 1000)
+    n: tuple[Count, ...] = (100, 300, 1000)
     """Numbers of target windows to adapt to."""
     draw: Literal["random", "contiguous"] = "random"
     """random: windows from all training flights of the target. contiguous: consecutive windows, as from the first
     seconds of a flight; they cover far less flight."""
-    folds: int | None = None
+    folds: Count | None = None
     """Without --test: number of folds; by default 3, or as many as there are names."""
     folds_by: Literal["flight", "manoeuvre"] = "flight"
     """Test and training share no flight, or no manoeuvre (file name without number).
@@ -108,49 +102,38 @@ class RealFlightConfig(Run):
     learn: tuple[str, ...] | None = None
     """Names of learned physical parameters, and motor_time_constant for the rotors' lag; by default `learn` of the
     vehicle file, or else what real multirotors need."""
-    hidden: int = 32
+    hidden: Count = 32
     """Hidden units of the network."""
-    stride: int = 5
+    stride: Count = 5
     """Samples between the starts of two training windows of the source; for the target it is 1."""
-    validation: int = 200
+    validation: Count = 200
     """Number of validation windows, evenly spaced in the validation flights."""
-    epochs: float = 1.0
+    epochs: Positive = 1.0
     """Factor on the numbers of epochs of the recipes."""
-    batch_size: int = 100
+    batch_size: Count = 100
     """Windows per minibatch."""
     data_seed: int = 0
     """Seed of the folds and of simulated flights."""
 
     def __post_init__(self):
         Run.__post_init__(self)
-        for name in ("hidden", "stride", "validation", "batch_size", *(("folds",) if self.folds else ())):
-            if getattr(self, name) < 1:
-                raise ValueError(f"--{name.replace('_', '-')} must be at least 1, got {getattr(self, name)}")
+        check_numbers("--", self)
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
-        distinct("--models", self.models)
-        distinct("--horizon", tuple(map(str, self.horizon)))
-        distinct("--n", tuple(map(str, self.n)))
-        if min(self.horizon) < 1:
-            raise ValueError(f"--horizon must be at least 1, got {self.horizon}")
+        for name in ("models", "horizon", "n"):
+            distinct(f"--{name}", tuple(map(str, getattr(self, name))))
         if max(self.n) > MAX_WINDOWS:
             raise ValueError(f"--n must be at most {MAX_WINDOWS}, got {max(self.n)}")
         if min(self.n) < self.batch_size:
             raise ValueError(f"--n must each be at least --batch-size {self.batch_size}, got {self.n}")
-        if not 0 < self.epochs < math.inf:
-            raise ValueError(f"--epochs must be a positive number, got {self.epochs}")
         if self.learn is not None:
             check_learned(self.learn)
-        if self.simulated and any(getattr(self, name) for name in (*FOLDERS, *FILES)):
+        if self.simulated and any(getattr(self, name) for name in PATHS):
             raise ValueError(
                 "--simulated makes its own logs: leave out --vehicle, --columns, --source, --target and --test"
             )
 
     def require_flights(self) -> None:
-        """Refuse a configuration without flights; apart from the other checks, as presets have no paths.
-
-        Raises:
-            ValueError: what is missing.
-        """
+        """Refuse a configuration without flights; apart from the other checks, as presets have no paths."""
         if not self.simulated and (self.vehicle is None or self.source is None):
             raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
 
@@ -168,8 +151,7 @@ class RealFlightConfig(Run):
     @property
     def tried(self) -> tuple[RecipeName, ...]:
         """The recipes: as given, or the default for the task."""
-        usual: tuple[RecipeName, ...] = ("turning",)
-        return self.recipes or (ANOTHER_MANOEUVRE if self.another_manoeuvre else usual)
+        return self.recipes or (ANOTHER_MANOEUVRE if self.another_manoeuvre else ("turning",))
 
     @property
     def validated_by(self) -> Literal["flight", "manoeuvre"]:
@@ -179,7 +161,7 @@ class RealFlightConfig(Run):
     def described(self) -> dict[str, Any]:
         """All that fixes the results; of folders and files only the name, since flights are described by content."""
         options = Run.described(self)
-        named = {name: None if options[name] is None else options[name].name for name in (*FOLDERS, *FILES)}
+        named = {name: None if options[name] is None else options[name].name for name in PATHS}
         return options | named | {"recipes": self.tried, "validate_by": self.validated_by}
 
 

@@ -14,14 +14,13 @@ from experiments.real_flight.report import write_report
 from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
 from experiments.real_flight.simulated_logs import write_logs
 from experiments.real_flight.study import run_folds
+from experiments.real_flight.tables import failed_checks
 from experiments.real_flight.train import Experiment
 from experiments.runner.stages import stages_of
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, learned_by_field, vehicle_model_of
-from hybrid_jax.flights.cleaning import lag_motors
-from hybrid_jax.flights.consistency import FAILS
+from hybrid_jax.flights.cleaning import choose_time_constant
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.rotor_lag import choose_time_constant
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
 from hybrid_jax.sweep import hosts
@@ -45,13 +44,17 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
     if config.simulated:
         path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
     else:
-        named = {name: getattr(config, name) for name in ("source", "target", "test")}
+        named = {"source": config.source, "target": config.target, "test": config.test}
         path, folders = config.vehicle, {name: folder for name, folder in named.items() if folder is not None}
     assert path is not None
     before, after, chooses_lag = load_vehicle_models(path, config)
-    if chooses_lag:
-        require_untested_source(folders, config)
-    logs = {}
+    # The time constant may not be chosen on flights, or manoeuvres, that models are tested on.
+    if chooses_lag and "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
+        raise ValueError(
+            f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "
+            f"give --target, or state {LAG} under [terms]"
+        )
+    logs: dict[str, LogSet] = {}
     for name, folder in folders.items():
         model = before if name == "source" else after
         time_constant = 0.0 if chooses_lag else model.terms.motor_time_constant
@@ -59,17 +62,15 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
     require_distinct(list(logs.values()), config)
     dt = require_common_interval([log for each in logs.values() for log in each.logs], "--cleaning.resample ")
     if chooses_lag:
-        logs = apply_motor_lag(logs, before, config, console)
+        chosen = choose_lag(logs["source"], before, config)
+        console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
+        logs = {name: each.with_lag(chosen) for name, each in logs.items()}
     print_failed_checks(logs, console)
     return Experiment(config, before, after, logs, dt, stages_of(config, console))
 
 
 def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
-    """Read the vehicle file.
-
-    Returns:
-        The vehicle of the source, that of target and test, and whether the rotors' time constant is to be chosen.
-    """
+    """Read the vehicle of the source, that of target and test, and whether the rotors' time constant is chosen."""
     tables = read_tables(path)
     before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
     learn = config.learn or (before.learn if "learn" in tables else LEARN)
@@ -77,50 +78,26 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
     return before, after, LAG in learn
 
 
-def require_untested_source(folders: Mapping[str, Path], config: RealFlightConfig) -> None:
-    """Refuse to choose the rotors' time constant on flights, or manoeuvres, that models are tested on."""
-    if "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
-        raise ValueError(
-            f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "
-            f"give --target, or state {LAG} under [terms]"
-        )
-
-
 def print_failed_checks(logs: Mapping[str, LogSet], console: Console) -> None:
     """Print one line per failed check; the report holds the whole table."""
-    for each in logs.values():
-        for record in each.records:
-            for check in record["checks"]:
-                if check["verdict"] == FAILS:
-                    line = f"{each.label}/{record['flight']}: {check['name']}: {check['suggestion']}"
-                    console.print(line, highlight=False, soft_wrap=True, style="yellow")
+    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        line = f"{flight}: {check['name']}: {check['suggestion']}"
+        console.print(line, highlight=False, soft_wrap=True, style="yellow")
 
 
-def apply_motor_lag(
-    logs: Mapping[str, LogSet], model: VehicleModel, config: RealFlightConfig, console: Console
-) -> dict[str, LogSet]:
-    """Choose the rotors' time constant on the source's validation flights and apply it to all logs.
+def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
+    """Choose the rotors' time constant [s] on the source's flights.
 
-    For each candidate, physics is fitted to the source's training flights and predicts the validation flights.
+    For each candidate, physics is fitted to training flights and predicts the validation flights.
     """
-    train, validation = hold_out_validation(logs["source"].logs, config)
+    train, validation = hold_out_validation(source.logs, config)
     baseline = thrust_baseline(model)
 
-    def error(candidate: list[FlightLog]) -> float:
-        fitted_to, predicted = (
-            cut_windows(part, INTERVAL_STEPS).windows for part in (candidate[: len(train)], candidate[len(train) :])
+    def error(logs: list[FlightLog]) -> float:
+        known, unknown = (
+            cut_windows(part, INTERVAL_STEPS).windows for part in (logs[: len(train)], logs[len(train) :])
         )
-        field = fit_least_squares(model.physics(), evenly_spaced(fitted_to, LAG_WINDOWS)).field
-        return relative_error(flight_errors(field, predicted), flight_errors(baseline, predicted), (INTERVAL_STEPS,))
+        field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
+        return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
 
-    chosen, _ = choose_time_constant([*train, *validation], error)
-    console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
-    return {name: _with_lag(each, chosen) for name, each in logs.items()}
-
-
-def _with_lag(logs: LogSet, time_constant: float) -> LogSet:
-    changed = [lag_motors(log, time_constant) for log in logs.logs]
-    records = [
-        record | {"done": [*record["done"], line]} for record, (_, line) in zip(logs.records, changed, strict=True)
-    ]
-    return LogSet(logs.label, [log for log, _ in changed], records)
+    return choose_time_constant([*train, *validation], error)[0]

@@ -1,61 +1,84 @@
 """Figures of models on recorded flights: errors against horizon and N, a predicted flight, output of the network."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from itertools import pairwise
-from typing import Any, NamedTuple
+from typing import Any
 
+import jax
 import matplotlib as mpl
 import numpy as np
-from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
 
-from experiments.real_flight.rows import QUANTITIES, SUM, Cell, cell_name, cells, pooled, score_labels
+from experiments.real_flight.config import NANODRONE_STEPS
+from experiments.real_flight.models import thrust_baseline
+from experiments.real_flight.rows import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
+from experiments.real_flight.study import Outputs
+from experiments.real_flight.train import Experiment, TrainedModel
 from experiments.reporting.plots import COLOURS, STYLE, legend_below
 from experiments.reporting.results import Results
+from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.flights.windows import cut_windows, longest_segment
+from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
-BASELINE_COLOURS = {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
+MODEL_COLOURS = COLOURS | {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
-BINS = 12
-MIN_SAMPLES = 10  # of a bin that is drawn
+BINS, MIN_SAMPLES = 12, 10  # bins of speed, and samples of one that is drawn
 OFFSET = 1.02  # factor in N between the points of two models
 MARGIN = 1.5  # factor in N on both sides of a single one
+PIECES = 6  # predictions in the figure of a flight
 
 
-class Curve(NamedTuple):
-    """Errors at every step, in the order of QUANTITIES: mean over seeds and their standard deviation."""
-
-    mean: Float[np.ndarray, "4 t"]
-    std: Float[np.ndarray, "4 t"]
-
-
-class Restarted(NamedTuple):
-    """Predictions of one model, each from a measured state: time [s] and states of each piece."""
-
-    name: str
-    colour: str
-    pieces: Sequence[tuple[np.ndarray, np.ndarray]]
+def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Figure, str]]:
+    """Draw all figures: name → figure and caption."""
+    nanodrone, rows = experiment.config.protocol == "nanodrone", outputs.table
+    caption = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
+    steps = f"Error against horizon, {caption}, test flights of all folds"
+    figures = {"errors_by_step": (errors_by_step(experiment, outputs), steps)}
+    if any(rows["n_train"]):
+        by_size = errors_by_size(rows, experiment.dt, "Error against the amount of target flight")
+        figures["errors_by_size"] = (by_size, "Error against N, the number of target windows trained on")
+    modes = ("fine_tuned", "source_only", "zero_shot")
+    hybrids = {mode: outputs.trained[0, "hybrid", mode] for mode in modes if (0, "hybrid", mode) in outputs.trained}
+    if hybrids:
+        flight = predicted_flight(experiment, outputs, next(iter(hybrids)))
+        figures["predicted_flight"] = (flight, "A part of a test flight and its predictions")
+        network = residual_by_speed(outputs, hybrids)
+        figures["residual_by_speed"] = (network, "Output of the network on test flights against speed")
+    return figures
 
 
 @mpl.rc_context(STYLE)
-def errors_by_step(curves: Mapping[Cell, Curve], dt: float, title: str, measure: str) -> Figure:
-    """A panel for each quantity: the error of every model against the time since the start of the prediction.
-
-    Args:
-        measure: what an error is, such as "RMSE".
-    """
+def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
+    """A panel for each quantity: the error of the main cells against the time since the start of the prediction."""
+    measure, power, kind = ("mean error", 1, 1) if experiment.config.protocol == "nanodrone" else ("RMSE", 2, 0)
     figure = Figure(figsize=(9.5, 7.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
-    for index, (axes, (name, unit)) in enumerate(zip(panels.flat, QUANTITIES.items(), strict=True)):
-        for cell, curve in curves.items():
-            _draw_curve(axes, cell, dt * np.arange(1, curve.mean.shape[1] + 1), curve.mean[index], curve.std[index])
+    most = max(outputs.table["n_train"])
+    for cell, group in cells(outputs.table).items():
+        model, mode, n = cell
+        if n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
+            continue
+        by_seed = []  # over the test windows of all folds
+        for own in group.group("seed").values():
+            weights, errors = (
+                own.numbers("windows"),
+                np.array([outputs.errors[tuple(row[tag] for tag in TAGS)][kind] for row in own]),
+            )
+            by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
+        curves = zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True)
+        for axes, mean, std in curves:
+            time, low = experiment.dt * np.arange(1, len(mean) + 1), np.maximum(mean - std, 0.5 * mean)
+            axes.plot(time, mean, DASHES[mode], color=MODEL_COLOURS[model], label=cell_name(*cell))
+            axes.fill_between(time, low, mean + std, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
+    for axes, (name, unit) in zip(panels.flat, QUANTITIES.items(), strict=True):
         axes.set(yscale="log", title=name.replace("_", " ").capitalize(), ylabel=f"{measure} [{unit}]")
         _tick(axes)
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
-    return legend_below(figure, title, "mean over seeds; band: ± one standard deviation")
+    return legend_below(figure, "Error against horizon", "mean over seeds; band: ± one standard deviation")
 
 
 @mpl.rc_context(STYLE)
@@ -67,9 +90,10 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
     figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)
     for label, line in zip(labels, panels, strict=True):
+        when = "summed over 50 steps" if label == SUM else f"{int(label) * dt:.3g} s"
         for (name, unit), axes in zip(QUANTITIES.items(), line, strict=True):
             _draw_sizes(axes, found, sizes, label, name)
-            axes.set(title=f"{name.replace('_', ' ').capitalize()}, {_when(label, dt)}", ylabel=f"error [{unit}]")
+            axes.set(title=f"{name.replace('_', ' ').capitalize()}, {when}", ylabel=f"error [{unit}]")
     for axes in panels[-1]:
         axes.set(xscale="log", xlabel="N, target windows")
         axes.set_xticks(sizes, [str(size) for size in sizes])
@@ -80,10 +104,18 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def predicted_flight(
-    time: Float[np.ndarray, " t"], truth: Float[np.ndarray, "t 13"], models: Sequence[Restarted], title: str
-) -> Figure:
+def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Figure:
     """Velocity and body rates of a part of one test flight, and predictions that restart from it at intervals."""
+    config, dt = experiment.config, experiment.dt
+    log, begin, windows = longest_segment(outputs.folds[0].test, config.longest)
+    windows = windows[:PIECES]
+    fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
+    fields["thrust", "nominal"] = thrust_baseline(experiment.after)
+    states = {
+        cell: np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt)) for cell, field in fields.items()
+    }
+    truth = np.concatenate([windows.x0[:1], *windows.x])
+    time = begin + dt * np.arange(len(truth))
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
     places = [*range(*VELOCITY.indices(13)), *range(*BODY_RATES.indices(13))]
@@ -91,68 +123,67 @@ def predicted_flight(
         axes.plot(time, truth[:, place], color="black", linewidth=1.6, label="measured")
         low, high = truth[:, place].min(), truth[:, place].max()
         room = 0.5 * (high - low) or 1.0
-        for model in models:
-            for index, (at, states) in enumerate(model.pieces):
-                label = model.name if index == 0 else None
-                axes.plot(at, states[:, place], color=model.colour, linewidth=1.2, label=label)
-                axes.plot(at[:1], states[:1, place], ".", color="black", markersize=4)
+        for (model, mode), predicted in states.items():
+            label: str | None = cell_name(model, mode)
+            for piece, (x0, x) in enumerate(zip(windows.x0, predicted, strict=True)):
+                at = time[piece * config.longest :][: config.longest + 1]
+                axes.plot(at, [x0[place], *x[:, place]], color=MODEL_COLOURS[model], linewidth=1.2, label=label)
+                axes.plot(at[:1], x0[place], ".", color="black", markersize=4)
+                label = None
         axes.set(title=f"{name} [{'m/s' if name[0] == 'v' else 'rad/s'}]", ylim=(low - room, high + room))
     for axes in panels[1]:
         axes.set_xlabel("time in flight [s]")
+    title = f"Test flight {flight_of(log)}, predicted {dt * config.longest:.3g} s at a time"
     return legend_below(figure, title, "each prediction starts at a dot, from the measured state")
 
 
 @mpl.rc_context(STYLE)
-def residual_by_speed(
-    speed: Float[np.ndarray, " n"], residuals: Mapping[str, Float[np.ndarray, "n 13"]], title: str
-) -> Figure:
+def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> Figure:
     """Output of a network on test flights in ṗ, v̇ and ω̇ against speed: median and quartiles of equal bins.
 
     Derivatives that no network changes have no panel.
-
-    Args:
-        residuals: addition to ẋ at each sample, by the label of the model.
     """
+    windows = cut_windows(outputs.folds[0].test, 1).windows
+    x, u, residuals = windows.x0, windows.u[:, 0], {}
+    for mode, trained in hybrids.items():
+        residuals[cell_name("hybrid", mode)] = np.asarray(jax.jit(jax.vmap(_largest(trained).residual))(x, u))
     every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
     figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
     panels = figure.subplots(1, max(len(parts), 1), squeeze=False)[0][: len(parts)]
-    colours = (COLOURS["hybrid"], COLOURS["no_physics"], COLOURS["physics_only"])
     for axes, (name, part) in zip(panels, parts.items(), strict=True):
-        for colour, (model, residual) in zip(colours, residuals.items(), strict=False):
-            _draw_bins(axes, speed, np.linalg.norm(residual[:, part], axis=1), colour, model)
+        for colour, (label, residual) in zip(COLOURS.values(), residuals.items(), strict=False):
+            size = np.linalg.norm(residual[:, part], axis=1)
+            _draw_bins(axes, np.linalg.norm(x[:, VELOCITY], axis=1), size, colour, label)
         axes.set(xlabel="speed [m/s]", ylabel=f"added to {name}", ylim=(0, None))
-    return legend_below(figure, title, "median over the samples of a bin; band: quartiles")
+    return legend_below(
+        figure, "Output of the network against speed", "median over the samples of a bin; band: quartiles"
+    )
 
 
-def colour_of(model: str) -> str:
-    """The colour that a model has in every figure."""
-    return (COLOURS | BASELINE_COLOURS)[model]
-
-
-def _draw_curve(axes: Axes, cell: Cell, time: np.ndarray, mean: np.ndarray, std: np.ndarray) -> None:
-    model, mode, _ = cell
-    colour = colour_of(model)
-    axes.plot(time, mean, DASHES[mode], color=colour, label=cell_name(*cell))
-    axes.fill_between(time, np.maximum(mean - std, 0.5 * mean), mean + std, color=colour, alpha=0.15, linewidth=0)
+def _largest(trained: TrainedModel) -> Any:
+    """The field of the first seed with the most windows."""
+    return trained.run(int(np.argmax([len(subset) for subset in trained.subsets])))
 
 
 def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, quantity: str) -> None:
     drawn = dict.fromkeys((model, mode) for model, mode, _ in found)
     adapted = [each for each in drawn if (*each, 0) not in found]
     for model, mode in drawn:
-        own = [(n, pooled(found[model, mode, n], label, quantity)) for n in (0, *sizes) if (model, mode, n) in found]
-        name, colour = cell_name(model, mode), colour_of(model)
-        if own[0][0] == 0:
-            axes.axhline(own[0][1].mean(), color=colour, linestyle=DASHES[mode], linewidth=1.2, label=name)
+        own = {n: pooled(found[model, mode, n], label, quantity) for n in (0, *sizes) if (model, mode, n) in found}
+        style: dict[str, Any] = {
+            "color": MODEL_COLOURS[model],
+            "linestyle": DASHES[mode],
+            "label": cell_name(model, mode),
+        }
+        if 0 in own:
+            axes.axhline(own[0].mean(), linewidth=1.2, **style)
             continue
-        means = [values.mean() for _, values in own]
-        spread = [values.std(ddof=1) if len(values) > 1 else 0.0 for _, values in own]
+        spread = [values.std(ddof=1) if len(values) > 1 else 0.0 for values in own.values()]
         # Offset, or bars would hide each other.
         factor = OFFSET ** (adapted.index((model, mode)) - (len(adapted) - 1) / 2)
-        at = [n * factor for n, _ in own]
-        style: dict[str, Any] = {"color": colour, "linestyle": DASHES[mode], "marker": "o", "markersize": 3.5}
-        axes.errorbar(at, means, spread, capsize=2, label=name, **style)
+        at, means = [n * factor for n in own], [values.mean() for values in own.values()]
+        axes.errorbar(at, means, spread, capsize=2, marker="o", markersize=3.5, **style)
     axes.set_yscale("log")
     _tick(axes)
 
@@ -166,15 +197,10 @@ def _tick(axes: Axes) -> None:
 
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:
     edges = np.linspace(0, np.quantile(speed, 0.995), BINS + 1)
-    inside = [size[(speed >= low) & (speed < high)] for low, high in pairwise(edges)]
-    kept = [index for index, values in enumerate(inside) if len(values) >= MIN_SAMPLES]
-    if not kept:
-        return
-    middle = [(edges[index] + edges[index + 1]) / 2 for index in kept]
-    low, median, high = np.array([np.quantile(inside[index], (0.25, 0.5, 0.75)) for index in kept]).T
-    axes.plot(middle, median, color=colour, marker="o", markersize=3.5, label=label)
-    axes.fill_between(middle, low, high, color=colour, alpha=0.18, linewidth=0)
-
-
-def _when(label: str, dt: float) -> str:
-    return "summed over 50 steps" if label == SUM else f"{int(label) * dt:.3g} s"
+    bins = [((low + high) / 2, size[(speed >= low) & (speed < high)]) for low, high in pairwise(edges)]
+    kept = [(at, np.quantile(values, (0.25, 0.5, 0.75))) for at, values in bins if len(values) >= MIN_SAMPLES]
+    if kept:
+        middle, quartiles = zip(*kept, strict=True)
+        low, median, high = np.transpose(quartiles)
+        axes.plot(middle, median, color=colour, marker="o", markersize=3.5, label=label)
+        axes.fill_between(middle, low, high, color=colour, alpha=0.18, linewidth=0)

@@ -9,7 +9,7 @@ from jaxtyping import Int
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.recipes import RECIPES
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.splits import contiguous, flight_of, folds, hold_out, manoeuvre_of
+from hybrid_jax.flights.splits import flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.flights.windows import count_windows, require_length
 from hybrid_jax.trajectories import Trajectories
 
@@ -32,7 +32,7 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
     if tested is not None and (config.target is not None or config.folds_by == "flight"):
         return [Fold("test", *hold_out_validation(train, config), list(tested))]
     of = GROUP_BY[config.folds_by]
-    names = {of(log) for log in train if tested is None or of(log) in {of(other) for other in tested}}
+    names = {of(log) for log in train} & {of(log) for log in tested or train}
     if len(names) < 2:
         raise ValueError(
             f"--folds-by {config.folds_by}: all flights are of one name, so none is left to train on; "
@@ -68,11 +68,7 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
 
 
 def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlightConfig) -> None:
-    """Refuse, before anything is trained, flights that are too short.
-
-    Args:
-        source: the source flights, where the folds hold flights to adapt to.
-    """
+    """Refuse, before anything is trained, flights that are too short; with a source, folds hold flights to adapt to."""
     longest = max(RECIPES[name].window for name in config.tried)
     for fold in (*([source] if source else []), *folds):
         require_length(fold.train, longest)
@@ -101,37 +97,36 @@ def padded(windows: Trajectories, count: int) -> Trajectories:
 
 
 def sampled_indices(sizes: Sequence[int], size: int, draw: str, seed: int) -> Int[np.ndarray, " size"]:
-    """Sample the indices of the training windows of one run.
+    """Sample the indices of the training windows of one run, from flights of so many windows each.
 
-    Args:
-        sizes: number of windows of each flight.
-        draw: "random": any windows; smaller sizes are prefixes of larger ones. "contiguous": consecutive windows of one
-            flight, or where no flight is that long, whole flights and a part of another.
+    Random draws are of any windows; smaller sizes are prefixes of larger ones. Contiguous draws are consecutive windows
+    of one flight, or where no flight is that long, whole flights and a part of another.
     """
     _require_size(size, sum(sizes))
     if draw == "random":
         return np.random.default_rng(seed).permutation(sum(sizes))[:size]
-    starts, left = np.cumsum([0, *sizes]), list(sizes)
+    starts, left = np.cumsum([0, *sizes]), np.array(sizes)
     taken: list[np.ndarray] = []
     while size > max(left):
         flight = int(np.random.default_rng((seed, len(taken))).choice(np.flatnonzero(left)))
         taken.append(np.arange(starts[flight], starts[flight + 1]))
         size, left[flight] = size - left[flight], 0
     if size:
-        # Map indices into the windows of the remaining flights to indices into all windows.
-        part = contiguous(left, size, seed)
-        flight = np.searchsorted(np.cumsum(left), part, side="right")
-        taken.append(part - np.concatenate([[0], np.cumsum(left)])[flight] + starts[flight])
+        # Every place where the rest fits into a flight is equally likely.
+        places = np.cumsum(np.maximum(left - size + 1, 0))
+        at = int(np.random.default_rng(seed).integers(places[-1]))
+        flight = int(np.searchsorted(places, at, side="right"))
+        begin = starts[flight] + at - (places[flight - 1] if flight else 0)
+        taken.append(np.arange(begin, begin + size))
     return np.concatenate(taken)
 
 
 def non_overlapping(indices: np.ndarray, sizes: Sequence[int], spacing: int) -> np.ndarray:
     """Thin out windows until those of one flight are at least `spacing` apart, so that they share no sample."""
-    flight = np.searchsorted(np.cumsum(sizes), np.sort(indices), side="right")
-    kept: list[int] = []
-    last = (-1, -spacing)
-    for index, of in zip(np.sort(indices).tolist(), flight.tolist(), strict=True):
-        if of != last[0] or index - last[1] >= spacing:
-            kept.append(index)
-            last = (of, index)
-    return np.array(kept, int)
+    kept: list[tuple[int, int]] = [(-1, 0)]
+    ordered = np.sort(indices)
+    flights = np.searchsorted(np.cumsum(sizes), ordered, side="right")
+    for flight, index in zip(flights.tolist(), ordered.tolist(), strict=True):
+        if flight != kept[-1][0] or index - kept[-1][1] >= spacing:
+            kept.append((flight, index))
+    return np.array([index for _, index in kept[1:]], int)

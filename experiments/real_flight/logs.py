@@ -18,25 +18,21 @@ from hybrid_jax.vehicle import Vehicle
 
 @dataclass(frozen=True)
 class LogSet:
-    """The flights of one folder.
+    """The flights of one folder."""
 
-    Attributes:
-        label: "source", "target" or "test".
-        logs: after cleaning.
-        records: of each flight, as JSON values: samples and their SHA-256, gaps, checks of the raw log, changes made.
-    """
+    label: str  # source, target or test
+    logs: list[FlightLog]  # after cleaning
+    records: list[dict[str, Any]]  # of each flight, as JSON values: see `_record`
 
-    label: str
-    logs: list[FlightLog]
-    records: list[dict[str, Any]]
+    def with_lag(self, time_constant: float) -> "LogSet":
+        """The flights with rotors that follow the log's motor values with a first-order lag [s]."""
+        logs, lines = zip(*(lag_motors(log, time_constant) for log in self.logs), strict=True)
+        records = [each | {"done": [*each["done"], line]} for each, line in zip(self.records, lines, strict=True)]
+        return LogSet(self.label, list(logs), records)
 
 
 def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float, config: RealFlightConfig) -> LogSet:
-    """Read, check and clean all logs of a folder.
-
-    Args:
-        option: the option that named the folder, without dashes.
-        time_constant: first-order lag of the rotors behind the log's motor values [s].
+    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s].
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
@@ -46,15 +42,10 @@ def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float,
     except ValueError as error:
         about_folder = str(error).startswith(f"{folder}: ")
         raise ValueError(f"--{option} {error}" if about_folder else str(error)) from error
-    logs, records = [], []
-    for raw in found:
-        log, done = clean(raw, config.cleaning, vehicle)
-        if time_constant:
-            log, line = lag_motors(log, time_constant)
-            done.append(line)
-        logs.append(log)
-        records.append({"folder": option} | _record(raw, log, vehicle, done))
-    return LogSet(option, logs, records)
+    cleaned = [clean(raw, config.cleaning, vehicle) for raw in found]
+    records = [_record(option, raw, *each, vehicle) for raw, each in zip(found, cleaned, strict=True)]
+    logs = LogSet(option, [log for log, _ in cleaned], records)
+    return logs.with_lag(time_constant) if time_constant else logs
 
 
 def require_distinct(sets: Sequence[LogSet], config: RealFlightConfig) -> None:
@@ -81,21 +72,19 @@ def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightL
     Raises:
         ValueError: the flight, the option and why it cannot be applied, in one line.
     """
-    steps: list[tuple[str, Callable[..., tuple[FlightLog, str]], tuple[Any, ...]]] = []
-    if cleaning.in_flight:
-        steps.append(("in-flight", in_flight, ()))
-    if cleaning.resample is not None:
-        steps.append(("resample", resample, (cleaning.resample, cleaning.longest_gap)))
-    if cleaning.low_pass is not None:
-        steps.append(("low-pass", low_pass, (cleaning.low_pass,)))
-    if cleaning.align:
-        steps.append(("align", align_motors, (vehicle,)))
-    if cleaning.delay:
-        steps.append(("delay", delay_motors, (cleaning.delay,)))
+    steps: dict[str, tuple[Any, Callable[[FlightLog, Any], tuple[FlightLog, str]]]] = {
+        "in-flight": (cleaning.in_flight or None, lambda log, _: in_flight(log)),
+        "resample": (cleaning.resample, lambda log, dt: resample(log, dt, cleaning.longest_gap)),
+        "low-pass": (cleaning.low_pass, low_pass),
+        "align": (cleaning.align or None, lambda log, _: align_motors(log, vehicle)),
+        "delay": (cleaning.delay or None, delay_motors),
+    }
     done: list[str] = []
-    for option, change, values in steps:
+    for option, (value, change) in steps.items():
+        if value is None:
+            continue
         try:
-            log, line = change(log, *values)
+            log, line = change(log, value)
         except ValueError as error:
             why = str(error).removeprefix(f"{log.name}: ")
             raise ValueError(f"{log.name}: --cleaning.{option}: {why}") from error
@@ -103,9 +92,10 @@ def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightL
     return log, done
 
 
-def _record(raw: FlightLog, log: FlightLog, vehicle: Vehicle, done: list[str]) -> dict[str, Any]:
+def _record(folder: str, raw: FlightLog, log: FlightLog, done: list[str], vehicle: Vehicle) -> dict[str, Any]:
     checks = [asdict(check) for check in check_log(raw, vehicle)]
     return {
+        "folder": folder,
         "flight": flight_of(raw),
         "sha256": digest(None, {"t": raw.t, "x": raw.x, "u": raw.u}),
         "samples": len(raw),

@@ -42,24 +42,18 @@ def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:
 
 
 def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds: int) -> AbstractVectorField:
-    """Stack the untrained fields of all seeds; an untrained hybrid equals its physics.
-
-    Args:
-        name: "hybrid", "no_physics" or "physics_only".
-    """
+    """Stack the untrained fields of all seeds; an untrained hybrid equals its physics."""
     hover = InputScaling(model.vehicle.hover_speed, model.vehicle.hover_speed / 10)
     physics = physics_of(model, recipe)
     # Without physics, no other term could reconcile an estimator's position with its velocity.
     outputs = "motion" if name == "no_physics" else recipe.outputs
-
-    def network(key: PRNGKeyArray) -> AbstractVectorField:
-        options: dict[str, Any] = {"inputs": "body_motion", "outputs": outputs, "norm": "none", "scaling": hover}
-        return zero_output(make_residual(key, hidden=hidden, **options))
+    options: dict[str, Any] = {"inputs": "body_motion", "outputs": outputs, "norm": "none", "scaling": hover}
 
     def build(seed):
         if name == "physics_only":
             return physics
-        return Hybrid(Kinematics() if name == "no_physics" else physics, network(key_of(seed, NETWORK)))
+        network = zero_output(make_residual(key_of(seed, NETWORK), hidden=hidden, **options))
+        return Hybrid(Kinematics() if name == "no_physics" else physics, network)
 
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(np.arange(seeds)))
 
@@ -77,7 +71,7 @@ def move_to_vehicle(fields: Any, vehicle: Vehicle) -> Any:
 
 
 def is_body(node: Any) -> bool:
-    """Whether a node of a field's tree is its multirotor."""
+    """Whether a node of a field's tree is a multirotor."""
     return isinstance(node, Multirotor)
 
 

@@ -16,12 +16,10 @@ NETWORK_ALONE = 5e-3  # rate of a network without physics in stages that train p
 
 @dataclass(frozen=True)
 class Step:
-    """One stage of training.
+    """One stage of training on the first `steps` intervals of each window, as `hybrid_jax.training.stages.Stage`.
 
     Attributes:
         physics, residual: Adam's learning rates; 0 freezes that part.
-        steps: intervals of each window that are trained on.
-        epochs, patience: maximum number of epochs, and epochs without a better validation that end the stage.
         frozen: names of physical parameters that are not trained.
     """
 
@@ -41,11 +39,10 @@ class Recipe:
         about: description for the report.
         window: intervals per window, for training and validation.
         source: stages on the source's flights.
-        adaptation: stages on N windows of the target, from the source's model.
-        scratch: stages on N windows of the target, from the nominal vehicle.
+        adaptation, scratch: stages on N windows of the target, from the source's model and from the nominal vehicle.
         physics: of the hybrid and of physics-only.
         learn: learned names of `multirotor.SHAPES`; if empty, those of the vehicle.
-        outputs: of a hybrid's network; see `hybrid_jax.networks.views.restricted`.
+        outputs: of a hybrid's network.
         position: factor on the scale of position errors in the loss. Position is the integral of velocity and adds no
             information; where an estimator's two disagree, a smaller scale would cause wrong accelerations.
         huber: errors above this multiple of the baseline's error count linearly.
@@ -68,7 +65,7 @@ _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25,
 # lag, but flights after the change determine that single number better than the source does.
 _ESTIMATOR = ("velocity_gain",)
 # A load on a cable comes with the change; fitted to flights without one, the pull would absorb aerodynamic moments.
-_CHANGE = ("cable_pull",)
+CHANGE = ("cable_pull",)
 _ADAPTATION = (
     Step(1e-2, 0, 10, 80, 30, _ESTIMATOR),
     Step(3e-3, 3e-3, 10, 80, 30, _ESTIMATOR),
@@ -81,10 +78,8 @@ _BRIEF = (Step(2e-2, 0, 10, 20), Step(0, 2e-3, 25, 5), Step(0, 1e-3, 50, 5))
 
 _STAGED = Recipe(
     "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
-    *(25, _SOURCE, _ADAPTATION, _SCRATCH),
-    outputs="accelerations",
-    position=10.0,
-)
+    *(25, _SOURCE, _ADAPTATION, _SCRATCH), outputs="accelerations", position=10.0,
+)  # fmt: skip
 _TURNING = "physics, then all on 10 steps, then all on 25; the network adds to the angular acceleration alone"
 _SHORT = "physics, then all on 10 steps; the network adds to accelerations alone"
 _CAREFUL = Recipe(
@@ -115,26 +110,16 @@ RECIPES: Mapping[str, Recipe] = {
 }
 
 
-def before_a_change(recipe: Recipe) -> tuple[Step, ...]:
-    """The stages on the source's flights where a target follows: parameters of the change are frozen."""
-    return tuple(replace(step, frozen=(*step.frozen, *_CHANGE)) for step in recipe.source)
-
-
 def stage_of(step: Step, model: str, factor: float = 1.0) -> Stage:
-    """The training stage of one model.
-
-    Args:
-        factor: on epochs and patience.
-    """
+    """The training stage of one model; `factor` is on epochs and patience."""
     epochs, patience = (max(1, round(factor * count)) for count in (step.epochs, step.patience))
-    match model:
-        case "hybrid":
-            rates = {"physics": step.physics, "residual": step.residual}
-        case "no_physics":  # it has no physics to train first, and gets as many epochs
-            rates = {"residual": step.residual or NETWORK_ALONE}
-        case _:
-            rates = {"": step.physics}
-    return Stage(rates, step.steps, epochs, patience)
+    rates = {
+        "hybrid": {"physics": step.physics, "residual": step.residual},
+        # It has no physics to train first, and gets as many epochs.
+        "no_physics": {"residual": step.residual or NETWORK_ALONE},
+        "physics_only": {"": step.physics},
+    }
+    return Stage(rates[model], step.steps, epochs, patience)
 
 
 def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:

@@ -15,25 +15,14 @@ from collections.abc import Mapping
 
 import numpy as np
 
+from experiments.reporting import names
 from experiments.reporting.results import Results
 
 QUANTITIES = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
-MODELS = ("hybrid", "no_physics", "physics_only", "linear_residual", "thrust", "hold")
-MODES = ("fine_tuned", "scratch", "zero_shot", "source_only", "nominal")
+MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, names.LINEAR_RESIDUAL, names.THRUST, names.HOLD)
+MODES = (names.FINE_TUNED, names.SCRATCH, names.ZERO_SHOT, names.SOURCE_ONLY, names.NOMINAL)
 TAGS = ("fold", "model", "mode", "n_train", "seed")
-NAMES = {
-    "hybrid": "hybrid",
-    "no_physics": "no-physics",
-    "physics_only": "physics-only",
-    "linear_residual": "rigid body + linear residual",
-    "thrust": "thrust, rates frozen",
-    "hold": "hold the state",
-    "fine_tuned": "fine-tuned",
-    "scratch": "scratch",
-    "zero_shot": "zero-shot",
-    "source_only": "trained",
-    "nominal": "",
-}
+OWN_LABELS = {names.LINEAR_RESIDUAL: "rigid body + linear residual", names.SOURCE_ONLY: "trained", names.NOMINAL: ""}
 SUM = "sum"  # label of the nanodrone protocol's score; other labels are numbers of intervals
 
 Cell = tuple[str, str, int]  # model, mode, n_train
@@ -46,7 +35,8 @@ def cells(rows: Results) -> dict[Cell, Results]:
 
 def cell_name(model: str, mode: str, n_train: int = 0) -> str:
     """Label a model, what was done with it, and with how many windows."""
-    return ", ".join(word for word in (NAMES[model], NAMES[mode], f"N = {n_train}" if n_train else "") if word)
+    words = [(names.LABELS | OWN_LABELS).get(key, key) for key in (model, mode)]
+    return ", ".join(filter(None, [*words, f"N = {n_train}" if n_train else ""]))
 
 
 def score_labels(rows: Results) -> list[str]:
@@ -68,8 +58,3 @@ def pooled(rows: Results, label: str, quantity: str) -> np.ndarray:
 def least(errors: Mapping[str, float]) -> str:
     """The name with the smallest finite error, the first of equal ones."""
     return min(errors, key=lambda name: (not math.isfinite(errors[name]), errors[name]))
-
-
-def finite(value: float) -> float | None:
-    """The number, or None where it is not finite."""
-    return float(value) if math.isfinite(value) else None

@@ -13,22 +13,22 @@ from jaxtyping import Int
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
 from experiments.real_flight.folds import non_overlapping
 from experiments.real_flight.models import is_body
-from experiments.real_flight.rows import QUANTITIES, SUM, finite
+from experiments.real_flight.rows import QUANTITIES, SUM
 from experiments.real_flight.train import TrainedModel, TrainingData
-from hybrid_jax.adaptation import least_squares, ridge
+from hybrid_jax.adaptation.least_squares import ravel_parameters
+from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.multirotor import Multirotor
-from hybrid_jax.flights.scores import FlightErrors, flight_errors, mean_by_step
+from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.sweep.lanes import lane, stack
-from hybrid_jax.training import stages
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
+from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories
 
 INTERVAL_STEPS = 10  # length of the windows that intervals of θ_p come from: short, so that many are independent
 ROUND = 25  # their number is a multiple of it
-
 
 Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step: RMS and mean over windows, (2, 4, t)
 
@@ -36,58 +36,43 @@ Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step:
 def score(
     field: AbstractVectorField, *, windows: Trajectories, config: RealFlightConfig, fold: str, **columns: Any
 ) -> Test:
-    """Test a field.
-
-    Args:
-        columns: further columns of the row.
-    """
+    """Test a field; `columns` are further columns of the row."""
     errors = flight_errors(field, windows)
     rms = np.array([np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors])
-    mean = np.array(mean_by_step(errors))
+    mean = np.array([np.mean(part, axis=0, dtype=float) for part in errors])
     row = {"fold": fold, "model": "", "mode": "", "n_train": 0, "seed": 0, "recipe": "", "windows": len(windows)}
     row |= {"val_loss": None, "epochs": 0, "status": "ok", "scores": scores(rms, mean, config)}
     row |= {"theta": None, "theta_interval": None}
     return row | columns, np.stack([rms, mean])
 
 
-def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mapping[str, Mapping[str, float | None]]:
+def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mapping[str, Mapping[str, float]]:
     """Pick the RMSE at each horizon and, with the nanodrone protocol, the mean errors of 50 steps, summed."""
     found = {str(steps): rms[:, steps - 1] for steps in config.horizon}
     if config.protocol == "nanodrone":
         found[SUM] = mean[:, :NANODRONE_STEPS].sum(axis=1)
-    return {label: dict(zip(QUANTITIES, map(finite, values), strict=True)) for label, values in found.items()}
+    return {label: dict(zip(QUANTITIES, values, strict=True)) for label, values in found.items()}
 
 
 def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]) -> list[Test]:
-    """Test all runs of a model.
+    """Test all runs of a model by `score` with a fold's arguments; `theta` is what `parameters` found."""
 
-    Args:
-        scoring: `score` with all but the field and the columns given.
-        theta: of each run, from `parameters`.
-    """
+    def one(run: int) -> Test:
+        columns = {"model": trained.model, "mode": trained.mode, "recipe": trained.recipe, **theta[run]}
+        columns |= {"n_train": trained.size(run), "seed": trained.seeds[run], "epochs": int(trained.epochs[run])}
+        status = STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED])
+        return scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
 
-    def columns(run: int) -> dict[str, Any]:
-        return {
-            "model": trained.model,
-            "mode": trained.mode,
-            "n_train": trained.size(run),
-            "seed": trained.seeds[run],
-            "recipe": trained.recipe,
-            "val_loss": finite(trained.val_loss[run]),
-            "epochs": int(trained.epochs[run]),
-            "status": STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED]),
-            **theta[run],
-        }
-
-    return [scoring(trained.run(run), **columns(run)) for run in range(len(trained))]
+    return list(map(one, range(len(trained))))
 
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:
-    """Estimate θ_p and its intervals for each run, from those of its training windows that share no sample."""
+    """Estimate θ_p of each run, and its intervals if enough of its training windows share no sample."""
     if not any(map(is_body, jax.tree.leaves(trained.fields, is_leaf=is_body))):
         return [{} for _ in trained.seeds]
-    short = stages.cut(data.train.windows, min(INTERVAL_STEPS, data.train.windows.horizon))
+    short = _short(data)
     spacing = -(-short.horizon // data.train.stride)
+    learned = ravel_parameters(trained.run(0))[0].size
     found: list[dict[str, Any]] = []
     # Runs of one size share a program; rounding the number of windows lets sizes and folds share one too.
     for _, group in groupby(range(len(trained)), lambda run: len(trained.subsets[run])):
@@ -95,42 +80,29 @@ def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]
         own = [non_overlapping(trained.subsets[run], data.train.sizes, spacing) for run in runs]
         most = min(map(len, own)) // ROUND * ROUND
         picked = stack([each[np.linspace(0, len(each) - 1, most).round().astype(int)] for each in own])
-        found += _parameters(lane(trained.fields, np.array(runs)), picked, short, data.objective)
+        bounded = most > learned
+        of = lane(trained.fields, np.array(runs))
+        ends = jax.device_get(_intervals(of, picked if bounded else picked[:, :0], short, data.objective))
+        for run in range(len(runs)):
+            theta = {name: at.value[run] for name, at in ends.items()}
+            around = {name: [at.low[run], at.high[run]] for name, at in ends.items()}
+            found.append({"theta": theta, "theta_interval": around if bounded else None})
     return found
-
-
-def _parameters(
-    fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajectories, objective: ChannelLoss
-) -> list[dict[str, Any]]:
-    """Return θ_p without intervals where there are no more windows than parameters."""
-    enough = picked.shape[1] > least_squares.ravel_parameters(lane(fields, 0))[0].size
-    ends = jax.device_get(_intervals(fields, picked, windows, objective) if enough else _values(fields))
-
-    def one(run: int) -> dict[str, Any]:
-        theta = {name: finite(interval.value[run]) for name, interval in ends.items()}
-        around = {name: [finite(end[run]) for end in (at.low, at.high)] for name, at in ends.items()}
-        return {"theta": theta, "theta_interval": around if enough else None}
-
-    return [one(run) for run in range(len(picked))]
 
 
 @eqx.filter_jit
 def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajectories, objective: ChannelLoss):
+    """θ_p of each run and its intervals, of no width without windows."""
+
     def one(run):
         field, indices = run
-        return intervals(body_of(field), covariance_of(field, windows[indices], error=objective.error))
-
-    return jax.lax.map(one, (fields, picked))
-
-
-@eqx.filter_jit
-def _values(fields: Any):
-    def one(field):
         body = body_of(field)
-        size = least_squares.ravel_parameters(body)[0].size
+        if len(indices):
+            return intervals(body, covariance_of(field, windows[indices], error=objective.error))
+        size = ravel_parameters(body)[0].size
         return intervals(body, jnp.zeros((size, size)))
 
-    return jax.lax.map(one, fields)
+    return jax.lax.map(one, (fields, picked))
 
 
 def body_of(field: AbstractVectorField) -> Multirotor:
@@ -141,22 +113,18 @@ def body_of(field: AbstractVectorField) -> Multirotor:
 def linear_residuals(
     base: AbstractVectorField, data: TrainingData, subsets: Sequence[np.ndarray], test_base: AbstractVectorField
 ) -> list[AbstractVectorField]:
-    """Fit a linear residual of `base` to each subset of the training windows, all of one size.
-
-    Args:
-        test_base: field that the fitted residuals are added to, such as `base` with another payload.
-    """
-    windows = stages.cut(data.train.windows, min(INTERVAL_STEPS, data.train.windows.horizon))
-    fitted = jax.device_get(_linear_residuals(base, windows, stack(list(subsets)), data.validation))
+    """Fit a linear residual of `base` to each subset of the training windows, of one size; add it to `test_base`."""
+    fitted = jax.device_get(_linear_residuals(base, _short(data), stack(list(subsets)), data.validation))
     return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 
 
 @eqx.filter_jit
 def _linear_residuals(base, windows: Trajectories, subsets: Int[np.ndarray, "runs n"], validation: Trajectories):
-    def one(subset):
-        return ridge.fit_ridge(ridge.linear_residual, base, windows[subset], validation).field
+    return jax.lax.map(lambda subset: fit_ridge(linear_residual, base, windows[subset], validation).field, subsets)
 
-    return jax.lax.map(one, subsets)
+
+def _short(data: TrainingData) -> Trajectories:
+    return cut(data.train.windows, min(INTERVAL_STEPS, data.train.windows.horizon))
 
 
 def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:

@@ -19,11 +19,7 @@ SECONDS = 8.0
 
 
 def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
-    """Simulate flights before and after a change of the inertia; write vehicle.toml and a folder of logs for each.
-
-    Returns:
-        The vehicle file, and the folders by name: source and target.
-    """
+    """Simulate flights before and after a change of the inertia; return the vehicle file, and the folders by name."""
     vehicle = folder / "vehicle.toml"
     write_atomic(vehicle, vehicle_toml(IRIS))
     for name, (domain, count) in FLIGHTS.items():

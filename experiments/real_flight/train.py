@@ -8,13 +8,13 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Int
 
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.folds import Fold, evenly_spaced, padded, sampled_indices
 from experiments.real_flight.logs import LogSet
 from experiments.real_flight.models import ORDER, key_of, move_to_vehicle, objective_of, untrained
-from experiments.real_flight.recipes import RECIPES, Step, before_a_change, epoch_factor, stage_of
+from experiments.real_flight.recipes import CHANGE, RECIPES, Step, epoch_factor, stage_of
 from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
@@ -29,33 +29,24 @@ from hybrid_jax.training.objective import Settings
 from hybrid_jax.training.stages import cut, judged, rates_by_group
 from hybrid_jax.trajectories import Trajectories, concatenate
 
+Counts = Int[np.ndarray, " runs"]
+
 
 @dataclass(frozen=True)
 class Experiment:
-    """What an experiment is given.
-
-    Attributes:
-        before, after: the vehicle of the source, and that of target and test.
-        logs: "source" and, if given, "target" and "test".
-        dt: interval between samples [s].
-        stages: runs sweeps and caches them.
-    """
+    """What an experiment is given."""
 
     config: RealFlightConfig
-    before: VehicleModel
-    after: VehicleModel
-    logs: Mapping[str, LogSet]
-    dt: float
+    before: VehicleModel  # the source's vehicle
+    after: VehicleModel  # that of target and test
+    logs: Mapping[str, LogSet]  # source and, if given, target and test
+    dt: float  # interval between samples [s]
     stages: Stages
 
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Windows to train on and to stop by, and the loss.
-
-    Attributes:
-        capacity: number of windows that the training windows are padded to.
-    """
+    """Windows to train on and to stop by, and the loss; training windows are padded to `capacity`."""
 
     train: LogWindows
     validation: Trajectories
@@ -65,31 +56,18 @@ class TrainingData:
 
 @dataclass(frozen=True)
 class TrainedModel:
-    """The runs of one model, one per seed and number of windows.
-
-    Attributes:
-        model: "hybrid", "no_physics" or "physics_only".
-        mode: "source_only", "zero_shot", "fine_tuned" or "scratch".
-        recipe: a name of `RECIPES`.
-        fields: the vector fields, stacked.
-        seeds: of each run.
-        subsets: indices of the training windows of each run.
-        val_loss: of each run, at the best epoch of its last stage.
-        epochs: of each run, over all stages.
-        best_epochs: of each stage and run.
-        status: of each run's last stage.
-    """
+    """The runs of one model, one per seed and number of windows."""
 
     model: str
     mode: str
     recipe: str
-    fields: Any
+    fields: Any  # stacked
     seeds: Sequence[int]
-    subsets: Sequence[Int[np.ndarray, " n"]]
-    val_loss: Float[np.ndarray, " runs"] = field(default_factory=partial(np.zeros, 0))
-    epochs: Int[np.ndarray, " runs"] = field(default_factory=partial(np.zeros, 0, int))
-    best_epochs: Sequence[Int[np.ndarray, " runs"]] = ()
-    status: Int[np.ndarray, " runs"] = field(default_factory=partial(np.zeros, 0, int))
+    subsets: Sequence[Int[np.ndarray, " n"]]  # indices of the training windows
+    val_loss: np.ndarray = field(default_factory=partial(np.zeros, 0))  # at the best epoch of the last stage
+    epochs: Counts = field(default_factory=partial(np.zeros, 0, int))  # over all stages
+    best_epochs: Sequence[Counts] = ()  # of each stage
+    status: Counts = field(default_factory=partial(np.zeros, 0, int))  # of the last stage
 
     def run(self, index: int) -> AbstractVectorField:
         """The field of one run."""
@@ -103,32 +81,36 @@ class TrainedModel:
         return len(self.subsets[run]) if self.mode in ("fine_tuned", "scratch") else 0
 
 
-def source_data(experiment: Experiment, fold: Fold, recipe: str) -> TrainingData:
-    """Cut windows of a fold before the change; the loss is scaled by them."""
-    train, validation = _windows(experiment, fold, recipe, experiment.config.stride)
-    return TrainingData(train, validation, objective_of(experiment.before, train.windows, RECIPES[recipe]), len(train))
+def training_data(
+    experiment: Experiment, fold: Fold, recipe: str, source: TrainingData | None = None, capacity: int = 0
+) -> TrainingData:
+    """Cut the windows of a fold; the loss is scaled by its training windows.
 
-
-def target_data(experiment: Experiment, fold: Fold, recipe: str, objective: ChannelLoss, capacity: int) -> TrainingData:
-    """Cut windows of a fold after the change, one at every sample, with the loss of the source."""
-    return TrainingData(*_windows(experiment, fold, recipe, 1), objective, capacity)
-
-
-def _windows(experiment: Experiment, fold: Fold, recipe: str, stride: int) -> tuple[LogWindows, Trajectories]:
-    steps = RECIPES[recipe].window
-    validation = cut_windows(fold.validation, steps).windows
-    return cut_windows(fold.train, steps, stride), evenly_spaced(validation, experiment.config.validation)
+    After a change, `source` are the data before it: its loss is used, and a window starts at every sample.
+    """
+    how, config = RECIPES[recipe], experiment.config
+    validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, config.validation)
+    train = cut_windows(fold.train, how.window, 1 if source else config.stride)
+    loss = source.objective if source else objective_of(experiment.before, train.windows, how)
+    return TrainingData(train, validation, loss, capacity or len(train))
 
 
 def train_on_source(
-    experiment: Experiment, name: str, model: str, recipe: str, data: TrainingData, seeds: int
+    experiment: Experiment,
+    name: str,
+    model: str,
+    recipe: str,
+    data: TrainingData,
+    seeds: int,
+    best_epochs: Sequence[Counts] | None = None,
 ) -> TrainedModel:
-    """Train a model on all windows before the change, one run per seed."""
+    """Train a model on all windows before the change, one run per seed; `best_epochs` is that of `in_stages`."""
     how = RECIPES[recipe]
     fields = untrained(model, experiment.before, how, experiment.config.hidden, seeds)
     start = TrainedModel(model, "source_only", recipe, fields, range(seeds), [np.arange(len(data.train))] * seeds)
-    steps = before_a_change(how) if "target" in experiment.logs else how.source
-    return in_stages(experiment, name, start, steps, data)
+    frozen = CHANGE if "target" in experiment.logs else ()
+    steps = [replace(step, frozen=(*step.frozen, *frozen)) for step in how.source]
+    return in_stages(experiment, name, start, steps, data, best_epochs)
 
 
 def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, first: TrainedModel) -> TrainedModel:
@@ -139,12 +121,9 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
     """
     more = cut_windows(fold.validation, RECIPES[first.recipe].window, experiment.config.stride)
     both = concatenate([data.train.windows, more.windows])
-    train = LogWindows(both, [*data.train.sizes, *more.sizes], data.train.stride)
-    everything = replace(data, train=train, capacity=len(train))
-    fields = untrained(first.model, experiment.before, RECIPES[first.recipe], experiment.config.hidden, len(first))
-    start = replace(first, fields=fields, subsets=[np.arange(len(train))] * len(first))
-    steps = RECIPES[first.recipe].source
-    again = in_stages(experiment, f"{name} again", start, steps, everything, first.best_epochs)
+    windows = LogWindows(both, [*data.train.sizes, *more.sizes], data.train.stride)
+    data = replace(data, train=windows, capacity=len(both))
+    again = train_on_source(experiment, f"{name} again", first.model, first.recipe, data, len(first), first.best_epochs)
     return replace(first, fields=again.fields, epochs=first.epochs + again.epochs)
 
 
@@ -158,17 +137,19 @@ def adapt(
 ) -> TrainedModel:
     """Train a model on N windows after the change, one run for each size and seed, in this order.
 
-    Args:
-        mode: "fine_tuned" starts from the fields of `start`, "scratch" from untrained ones.
+    "fine_tuned" starts from the fields of `start`, "scratch" from untrained ones.
     """
-    config, how = experiment.config, RECIPES[start.recipe]
-    fields = start.fields
+    config, how, fields, steps = (
+        experiment.config,
+        RECIPES[start.recipe],
+        start.fields,
+        RECIPES[start.recipe].adaptation,
+    )
     if mode == "scratch":
-        fields = untrained(start.model, experiment.after, how, config.hidden, len(start))
+        fields, steps = untrained(start.model, experiment.after, how, config.hidden, len(start)), how.scratch
     seeds = [seed for _ in sizes for seed in start.seeds]
     subsets = [sampled_indices(data.train.sizes, size, config.draw, s) for size in sizes for s in start.seeds]
     begin = TrainedModel(start.model, mode, start.recipe, lane(fields, np.array(seeds)), seeds, subsets)
-    steps = how.scratch if mode == "scratch" else how.adaptation
     return in_stages(experiment, f"{name} {mode}", begin, steps, data)
 
 
@@ -178,12 +159,11 @@ def in_stages(
     start: TrainedModel,
     steps: Sequence[Step],
     data: TrainingData,
-    best_epochs: Sequence[np.ndarray] | None = None,
+    best_epochs: Sequence[Counts] | None = None,
 ) -> TrainedModel:
     """Train all runs through the stages; each stage starts from the previous stage's best validation checkpoint.
 
-    Args:
-        best_epochs: of each stage and run; stages then end after these, with their last fields.
+    With `best_epochs`, of each stage and run, a stage ends after these, with its last fields.
     """
     config, fields, finals = experiment.config, start.fields, []
     settings = Settings(config.batch_size, objective=data.objective)
@@ -193,9 +173,11 @@ def in_stages(
     for number, step in enumerate(steps, 1):
         runs = _run_configs(start, fields, step, factors)
         splits = Dataset({"train": cut(train, step.steps), "validation": data.validation}, {})
-        states = _start_states(fields, start.seeds, number, data.validation, settings)
+        where = (fields, np.asarray(start.seeds), np.asarray(number))
+        states = jax.device_get(_start_states(*where, data.validation, settings))
         if best_epochs is not None:
-            runs = _exactly(runs, best_epochs[number - 1])
+            exact = np.maximum(best_epochs[number - 1], 1).astype(np.int32)
+            runs = eqx.tree_at(lambda run: (run.max_epochs, run.min_epochs), runs, (exact, exact))
         final = experiment.stages.run(f"{name} {start.model} {start.recipe} {number}", states, runs, settings, splits)
         trained = final.best if best_epochs is None else _where(best_epochs[number - 1] > 0, final.field, fields)
         finals, fields = [*finals, final], trained
@@ -217,8 +199,7 @@ def rates_of(step: Step, model: str, field: AbstractVectorField) -> dict[str, fl
 
 
 def _run_configs(start: TrainedModel, fields: Any, step: Step, factors: Sequence[float]) -> RunConfig:
-    longest = max(map(len, start.subsets))
-    one = lane(fields, 0)
+    longest, one = max(map(len, start.subsets)), lane(fields, 0)
     rates = rates_by_group(one, rates_of(step, start.model, one))
 
     def configure(subset: np.ndarray, factor: float) -> RunConfig:
@@ -226,28 +207,19 @@ def _run_configs(start: TrainedModel, fields: Any, step: Step, factors: Sequence
         indices = np.resize(subset, longest)  # all of one length; only the first len(subset) are used
         return make_run_config(rates, indices, len(subset), 0, stage.patience, stage.epochs, 0.0)
 
-    runs = [configure(*each) for each in zip(start.subsets, factors, strict=True)]
-    return jax.device_get(stack([jax.device_get(run) for run in runs]))
-
-
-def _exactly(runs: RunConfig, epochs: np.ndarray) -> RunConfig:
-    """Make each run take exactly so many epochs, but at least one."""
-    exact = np.maximum(epochs, 1).astype(np.int32)
-    return eqx.tree_at(lambda run: (run.max_epochs, run.min_epochs), runs, (exact, exact))
-
-
-def _start_states(fields: Any, seeds: Sequence[int], number: int, validation: Trajectories, settings: Settings):
-    def start(field, seed):
-        return fitting.start(field, jax.random.fold_in(key_of(seed, ORDER), number))
-
-    states = jax.device_get(eqx.filter_jit(eqx.filter_vmap(start))(fields, np.asarray(seeds)))
-    errors = jax.device_get(_errors_at_start(states, validation, settings))
-    return eqx.tree_at(lambda state: state.best_mse, states, errors)
+    return stack([configure(*each) for each in zip(start.subsets, factors, strict=True)])
 
 
 @eqx.filter_jit
-def _errors_at_start(states: FitState, validation: Trajectories, settings: Settings) -> Float[Array, " runs"]:
-    return jax.lax.map(lambda state: judged(state, validation, settings).best_mse, states)
+def _start_states(fields: Any, seeds: Counts, number, validation: Trajectories, settings: Settings) -> FitState:
+    """The state of each run at the start of a stage, with the validation error of its field."""
+
+    def one(run):
+        field, seed = run
+        state = fitting.start(field, jax.random.fold_in(key_of(seed, ORDER), number))
+        return judged(state, validation, settings)
+
+    return jax.lax.map(one, (fields, seeds))
 
 
 def _where(mask: np.ndarray, new: Any, old: Any) -> Any:

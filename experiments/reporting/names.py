@@ -4,7 +4,9 @@ HYBRID, NO_PHYSICS, PHYSICS_ONLY = "hybrid", "no_physics", "physics_only"
 EXPERT_AUGMENTATION, LAST_LAYER, LINEAR_RESIDUAL = "expert_augmentation", "last_layer", "linear_residual"
 THETA_P_ONLY, THETA_D_ONLY = "theta_p_only", "theta_d_only"
 LEAST_SQUARES, CONSTANT_DISTURBANCE = "least_squares", "constant_disturbance"
+THRUST, HOLD = "thrust", "hold"
 FINE_TUNED, TARGET_ONLY, SOURCE_ONLY = "fine_tuned", "target_only", "source_only"
+SCRATCH, ZERO_SHOT, NOMINAL = "scratch", "zero_shot", "nominal"
 PARAMETER_SHIFT, EXTERNAL_FORCE = "parameter_shift", "external_force"
 LABELS = {
     HYBRID: "hybrid",
@@ -17,7 +19,10 @@ LABELS = {
     LEAST_SQUARES: "least squares on θ_p",
     CONSTANT_DISTURBANCE: "least squares on θ_p + disturbance",
     LINEAR_RESIDUAL: "source + linear residual",
+    THRUST: "thrust, rates frozen",
+    HOLD: "hold the state",
     FINE_TUNED: "fine-tuned",
+    ZERO_SHOT: "zero-shot",
     TARGET_ONLY: "target-only",
     SOURCE_ONLY: "source-only",
     PARAMETER_SHIFT: "parameter shift",

@@ -17,7 +17,7 @@ thrust. Then v − v̂ is λ times the force in the log, which is f and what a r
 gain S of each axis models the same for drag alone, and other errors of scale.
 
 The lag of the rotors is not part of the field but applied to the log: as four more states, the rotor speeds would be
-unknown at the start of each window, which is about as long as the lag. See `hybrid_jax.flights.rotor_lag`.
+unknown at the start of each window, which is about as long as the lag. See `hybrid_jax.flights.cleaning`.
 """
 
 from functools import partial

@@ -24,7 +24,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import Vehicle, from_table, read_tables, require_known, vehicle_of
 
-LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.rotor_lag`
+LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.cleaning`
 TABLES = ("vehicle", "learn", "terms")
 
 

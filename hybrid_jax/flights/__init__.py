@@ -15,15 +15,22 @@ share samples, wind and battery:
 
 - log, flight_csv, column_map, ulog: reading; attitude: frames.
 - consistency, readings, motor_response: checks of a log against itself and the vehicle.
-- segments, cleaning, rotor_lag: gaps, resampling, filtering, delays of the motors.
+- segments, cleaning: gaps, resampling, filtering, delays of the motors.
 - splits, windows, scores: flights for training and test, windows, prediction errors.
 """
 
-from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
+from hybrid_jax.flights.cleaning import (
+    align_motors,
+    choose_time_constant,
+    delay_motors,
+    in_flight,
+    lag_motors,
+    low_pass,
+    resample,
+)
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.consistency import Check, check_log
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.rotor_lag import choose_time_constant
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.flights.splits import folds, hold_out
 from hybrid_jax.flights.windows import LogWindows, cut_windows, load_log, load_logs, load_windows

@@ -20,20 +20,11 @@ VELOCITY_FRAMES = ("world", "body")
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of the vectors in a log.
+    """The frames of the vectors in a log; ENU stands for any world with z up."""
 
-    Attributes:
-        world: "ENU" (or any other frame with z up) or "NED".
-        body: "FLU" or "FRD".
-        velocity: "world" or "body".
-
-    Raises:
-        ValueError: another name.
-    """
-
-    world: str
-    body: str
-    velocity: str
+    world: str  # ENU or NED
+    body: str  # FLU or FRD
+    velocity: str  # world or body
 
     def __post_init__(self):
         for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", VELOCITY_FRAMES)):

@@ -1,14 +1,18 @@
 """Changes to a log; each returns the new log and one line that describes the change."""
 
+from collections.abc import Callable, Sequence
+
 import numpy as np
 from scipy import signal
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.motor_response import lagged, respond
-from hybrid_jax.flights.segments import GAP, at_rest, even_segments, repeats, segments
+from hybrid_jax.flights.segments import GAP, at_rest, even_segments, repeats, runs_of, segments
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import Vehicle
+
+TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
@@ -25,7 +29,7 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
     if not dt > 0:
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
     fresh, parts = log[~repeats(log)], []
-    for part in _joined(log, fresh, longest_gap):
+    for part in runs_of(np.diff(fresh.t) <= max(1.5 * log.dt, longest_gap), 1):
         piece = fresh[part]
         # The tolerance keeps the last sample despite rounded times.
         first, last = np.ceil(piece.t[0] / dt - 1e-6), np.floor(piece.t[-1] / dt + 1e-6)
@@ -33,23 +37,12 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
             parts.append(_sampled(piece, np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])))
     if not parts:
         raise ValueError(f"{log.name}: no segment without gaps is as long as dt = {dt} s")
-    parts = _kept_apart(parts, dt)
+    # Without last samples of segments that would make a gap too short to be recognised as one.
+    ends = [following.t[0] - GAP * dt for following in parts[1:]] + [np.inf]
+    parts = [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
     t, x, u = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "x", "u"))
     done = f"resampled {len(log)} samples to {len(t)} at {dt} s in {len(parts)} segments"
     return FlightLog(t, x, u, log.name), f"{done}, bridging gaps up to {longest_gap} s"
-
-
-def _kept_apart(parts: list[FlightLog], dt: float) -> list[FlightLog]:
-    """Drop last samples of segments so that every gap remains longer than the threshold for gaps."""
-    ends = [following.t[0] - GAP * dt for following in parts[1:]] + [np.inf]
-    return [part[part.t < end] for part, end in zip(parts, ends, strict=True) if (part.t < end).any()]
-
-
-def _joined(log: FlightLog, fresh: FlightLog, longest_gap: float) -> list[slice]:
-    """Segments of the fresh samples, with intervals up to the longest gap."""
-    whole = np.diff(fresh.t) <= max(1.5 * log.dt, longest_gap)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], whole, [0]])))
-    return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
 
 
 def _sampled(piece: FlightLog, t) -> FlightLog:
@@ -88,7 +81,10 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     x, u = log.x.copy(), log.u.copy()
     for part in even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
-        both = _forward(sections, both) if causal else _both_ways(sections, both)
+        if causal:
+            both, _ = signal.sosfilt(sections, both, axis=0, zi=signal.sosfilt_zi(sections)[..., None] * both[0])
+        else:
+            both = signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
         x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
@@ -96,15 +92,6 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     if len(log) < all_samples:
         done += f"; {all_samples - len(log)} repeated samples left out"
     return FlightLog(log.t, x, u, log.name), done
-
-
-def _forward(sections, values):
-    start = signal.sosfilt_zi(sections)[..., None] * values[0]
-    return signal.sosfilt(sections, values, axis=0, zi=start)[0]
-
-
-def _both_ways(sections, values):
-    return signal.sosfiltfilt(sections, values, axis=0, padlen=min(9, len(values) - 1))
 
 
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
@@ -151,3 +138,22 @@ def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
     if found is None or sum(found.correlations[:2]) < 0.2:
         raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be estimated")
     return delay_motors(log, found.lag)
+
+
+def choose_time_constant(
+    logs: Sequence[FlightLog], error: Callable[[list[FlightLog]], float], candidates: Sequence[float] = TIME_CONSTANTS
+) -> tuple[float, list[float]]:
+    """Choose the time constant [s] for `lag_motors` with the smallest error; also return the error of each candidate.
+
+    For logs that record commands, not rotor speeds.
+
+    Args:
+        error: prediction error of a model fitted to logs to which a candidate was applied.
+
+    Raises:
+        ValueError: no error is finite, or as `lag_motors`.
+    """
+    errors = [float(error([lag_motors(log, candidate)[0] for log in logs])) for candidate in candidates]
+    if not np.isfinite(errors).any():
+        raise ValueError("error is finite for no candidate, so no time constant can be chosen")
+    return candidates[int(np.nanargmin(np.where(np.isfinite(errors), errors, np.nan)))], errors

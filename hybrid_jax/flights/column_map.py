@@ -1,30 +1,15 @@
 """Read any CSV log through a TOML file that states the meaning of its columns; no unit or frame is assumed.
 
-[frames]
-world = "NED"                 # or "ENU" (any frame with z up)
-body = "FRD"                  # or "FLU"
-velocity = "world"            # or "body"
-[time]
-columns = ["timestamp"]
-unit = "us"                   # s, ms, us, ns
-[position]
-columns = ["x", "y", "z"]
-unit = "mm"                   # m, cm, mm
-[attitude]                    # body → world
-columns = ["q0", "q1", "q2", "q3"]
-unit = "wxyz"                 # or xyzw; or of three columns roll, pitch, yaw: rad, deg
-[velocity]
-columns = ["vx", "vy", "vz"]
-unit = "m/s"                  # m/s, cm/s, mm/s
-[body_rates]
-columns = ["p", "q", "r"]
-unit = "deg/s"                # rad/s, deg/s
-[motors]                      # in the order of the vehicle's rotors, whose spin is in the vehicle file
-columns = ["m3", "m1", "m4", "m2"]
-unit = "rpm"                  # rad/s, rpm, rev/s, or command with
-# polynomial = [150.0, 900.0] # rad/s = c0 + c1 command + c2 command² …
-[format]
-delimiter = ";"               # optional, by default a comma
+frames = {world = "NED", body = "FRD", velocity = "world"}      # or "ENU" (any world with z up), "FLU", "body"
+time = {columns = ["timestamp"], unit = "us"}                   # s, ms, us, ns
+position = {columns = ["x", "y", "z"], unit = "mm"}             # m, cm, mm
+attitude = {columns = ["q0", "q1", "q2", "q3"], unit = "wxyz"}  # body → world; wxyz, xyzw; roll, pitch, yaw: rad, deg
+velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}         # m/s, cm/s, mm/s
+body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}        # rad/s, deg/s
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, command; in the vehicle's order
+format = {delimiter = ";"}                                      # optional, by default a comma
+
+Motors in unit "command" need polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
 """
 
 import math
@@ -53,13 +38,7 @@ COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "motors": 4}
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of one quantity and their unit; for motors also the map from command to rad/s.
-
-    Attributes:
-        columns: names in the header.
-        unit: a key of `SCALES`.
-        polynomial: coefficients c0, c1, … of rotor speed [rad/s] = Σ cᵢ commandⁱ; empty unless the unit is "command".
-    """
+    """The columns of one quantity and their unit; for motor commands also the coefficients c0, c1, … of their map."""
 
     columns: tuple[str, ...]
     unit: str
@@ -107,6 +86,8 @@ def load_column_map(path: str | Path) -> ColumnMap:
         return _column_map(tables)
     except ValueError as error:
         raise ValueError(f"{path}: {error}") from error
+    except TypeError as error:
+        raise ValueError(f"{path}: a value of the wrong type: {error}") from error
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_ROWS) -> FlightLog:
@@ -116,32 +97,25 @@ def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_
         ValueError: file, row, field and what to do, in one line.
     """
     table = read_table(path, column_map.names, delimiter=column_map.delimiter, max_rows=max_rows)
-    return flight_log(path, convert(table, column_map, str(path)))
-
-
-def convert(table: Float[np.ndarray, "n c"], column_map: ColumnMap, origin: str = "table") -> Float[np.ndarray, "n 18"]:
-    """Convert numbers in the order of `column_map.names` to t, state and rotor speeds as in `hybrid_jax.state`.
-
-    Raises:
-        ValueError: angles declared in rad that are degrees, or an attitude of norm zero.
-    """
-    ends = np.cumsum([len(column_map.quantities[name].columns) for name in SCALES])
-    parts = dict(zip(SCALES, np.split(table, ends[:-1], axis=1), strict=True))
-    parts = {name: part * SCALES[name][column_map.quantities[name].unit] for name, part in parts.items()}
-    q = _attitude(parts["attitude"], column_map.quantities["attitude"], origin)
-    motors, polynomial = parts["motors"], column_map.quantities["motors"].polynomial
+    stated, parts, begin = column_map.quantities, {}, 0
+    for name, scales in SCALES.items():
+        end = begin + len(stated[name].columns)
+        parts[name], begin = table[:, begin:end] * scales[stated[name].unit], end
+    q = _attitude(parts["attitude"], stated["attitude"], path)
+    motors, polynomial = parts["motors"], stated["motors"].polynomial
     u = np.polynomial.polynomial.polyval(motors, polynomial) if polynomial else motors
     x = to_library(parts["position"], q, parts["velocity"], parts["body_rates"], column_map.frames)
-    return np.concatenate([parts["time"], x, u], axis=1)
+    return flight_log(path, np.concatenate([parts["time"], x, u], axis=1))
 
 
-def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str) -> Float[np.ndarray, "n 4"]:
+def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
+    fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
         row = int(np.abs(values).max(axis=1).argmax())
         # Yaw may be counted over turns, tilt may not.
         if np.abs(values[:, :2]).max() > 2 * math.pi:
             raise ValueError(
-                f"{origin}: row {row + 2}, field {' '.join(stated.columns)}: roll or pitch above 2π; "
+                f"{origin}: row {row + 2}, field {fields}: roll or pitch above 2π; "
                 'are the angles degrees? set [attitude] unit = "deg"'
             )
         return from_euler(values)
@@ -150,43 +124,34 @@ def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str) ->
         norm = np.linalg.norm(q, axis=1)
     for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
         raise ValueError(
-            f"{origin}: row {row + 2}, field {' '.join(stated.columns)}: norm is {norm[row]:.4g}, not 1; "
+            f"{origin}: row {row + 2}, field {fields}: norm is {norm[row]:.4g}, not 1; "
             "cut out samples without an attitude, or name the four quaternion columns"
         )
     return q
 
 
 def _column_map(tables: dict[str, Any]) -> ColumnMap:
-    unknown = sorted(tables.keys() - {"frames", "format", *SCALES})
-    if unknown:
-        raise ValueError(f"[{unknown[0]}]: no such table; known are frames, {', '.join(SCALES)}, format")
-    for name, table in tables.items():
+    known = {"frames": (("world", "body", "velocity"), ())}
+    known |= dict.fromkeys(SCALES, (("columns", "unit"), ("polynomial",))) | {"format": ((), ("delimiter",))}
+    for name, table in {"frames": {}, **tables}.items():
+        if name not in known:
+            raise ValueError(f"[{name}]: no such table; known are {', '.join(known)}")
         if not isinstance(table, dict):
             raise ValueError(f"[{name}]: must be a table, got {table!r}")
-    frames, form = tables.get("frames", {}), tables.get("format", {})
-    _require_keys("frames", frames, ("world", "body", "velocity"), ())
-    _require_keys("format", form, (), ("delimiter",))
+        needed, allowed = known[name]
+        for key in needed:
+            if key not in table:
+                raise ValueError(f"[{name}]: {key} is missing")
+        for key in table:
+            if key not in needed + allowed:
+                raise ValueError(f"[{name}]: {key}: no such key; known are {', '.join(needed + allowed)}")
     quantities = {}
-    for name in SCALES:
-        if name in tables:
-            _require_keys(name, tables[name], ("columns", "unit"), ("polynomial",))
-            lists = {key: tables[name].get(key, []) for key in ("columns", "polynomial")}
-            if not all(isinstance(value, list) for value in lists.values()):
-                raise ValueError(f"[{name}]: columns and polynomial must be lists, got {lists}")
-            quantities[name] = Columns(tuple(lists["columns"]), tables[name]["unit"], tuple(lists["polynomial"]))
-    try:
-        return ColumnMap(Frames(**frames), quantities, form.get("delimiter", ","))
-    except TypeError as error:
-        raise ValueError(f"a value of the wrong type: {error}") from error
-
-
-def _require_keys(name: str, table: dict[str, Any], needed: tuple[str, ...], allowed: tuple[str, ...]) -> None:
-    for key in needed:
-        if key not in table:
-            raise ValueError(f"[{name}]: {key} is missing")
-    for key in table:
-        if key not in needed + allowed:
-            raise ValueError(f"[{name}]: {key}: no such key; known are {', '.join(needed + allowed)}")
+    for name in filter(tables.__contains__, SCALES):
+        lists = {key: tables[name].get(key, []) for key in ("columns", "polynomial")}
+        if not all(isinstance(value, list) for value in lists.values()):
+            raise ValueError(f"[{name}]: columns and polynomial must be lists, got {lists}")
+        quantities[name] = Columns(tuple(lists["columns"]), tables[name]["unit"], tuple(lists["polynomial"]))
+    return ColumnMap(Frames(**tables["frames"]), quantities, tables.get("format", {}).get("delimiter", ","))
 
 
 def _check(name: str, stated: Columns, scales: dict[str, float]) -> None:

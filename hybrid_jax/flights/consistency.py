@@ -4,28 +4,19 @@ Where they disagree, common mistakes are undone one at a time, and the one that 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.flights.motor_response import respond
-from hybrid_jax.flights.readings import (
-    NOTHING,
-    UP,
-    Readings,
-    Vectors,
-    accelerations,
-    middle,
-    rates,
-    smoother,
-    velocities,
-)
+from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, smoother
 from hybrid_jax.flights.segments import at_rest, gaps, repeats, sound_intervals
-from hybrid_jax.state import INPUT_NAMES, QUATERNION, VELOCITY
+from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
@@ -52,21 +43,14 @@ Law = Callable[[Vectors, Vectors, float], str]  # two records and the least moti
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check.
+    """The result of one check."""
 
-    Attributes:
-        name: the two records compared.
-        value, unit, limit: measured value and its maximum (for correlations its minimum).
-        verdict: "ok", "fails" or "cannot tell".
-        suggestion: what to correct, if anything.
-    """
-
-    name: str
+    name: str  # of the two records compared
     value: float
     unit: str
-    limit: float
-    verdict: str
-    suggestion: str
+    limit: float  # maximum of the value; of correlations the minimum
+    verdict: str  # "ok", "fails" or "cannot tell"
+    suggestion: str  # what to correct, if anything
 
 
 def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
@@ -77,12 +61,13 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
+    slope, turn, push = readings.velocities(log), readings.rates(log), readings.accelerations(log)
     exact = _axes_agree, _one_scale  # of kinematics alone: wind and drag separate v̇ from thrust
     return [
         *_samples(log),
-        _compare(log, "dp/dt against v", velocities(log), KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
-        _compare(log, "q̇ against ω", rates(log), KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
-        _compare(log, "v̇ against thrust along body z", accelerations(log), THRUST_LIMIT, LEAST_MOTION["acceleration"]),
+        _compare(log, "dp/dt against v", slope, KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
+        _compare(log, "q̇ against ω", turn, KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
+        _compare(log, "v̇ against thrust along body z", push, THRUST_LIMIT, LEAST_MOTION["acceleration"]),
         *_thrust(log, vehicle),
         _columns(log),
         *_motors(log, vehicle),
@@ -94,23 +79,22 @@ def _samples(log: FlightLog) -> list[Check]:
     clock = "the time is in ms or µs: declare its unit"
     split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones"
     return [
-        Check("interval between samples", log.dt, "s", LONGEST_INTERVAL, *_at_most(log.dt, LONGEST_INTERVAL, clock)),
-        Check("gaps", lost, "share of intervals", 0.01, *_at_most(lost, 0.01, split)),
-        Check("repeated samples", stale, "share of samples", 0.01, *_at_most(stale, 0.01, split)),
+        _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
+        _at_most("gaps", lost, "share of intervals", 0.01, split),
+        _at_most("repeated samples", stale, "share of samples", 0.01, split),
     ]
 
 
-def _at_most(value: float, limit: float, suggestion: str) -> tuple[str, str]:
-    return (OK, NOTHING) if value <= limit else (FAILS, suggestion)
+def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) -> Check:
+    return Check(name, value, unit, limit, *((OK, NOTHING) if value <= limit else (FAILS, suggestion)))
 
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """Check time on the ground, and in flight the mean specific force along body z over k Σu² / m."""
     name, resting = "specific force over thrust per mass", at_rest(log)
     flying = sound_intervals(log) & ~resting[:-1]
-    grounded = float(resting.mean())
     advice = "cut it out: in_flight(log), or --cleaning.in-flight"
-    ground = Check("time on the ground", grounded, "share of samples", 0.01, *_at_most(grounded, 0.01, advice))
+    ground = _at_most("time on the ground", float(resting.mean()), "share of samples", 0.01, advice)
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
@@ -139,63 +123,55 @@ def _columns(log: FlightLog) -> Check:
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
     columns: dict[str, np.ndarray] = dict(zip(COLUMNS[-len(values) :], values, strict=True))
     moving = [name for name, values in columns.items() if (values != values[0]).any()]
-    motors = [name for name in INPUT_NAMES if name in moving]
-    alike = [(a, b) for a, b in combinations(motors, 2) if (columns[a] == columns[b]).all()]
-    kinds = [[name for name in columns if name[0] == kind] for kind in "vwu"]
-    still = [name for kind in kinds if {*kind} & {*moving} for name in kind if name not in moving]
+    kinds = {name[0] for name in moving}  # v, w, u: a vehicle at rest does not change any of a kind
+    alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
-    problems += [f"{name} never changes" for name in still]
+    problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
     verdict = (FAILS, f"{'; '.join(problems)}: name the measured columns") if problems else (OK, NOTHING)
     return Check("columns", float(len(problems)), "suspect", 0.0, *verdict)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     found, limit = respond(log, vehicle), 1000 * log.dt
+    order, spin, gyro = "motor order against roll and pitch", "spin against yaw", "lag of the gyro behind the motors"
     if found is None or sum(found.correlations[:2]) < 2 * ORDER_LIMIT:
         value = float("nan") if found is None else min(found.correlations[:2])
         return [
-            Check("motor order against roll and pitch", value, "correlation", ORDER_LIMIT, UNKNOWN, MORE_FLIGHT),
-            Check("spin against yaw", float("nan"), "correlation", 0.0, UNKNOWN, MORE_FLIGHT),
-            Check("lag of the gyro behind the motors", float("nan"), "ms", limit, UNKNOWN, MORE_FLIGHT),
+            Check(order, value, "correlation", ORDER_LIMIT, UNKNOWN, MORE_FLIGHT),
+            Check(spin, float("nan"), "correlation", 0.0, UNKNOWN, MORE_FLIGHT),
+            Check(gyro, float("nan"), "ms", limit, UNKNOWN, MORE_FLIGHT),
         ]
-    right = found.order == (0, 1, 2, 3)
     columns = " ".join(f"u{motor}" for motor in found.order)
-    order = (OK, NOTHING) if right else (FAILS, f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}")
+    right, advice = found.order == (0, 1, 2, 3), f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}"
+    ordered = (OK, NOTHING) if right else (FAILS, advice)
+    yaw = found.yaw_sign * found.correlations[2]
+    if sum(vehicle.spin):
+        turning = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
+    elif yaw < OPPOSED:
+        turning = FAILS, "flip the sign of every spin of the vehicle"
+    else:
+        turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
+    lag, late = 1000 * found.lag, found.lag > 0
+    shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: delay_motors(log, {found.lag:.4f})"
+    shift += ", or lag_motors if they are commands" if late else ""
     return [
-        Check("motor order against roll and pitch", min(found.as_is[:2]), "correlation", ORDER_LIMIT, *order),
-        _spin(found.yaw_sign * found.correlations[2], vehicle),
-        _lag(1000 * found.lag, limit),
+        Check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, *ordered),
+        Check(spin, yaw, "correlation", YAW_LIMIT, *turning),
+        replace(_at_most(gyro, abs(lag), "ms", limit, shift), value=lag),
     ]
 
 
-def _spin(yaw: float, vehicle: Vehicle) -> Check:
-    if sum(vehicle.spin):
-        verdict = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
-    elif yaw < OPPOSED:
-        verdict = FAILS, "flip the sign of every spin of the vehicle"
-    else:
-        verdict = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
-    return Check("spin against yaw", yaw, "correlation", YAW_LIMIT, *verdict)
-
-
-def _lag(lag: float, limit: float) -> Check:
-    way = "later" if lag > 0 else "earlier"
-    advice = f"shift the motors {abs(lag):.1f} ms {way}: delay_motors(log, {lag / 1000:.4f})"
-    if lag > 0:
-        advice += ", or lag_motors if they are commands"
-    return Check("lag of the gyro behind the motors", lag, "ms", limit, *_at_most(abs(lag), limit, advice))
-
-
-def _compare(log: FlightLog, name: str, readings: Readings, limit: float, least: float, *laws: Law) -> Check:
+def _compare(log: FlightLog, name: str, pairs: Readings, limit: float, least: float, *laws: Law) -> Check:
     """Compare two records under every reading and by further laws."""
     smooth = smoother(log)
-    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in readings.items()}
+    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:
         return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value = _relative_error(a, b)
     advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
-    advice = advice or next(filter(None, (law(a, b, least) for law in laws)), "")
+    for law in laws:
+        advice = advice or law(a, b, least)
     return Check(name, value, "relative error", limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
@@ -210,7 +186,9 @@ def _nearer(pairs: Readings, limit: float, least: float) -> str:
 
 
 def _axes_agree(a: Vectors, b: Vectors, least: float) -> str:
-    apart = [axis for axis, ratio in zip("xyz", _by_axis(a, b, least), strict=True) if ratio > AXIS_LIMIT]
+    pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
+    moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
+    apart = [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]
     return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
 
 
@@ -218,12 +196,6 @@ def _one_scale(a: Vectors, b: Vectors, least: float) -> str:
     gain = float((a * b).sum() / (b * b).sum())
     message = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
     return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else message
-
-
-def _by_axis(a: Vectors, b: Vectors, least: float) -> list[float]:
-    """The relative error of each axis; 0 with little motion along it."""
-    columns = [(a[:, [axis]], b[:, [axis]]) for axis in range(3)]
-    return [_relative_error(*pair) if max(map(_size, pair)) > CLEAR * least else 0.0 for pair in columns]
 
 
 def _size(values: Float[np.ndarray, "n d"]) -> float:

@@ -32,15 +32,11 @@ def read_csv(path: str | Path, *, max_rows: int = MAX_ROWS) -> FlightLog:
 
 
 def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
-    """Make the log of a file from its table in the order of `COLUMNS`; row i + 2 of the file holds table[i].
-
-    Raises:
-        ValueError: file, row, field and what to do, in one line.
-    """
-    t, x, u = table[:, 0], table[:, 1:14], table[:, 14:]
-    require_possible(t, x, u, path, "row", 2)
-    log = FlightLog(t, x, u, str(path))
-    _refuse_degrees(log, path)
+    """Check the table of a file, in the order of `COLUMNS`; row i + 2 of the file holds table[i]."""
+    parts = table[:, 0], table[:, 1:14], table[:, 14:]
+    require_possible(*parts, path, "row", 2)
+    log = FlightLog(*parts, str(path))
+    _refuse_degrees(log)
     return log
 
 
@@ -54,7 +50,10 @@ def read_table(
     """
     try:
         with Path(path).open("rb") as file:
-            parts = list(_parts(path, _text(file), columns, delimiter, max_rows))
+            packed = file.read(2) == b"\x1f\x8b"
+            file.seek(0)
+            text = io.TextIOWrapper(gzip.GzipFile(fileobj=file) if packed else file, encoding="utf-8-sig")
+            parts = list(_parts(path, text, columns, delimiter, max_rows))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
@@ -64,12 +63,6 @@ def read_table(
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     return np.concatenate(parts)
-
-
-def _text(file: IO[bytes]) -> IO[str]:
-    packed = file.read(2) == b"\x1f\x8b"
-    file.seek(0)
-    return io.TextIOWrapper(gzip.open(file) if packed else file, encoding="utf-8-sig")  # type: ignore[arg-type]
 
 
 def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int) -> Iterator[Float[np.ndarray, "n c"]]:
@@ -84,9 +77,8 @@ def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int) -> Itera
         if not lines[-1]:
             lines.pop()
         elif len(lines[-1]) >= MAX_ROW_LENGTH:
-            raise ValueError(
-                f"{path}: row {row + len(lines) - 1}: is too long for a row of numbers; is this a CSV file?"
-            )
+            last = row + len(lines) - 1
+            raise ValueError(f"{path}: row {last}: is too long for a row of numbers; is this a CSV file?")
         if row - 2 + len(lines) > max_rows:
             raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
         yield _numbers(path, lines, row, names, picked, delimiter)
@@ -135,7 +127,7 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
     return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"
 
 
-def _refuse_degrees(log: FlightLog, path: str | Path) -> None:
+def _refuse_degrees(log: FlightLog) -> None:
     """Refuse body rates that are about 180/π times those of the attitude."""
     if len(log) < 3:
         return
@@ -144,8 +136,7 @@ def _refuse_degrees(log: FlightLog, path: str | Path) -> None:
     stated = np.linalg.norm(log.x[:-1, BODY_RATES], axis=1)
     # Medians are robust to noise and lost samples.
     if np.median(turned) > 0.02 and 30 < np.median(stated) / np.median(turned) < 110:
-        row = int(stated.argmax()) + 2
         raise ValueError(
-            f"{path}: row {row}, field wx wy wz: body rates (here {stated.max():.4g}) are 57 times those of the "
-            f"attitude: degrees per second; convert them to rad/s or declare the unit in a column map"
+            f"{log.name}: row {int(stated.argmax()) + 2}, field wx wy wz: body rates (here {stated.max():.4g}) are 57 "
+            "times those of the attitude: degrees per second; convert them to rad/s or declare the unit in a column map"
         )

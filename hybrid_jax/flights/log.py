@@ -1,7 +1,7 @@
 """A recorded flight in the library's frames and units, checked when it is created."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 from jaxtyping import Float
@@ -35,7 +35,7 @@ class FlightLog:
         t, x, u = (np.array(array, float) for array in (self.t, self.x, self.u))
         if t.ndim != 1 or x.shape != (len(t), STATE_SIZE) or u.shape != (len(t), INPUT_SIZE):
             raise ValueError(f"{self.name}: t, x, u must be (n,), (n, 13), (n, 4), got {t.shape}, {x.shape}, {u.shape}")
-        require_possible(t, x, u, self.name, "sample", 0)
+        require_possible(t, x, u, self.name)
         x[:, QUATERNION] = _canonical(x[:, QUATERNION])
         for name, array in (("t", t), ("x", x), ("u", u)):
             object.__setattr__(self, name, array)
@@ -63,9 +63,9 @@ def require_possible(
     t: Float[np.ndarray, " n"],
     x: Float[np.ndarray, "n 13"],
     u: Float[np.ndarray, "n 4"],
-    origin: str | Path,
-    unit: str,
-    first: int,
+    origin,
+    unit="sample",
+    first=0,
 ) -> None:
     """Refuse numbers that are impossible in a flight.
 
@@ -77,39 +77,26 @@ def require_possible(
     """
     if len(t) == 0:
         raise ValueError(f"{origin}: has no samples; record or export the flight again")
-    for problems in (_infinite(t, x, u), _disordered(t), _not_rotations(x[:, QUATERNION]), _backwards(u)):
-        for sample, name, complaint in problems:
-            raise ValueError(f"{origin}: {unit} {sample + first}, field {name}: {complaint}")
+    for sample, name, complaint in _problems(t, x, u):
+        raise ValueError(f"{origin}: {unit} {sample + first}, field {name}: {complaint}")
 
 
-def _infinite(t, x, u):
+def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
+    """Impossible values: index of the sample, field and what to do."""
     for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (INPUT_NAMES, u)):
         bad = ~np.isfinite(block)
         if bad.any():
             row, column = np.argwhere(bad)[0].tolist()
             yield row, names[column], f"is {block[row, column]}; cut the sample out (it becomes a gap) or repair it"
-
-
-def _disordered(t):
     # Compare, as a difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
-        word = "repeats" if t[row] == t[row - 1] else "goes back from"
-        yield (
-            row,
-            "t",
-            f"time {t[row]:.6g} {word} {t[row - 1]:.6g}; sort the samples, drop doubles, split restarted clocks",
-        )
-
-
-def _not_rotations(q):
+        times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"
+        yield row, "t", f"time {times}; sort the samples, drop doubles, split restarted clocks"
     with np.errstate(over="ignore"):  # an infinite norm is refused too
-        norm = np.linalg.norm(q, axis=1)
+        norm = np.linalg.norm(x[:, QUATERNION], axis=1)
     for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
         advice = "cut out samples without an attitude" if norm[row] == 0 else "are these the four quaternion columns?"
         yield row, "qw qx qy qz", f"norm is {norm[row]:.4g}, not 1; {advice}"
-
-
-def _backwards(u):
     for row, column in np.argwhere(u < 0)[:1].tolist():
         yield row, INPUT_NAMES[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
 

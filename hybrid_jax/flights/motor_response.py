@@ -18,32 +18,17 @@ LONGEST_LAG = 0.1  # s, either way
 FAST, SLOW = 0.03, 0.2  # s
 YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
 ORDERS = np.array(list(permutations(range(4))))
-TIME_CONSTANTS = np.concatenate([[0.0], np.geomspace(0.005, 0.2, 24)])  # s
 
 
 @dataclass(frozen=True)
 class Response:
-    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw.
+    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
 
-    Attributes:
-        order: `u[:, order]` is in the order of the vehicle's rotors.
-        yaw_sign: −1 if every rotor spins opposite to the vehicle file.
-        lag: time by which angular acceleration follows the motors [s]; negative if it precedes them.
-        correlations: of roll and pitch at that order and lag, of yaw at its own best lag near it.
-        as_is: of roll, pitch and yaw for the motors in their present order, at that lag.
-    """
-
-    order: tuple[int, int, int, int]
-    yaw_sign: int
-    lag: float
-    correlations: tuple[float, float, float]
-    as_is: tuple[float, float, float]
-
-
-def mixer(vehicle: Vehicle) -> Float[np.ndarray, "3 4"]:
-    """Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row."""
-    arms = np.asarray(vehicle.rotor_positions)
-    return np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
+    order: tuple[int, int, int, int]  # u[:, order] is in the order of the vehicle's rotors
+    yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
+    lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
+    correlations: tuple[float, float, float]  # of roll and pitch at that order and lag, of yaw at its best lag near it
+    as_is: tuple[float, float, float]  # of roll, pitch and yaw for the motors in their present order, at that lag
 
 
 def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
@@ -52,7 +37,10 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     torque, squares = _quick(log, vehicle)
     if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
         return None
-    table = np.stack([correlations(torque, squares, mixer(vehicle), lag) for lag in range(-reach, reach + 1)])
+    arms = np.asarray(vehicle.rotor_positions)
+    # Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row.
+    mix = np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
+    table = np.stack([correlations(torque, squares, mix, lag) for lag in range(-reach, reach + 1)])
     # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
     score = table[..., 0] + table[..., 1]
     at, best = np.unravel_index(score.argmax(), score.shape)

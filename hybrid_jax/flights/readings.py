@@ -1,8 +1,4 @@
-"""Common mistakes in a log, undone one at a time.
-
-A reading is a pair of records that should be equal, such as dp/dt and v, after undoing one mistake. The first reading,
-`NOTHING`, is the unchanged log.
-"""
+"""Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake."""
 
 from collections.abc import Callable
 
@@ -16,11 +12,12 @@ from hybrid_jax.flights.motor_response import moving_mean
 from hybrid_jax.flights.segments import sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
-NOTHING = "nothing to correct"
+NOTHING = "nothing to correct"  # the reading of the unchanged log
 SPAN = 0.05  # s of moving average on both sides of an equation
 LATE = 0.1  # delay or advance of a velocity that is tried [s]
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
+FLIPS = dict(zip("xyz", 1 - 2 * np.eye(3), strict=True))
 
 Vectors = Float[np.ndarray, "n 3"]
 Readings = dict[str, tuple[Vectors, Vectors]]
@@ -29,13 +26,11 @@ Readings = dict[str, tuple[Vectors, Vectors]]
 def velocities(log: FlightLog) -> Readings:
     """dp/dt and v [m/s]."""
     p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
-    slope, late = np.diff(p, axis=0) / np.diff(log.t)[:, None], round(LATE / log.dt)
+    slope, late, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], round(LATE / log.dt), BODIES["FRD"]
     stated = {
         NOTHING: v,
         'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
-        'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(
-            v @ BODIES["FRD"]
-        ),
+        'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(v @ frd),
         'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
         "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
         "velocity is in mm/s or position in km: set the units": v * 1e-3,
@@ -45,7 +40,7 @@ def velocities(log: FlightLog) -> Readings:
         f"velocity is about {LATE:g} s late: shift it": _shifted(v, late),
         f"velocity is about {LATE:g} s early: shift it": _shifted(v, -late),
     }
-    for axis, signs in zip("xyz", _one_axis_flipped(), strict=True):
+    for axis, signs in FLIPS.items():
         stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
     return {reading: (slope, middle(values)) for reading, values in stated.items()}
 
@@ -63,10 +58,9 @@ def rates(log: FlightLog) -> Readings:
     }
     for reading, attitude in _attitudes(q).items():
         found[reading] = rates_between(log.t, attitude), omega
-    for axis, signs in zip("xyz", _one_axis_flipped(), strict=True):
+    for axis, signs in FLIPS.items():
         found[f"w{axis} has the wrong sign: flip it"] = turned, omega * signs
-        mirrored = q * [1, *signs]
-        found[f"q{axis} has the wrong sign: flip it"] = rates_between(log.t, mirrored), omega
+        found[f"q{axis} has the wrong sign: flip it"] = rates_between(log.t, q * [1, *signs]), omega
     return found
 
 
@@ -74,17 +68,18 @@ def accelerations(log: FlightLog) -> Readings:
     """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
-    ned = quaternion_of(_turned(attitude, WORLDS["NED"], BODIES["FRD"]))
+
+    def turned(world) -> Float[np.ndarray, "n 4"]:
+        return quaternion_of(Rotation.from_matrix(world @ attitude.as_matrix() @ BODIES["FRD"].T))
+
+    ned = turned(WORLDS["NED"])
     stated = {
         NOTHING: (q, v),
         'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
         "attitude alone is NED and FRD: convert it": (ned, v),
         'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
-        'the body is FRD in a world with z up: set body = "FRD"': (
-            quaternion_of(_turned(attitude, np.eye(3), BODIES["FRD"])),
-            v,
-        ),
+        'the body is FRD in a world with z up: set body = "FRD"': (turned(np.eye(3)), v),
         'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
     }
     # Other readings of attitudes rotate thrust about z only, which wind or a load may do as well.
@@ -102,25 +97,15 @@ def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"
     }
 
 
-def _one_axis_flipped() -> Float[np.ndarray, "3 3"]:
-    return 1 - 2 * np.eye(3)
-
-
 def _shifted(values: Vectors, samples: int) -> Vectors:
-    """Shift values by some samples; the ends are repeated."""
     return values[np.clip(np.arange(len(values)) + samples, 0, len(values) - 1)]
 
 
-def _turned(attitude: Rotation, world, body) -> Rotation:
-    return Rotation.from_matrix(world @ attitude.as_matrix() @ body.T)
-
-
 def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
-    up, slope = middle(rotation_of(q).apply(UP)), np.diff(v, axis=0) / np.diff(log.t)[:, None]
-    specific, sound = slope + GRAVITY, sound_intervals(log)[:, None]
-    predicted = up * thrust
+    slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], sound_intervals(log)[:, None]
+    predicted = middle(rotation_of(q).apply(UP)) * thrust
     power = (predicted**2 * sound).sum()
-    scale = max(0.0, (predicted * specific * sound).sum() / power) if power > 0 else 0.0
+    scale = max(0.0, (predicted * (slope + GRAVITY) * sound).sum() / power) if power > 0 else 0.0
     return slope, scale * predicted - GRAVITY
 
 

@@ -27,41 +27,35 @@ def sound_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
     return ~(gaps(log) | stale[:-1] | stale[1:])
 
 
+def runs_of(mask: Bool[np.ndarray, " n"], extra: int = 0) -> list[slice]:
+    """The maximal runs of true entries, each longer by `extra` at its end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).tolist()
+    return [slice(start, stop + extra) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
 def segments(log: FlightLog) -> list[slice]:
     """Maximal runs of at least two samples joined by sound intervals."""
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], sound_intervals(log), [0]])))
-    return [slice(int(start), int(stop) + 1) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+    return runs_of(sound_intervals(log), 1)
 
 
 def even_segments(log: FlightLog) -> list[slice]:
-    """Return the segments after checking that the samples of each are evenly spaced.
-
-    Raises:
-        ValueError: the time of the first uneven interval.
-    """
-    for part in (found := segments(log)):
-        uneven = _uneven(log, part)
-        if uneven.any():
-            at = log.t[part][int(uneven.argmax())]
-            raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
-    return found
+    """Return the segments; refuse a log whose samples are not evenly spaced within each."""
+    uneven = unevenness(log)
+    if uneven.any():
+        at = log.t[int(uneven.argmax())]
+        raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return segments(log)
 
 
-def is_even(log: FlightLog) -> bool:
-    """Whether the samples of each segment are evenly spaced."""
-    return not any(_uneven(log, part).any() for part in segments(log))
-
-
-def _uneven(log: FlightLog, part: slice) -> Bool[np.ndarray, " n-1"]:
-    return np.abs(np.diff(log.t[part]) - log.dt) > JITTER * log.dt
+def unevenness(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether a sound interval has another length than the median one."""
+    return sound_intervals(log) & (np.abs(np.diff(log.t) - log.dt) > JITTER * log.dt)
 
 
 def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
     """Whether a sample belongs to a period of half a second or more with hardly any thrust, on the ground."""
     power = (log.u**2).sum(axis=1)
-    idle = power < IDLE * np.quantile(power, 0.9)
-    edges = np.flatnonzero(np.diff(np.concatenate([[0], idle, [0]])))
     found = np.zeros(len(log), bool)
-    for start, stop in zip(edges[::2], edges[1::2], strict=True):
-        found[start:stop] = log.t[stop - 1] - log.t[start] >= RESTING
+    for part in runs_of(power < IDLE * np.quantile(power, 0.9)):
+        found[part] = log.t[part][-1] - log.t[part.start] >= RESTING
     return found

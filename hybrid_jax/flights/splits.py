@@ -1,7 +1,6 @@
 """Split flights into training and test by flight or by manoeuvre.
 
-Windows of one flight overlap and share wind, battery and payload. Windows drawn at random from all flights would put
-neighbouring windows into training and test.
+Windows of one flight overlap and share wind, battery and payload, so a split of windows would leak into the test.
 """
 
 import re
@@ -9,7 +8,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Int
 
 from hybrid_jax.flights.log import FlightLog
 
@@ -45,9 +43,8 @@ def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[Flig
             raise ValueError(f"names: no flight is called {name!r}, only {', '.join(known)}")
     split = [log for log in logs if of(log) not in names], [log for log in logs if of(log) in names]
     if not all(split):
-        raise ValueError(
-            f"names: {len(split[0])} flights for training and {len(split[1])} held out; each side needs one"
-        )
+        found = f"{len(split[0])} flights for training and {len(split[1])} held out"
+        raise ValueError(f"names: {found}; each side needs one")
     return split
 
 
@@ -59,7 +56,6 @@ def folds(
     Args:
         count: number of splits; by default one per name.
         of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
-        seed: of the assignment of names to splits.
 
     Raises:
         ValueError: count is less than 2 or more than the number of names.
@@ -70,23 +66,3 @@ def folds(
         raise ValueError(f"count must be from 2 to the {len(names)} different names of the flights, got {count}")
     dealt = np.random.default_rng(seed).permutation(np.array(names, object))
     return [hold_out(logs, list(dealt[i::count]), of) for i in range(count)]
-
-
-def contiguous(sizes: Sequence[int], count: int, seed: int) -> Int[np.ndarray, " count"]:
-    """Pick `count` consecutive windows of one flight at random, as a recording of a few seconds would give.
-
-    Args:
-        sizes: number of windows of each flight, in the order of the concatenated windows.
-
-    Raises:
-        ValueError: no flight has as many windows.
-    """
-    places = [max(0, size - count + 1) for size in sizes]
-    if count < 1 or not any(places):
-        raise ValueError(
-            f"count must be from 1 to the {max(sizes, default=0)} windows of the longest flight, got {count}"
-        )
-    at = int(np.random.default_rng(seed).integers(sum(places)))
-    flight = int(np.searchsorted(np.cumsum(places), at, side="right"))
-    begin = sum(sizes[:flight]) + at - sum(places[:flight])
-    return np.arange(begin, begin + count)

@@ -21,7 +21,8 @@ STATES = {
     "vehicle_attitude": ("q[0]", "q[1]", "q[2]", "q[3]"),
     "vehicle_angular_velocity": ("xyz[0]", "xyz[1]", "xyz[2]"),
 }
-RPM, COMMANDS = "esc_status", ("actuator_motors", "actuator_outputs")
+RPM = "esc_status"
+# Of motors; the first topic that the log has is used.
 FIELDS = {RPM: "esc[{}].esc_rpm", "actuator_motors": "control[{}]", "actuator_outputs": "output[{}]"}
 LOST = 5  # an interval above this multiple of a topic's median, or of dt, is a gap and is not interpolated across
 
@@ -52,9 +53,8 @@ def read_ulog(
     (tp, local), (tq, q), (tw, omega) = (_samples(data, path, topic, fields) for topic, fields in STATES.items())
     tu, u = _motors(data, path, motor_order, polynomial)
     if np.abs(np.linalg.norm(q, axis=1) - 1).max() > NORM_TOLERANCE:
-        raise ValueError(
-            f"{path}: topic vehicle_attitude, field q: norm is not 1; cut the log where there is no attitude"
-        )
+        advice = "cut the log where there is no attitude"
+        raise ValueError(f"{path}: topic vehicle_attitude, field q: norm is not 1; {advice}")
     times = (tp, tq, tw, tu)
     first, last = max(at[0] for at in times), min(at[-1] for at in times)
     if last - first < dt:
@@ -104,9 +104,8 @@ def _samples(data, path, topic: str, fields: tuple[str, ...], clock: str = "time
     bad = ~np.isfinite(values)
     if topic not in FIELDS and bad.any():
         row, column = np.argwhere(bad)[0].tolist()
-        raise ValueError(
-            f"{path}: topic {topic}, sample {row}, field {fields[column]}: is not finite; cut the log there"
-        )
+        where = f"topic {topic}, sample {row}, field {fields[column]}"
+        raise ValueError(f"{path}: {where}: is not finite; cut the log there")
     t, kept = np.unique(t, return_index=True)
     if len(t) < 2:
         raise ValueError(f"{path}: topic {topic} has fewer than two samples; log it at a higher rate")
@@ -117,25 +116,19 @@ def _motors(data, path, order, polynomial) -> tuple[Float[np.ndarray, " n"], Flo
     """Time and rotor speeds [rad/s]: ESC rpm where there are any, else commands through the polynomial."""
     if sorted(order) != [0, 1, 2, 3]:
         raise ValueError(f"motor_order must hold 0, 1, 2, 3 in some order, got {order}")
-    if RPM in data:
-        t, rpm = _samples(data, path, RPM, _fields(RPM, order), "timestamp")
-        if np.abs(rpm).max() > 0:  # ESCs without telemetry report zero
-            return t, np.abs(rpm) * np.pi / 30
-    for topic in COMMANDS:
-        if topic in data:
-            if not polynomial:
-                raise ValueError(
-                    f"{path}: has only motor commands ({topic}); give the polynomial that maps them to rad/s"
-                )
-            t, command = _samples(data, path, topic, _fields(topic, order), "timestamp")
-            # PX4 writes NaN for a motor that is disarmed.
-            on = np.isfinite(command)
-            return t, np.where(on, np.polynomial.polynomial.polyval(np.where(on, command, 0.0), polynomial), 0.0)
+    for topic, field in FIELDS.items():
+        if topic not in data:
+            continue
+        t, values = _samples(data, path, topic, tuple(field.format(motor) for motor in order), "timestamp")
+        if topic == RPM:
+            if np.abs(values).max() > 0:
+                return t, np.abs(values) * np.pi / 30
+            continue  # ESCs without telemetry report zero
+        if not polynomial:
+            raise ValueError(f"{path}: has only motor commands ({topic}); give the polynomial that maps them to rad/s")
+        on = np.isfinite(values)  # PX4 writes NaN for a motor that is disarmed
+        return t, np.where(on, np.polynomial.polynomial.polyval(np.where(on, values, 0.0), polynomial), 0.0)
     raise ValueError(f"{path}: has no motors (none of {', '.join(FIELDS)}); log one of these topics and fly again")
-
-
-def _fields(topic: str, order) -> tuple[str, ...]:
-    return tuple(FIELDS[topic].format(motor) for motor in order)
 
 
 def _is_known(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], dt: float):

@@ -14,7 +14,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mappe
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, is_even, segments
+from hybrid_jax.flights.segments import even_segments, segments, unevenness
 from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
@@ -25,10 +25,7 @@ from hybrid_jax.vehicle import Vehicle
 class LogWindows:
     """Windows of several flights in float32, and the number of windows of each flight.
 
-    Attributes:
-        windows: the windows of all flights, flight by flight.
-        sizes: the number of windows of each flight.
-        stride: samples between the starts of two windows.
+    Windows are ordered by flight; `stride` is the number of samples between the starts of two.
     """
 
     windows: Trajectories
@@ -78,9 +75,14 @@ def load_windows(
         checks.positive("dt", dt, "a positive number of seconds")
     logs = load_logs(folder, columns=columns, polynomial=polynomial)
     for log in logs:
-        _report_failures(log, vehicle, strict)
+        for check in check_log(log, vehicle):
+            message = f"{log.name}: {check.name}: {check.suggestion}"
+            if check.verdict == FAILS and strict:
+                raise ValueError(message)
+            if check.verdict == FAILS:
+                warnings.warn(message, stacklevel=2)
     if dt is not None:
-        logs = [log if log.dt == dt and is_even(log) else resample(log, dt)[0] for log in logs]
+        logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
@@ -125,14 +127,7 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
 
 
 def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
-    """Return the interval [s] between samples, which all logs must share.
-
-    Args:
-        option: how the caller lets a user resample, for the error message.
-
-    Raises:
-        ValueError: a log with uneven samples, or two logs with different intervals.
-    """
+    """Return the interval [s] between samples, which all logs must share; `option` is how a user can resample them."""
     for log in logs:
         even_segments(log)
         if log.dt != logs[0].dt:
@@ -158,11 +153,7 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
-    """Return the logs that hold a window of `steps` intervals.
-
-    Raises:
-        ValueError: no log does.
-    """
+    """Return the logs that hold a window of `steps` intervals; refuse logs of which none does."""
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
         names = ", ".join(flight_of(log) for log in logs)
@@ -184,23 +175,11 @@ def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, f
 
     Returns:
         The log, the start of the segment [s] after the log's first sample, and the windows.
-
-    Raises:
-        ValueError: no log holds one.
     """
     log = require_length(logs, steps)[0]
     part = max(segments(log), key=lambda part: part.stop - part.start)
     windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
     return log, float(log.t[part.start] - log.t[0]), _float32(windows)
-
-
-def _report_failures(log: FlightLog, vehicle: Vehicle, strict: bool) -> None:
-    for check in check_log(log, vehicle):
-        if check.verdict == FAILS:
-            message = f"{log.name}: {check.name}: {check.suggestion}"
-            if strict:
-                raise ValueError(message)
-            warnings.warn(message, stacklevel=3)
 
 
 def _float32(windows: Trajectories) -> Trajectories:

@@ -23,6 +23,7 @@ from experiments.real_flight.recipes import RECIPES
 from experiments.real_flight.rows import QUANTITIES, TAGS, pooled
 from experiments.real_flight.scoring import parameters, scores
 from experiments.real_flight.study import each_fold, run_folds
+from experiments.real_flight.tables import choice_tables, parameter_tables
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
@@ -86,11 +87,7 @@ SHORT = [log[:30] for log in LOGS]
         ({}, {"source": LOGS, "test": [log[:5] for log in OTHERS]}, "no window of 5 intervals"),
         ({"recipes": ("frozen_rates",)}, {"source": SHORT, "target": LOGS}, "no window of 50 intervals"),
         ({"recipes": ("frozen_rates",)}, {"source": LOGS, "target": SHORT}, "no window of 50 intervals"),
-        (
-            {"horizon": (40,), "recipes": ("staged", "turning")},
-            {"source": SHORT, "test": LOGS},
-            "no window of 40 intervals",
-        ),
+        ({"horizon": (40,), "recipes": ("staged", "turning")}, {"source": SHORT, "test": LOGS}, "no window of 40"),
     ],
 )
 def test_short_flights_are_refused_before_training(options, flights, message, monkeypatch, tmp_path):
@@ -113,6 +110,8 @@ def test_random_samples_are_nested_and_contiguous_ones_are_runs():
             runs = [found[(found >= a) & (found < b)] for a, b in pairwise(starts)]
             assert all((np.diff(run) == 1).all() for run in runs)
             assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
+    begins = {int(sampled_indices([3, 6, 4], 4, "contiguous", seed)[0]) for seed in range(200)}
+    assert begins == {3, 4, 5, 9}  # all that leave room in one flight
     with pytest.raises(ValueError, match="--n 151: the training flights have only 150 windows"):
         sampled_indices(sizes, 151, "contiguous", 0)
 
@@ -172,10 +171,10 @@ def test_nanodrone_score_sums_the_mean_error_of_each_step():
     assert found["sum"] == dict.fromkeys(QUANTITIES, 50 * 51 / 2)
 
 
-def row(mode, value, *, n=100, seed=0, fold="a", windows=1, model="hybrid"):
+def row(mode, value, *, n=100, seed=0, fold="a", windows=1, model="hybrid", **columns):
     errors = dict.fromkeys(QUANTITIES, value)
     tags = dict(zip(TAGS, (fold, model, mode, n, seed), strict=True))
-    return tags | {"windows": windows, "scores": {"10": errors, "sum": errors}}
+    return tags | {"windows": windows, "scores": {"10": errors, "sum": errors}} | columns
 
 
 def test_folds_are_pooled_by_their_windows():
@@ -190,6 +189,29 @@ def test_verdicts_state_the_ratio_of_errors():
     found = verdicts(Results(rows, TAGS))
     assert {each.id: each.holds for each in found} == {"F1": True, "F2": False, "F3": True, "F4": False}
     assert "step 10 velocity 0.250" in found[0].measured
+
+
+@pytest.mark.parametrize(
+    ("second", "text"),
+    [
+        ({"Ix": 3.0, "drag": 5.0}, "4 ± 1 [3, 5]"),
+        ({"Ix": 3.0}, "3 [2, 4] (1 of 2 folds)"),  # its recipe learns no drag
+        ({"Ix": 3.0, "drag": None}, "nan ± nan [2, 4]"),  # its drag is not finite
+    ],
+)
+def test_parameter_is_the_mean_over_folds_that_learn_it(second, text):
+    rows = []
+    for fold, theta in {"a": {"Ix": 2.0, "drag": 3.0}, "b": second}.items():
+        ends = {name: [value - 1, value + 1] for name, value in theta.items() if value is not None}
+        rows.append(row("source_only", 1.0, n=0, fold=fold, theta=theta, theta_interval=ends))
+    (table,) = parameter_tables(Results(rows, TAGS), {"Ix": 1.0, "drag": 0.0})
+    assert [line[-1] for line in table.lines] == ["2.5 ± 0.7 [1.5, 3.5]", text]
+
+
+@pytest.mark.parametrize("errors", [(np.nan, 0.7, 0.6), (0.7, np.inf, 0.6), (0.7, np.nan, 0.6), (0.6, 0.6, 0.5)])
+def test_chosen_recipe_has_the_smallest_finite_error(errors):
+    (table,) = choice_tables({"fold": dict(zip("abc", errors, strict=True))})
+    assert table.lines[0][-1] == "c"
 
 
 @pytest.mark.parametrize("sizes", [(20,), (100, 1000)])

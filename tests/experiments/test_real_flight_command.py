@@ -64,19 +64,16 @@ def test_invalid_cleaning_options_are_refused(option, value, expected):
         Cleaning(**{"resample": 0.01, option: value})
 
 
-def test_logs_of_different_intervals_are_refused(tmp_path):
-    slow = [replace(LOGS[1], t=2 * LOGS[1].t)]
-    found = load_logs("source", write(tmp_path, [LOGS[0], *slow]), IRIS, 0.0, CONFIG)
-    with pytest.raises(ValueError, match=r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"):
-        require_common_interval(found.logs, "--cleaning.resample ")
-
-
-def test_uneven_samples_are_refused(tmp_path):
-    t = LOGS[0].t.copy()
-    t[10] += DT / 3
-    found = load_logs("source", write(tmp_path, [LOGS[1], replace(LOGS[0], t=t)]), IRIS, 0.0, CONFIG)
-    with pytest.raises(ValueError, match=r"chirp_run1.*resample the log first"):
-        require_common_interval(found.logs, "--cleaning.resample ")
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (lambda t: 2 * t, r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"),
+        (lambda t: t + DT / 3 * (np.arange(SAMPLES) == 10), r"chirp_run2.*resample the log first"),
+    ],
+)
+def test_uneven_samples_and_different_intervals_are_refused(times, message):
+    with pytest.raises(ValueError, match=message):
+        require_common_interval([LOGS[0], replace(LOGS[1], t=times(LOGS[1].t))], "--cleaning.resample ")
 
 
 def test_hidden_files_and_folders_are_ignored(tmp_path):
@@ -107,10 +104,10 @@ def test_duplicate_flights_are_refused(tmp_path):
     [
         ({"n": (50,)}, "--n must each be at least --batch-size 100"),
         ({"n": (1_000_000_000,)}, "--n must be at most"),
-        ({"horizon": (0,)}, "--horizon must be at least 1"),
+        ({"horizon": (0,)}, "--horizon must be an integer of at least 1"),
         ({"simulated": True, "source": Path("a")}, "--simulated makes its own logs"),
         ({"learn": ("wings",)}, "learn must be names of"),
-        ({"epochs": 0.0}, "--epochs must be a positive number"),
+        ({"epochs": 0.0}, "--epochs must be a positive finite number"),
     ],
 )
 def test_invalid_options_are_refused(options, message):
@@ -203,12 +200,8 @@ def test_learn_option_overrides_the_vehicle_file(tmp_path):
 def test_bad_log_is_refused_with_file_row_and_field(tmp_path):
     (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
     source = write(tmp_path / "source", LOGS[:3])
-    text = (
-        "t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3\n"
-        + "0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600\n"
-        + "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600\n"
-    )
-    (source / "bad.csv").write_text(text)
+    rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600")
+    (source / "bad.csv").write_text("\n".join(["t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3", *rows]))
     options = ("--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source))
     line = refused(command("real_flight", *options, folder=tmp_path), "real_flight")
     assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")

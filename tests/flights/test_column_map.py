@@ -10,34 +10,19 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.column_map import load_column_map, read_mapped
 
 GOOD = """
-[frames]
-world = "NED"
-body = "FRD"
-velocity = "body"
-[time]
-columns = ["stamp"]
-unit = "us"
-[position]
-columns = ["x", "y", "z"]
-unit = "mm"
-[attitude]
-columns = ["q1", "q2", "q3", "q4"]
-unit = "xyzw"
-[velocity]
-columns = ["u", "v", "w"]
-unit = "cm/s"
-[body_rates]
-columns = ["p", "q", "r"]
-unit = "deg/s"
-[motors]
-columns = ["m3", "m1", "m4", "m2"]
-unit = "rpm"
+frames = {world = "NED", body = "FRD", velocity = "body"}
+time = {columns = ["stamp"], unit = "us"}
+position = {columns = ["x", "y", "z"], unit = "mm"}
+attitude = {columns = ["q1", "q2", "q3", "q4"], unit = "xyzw"}
+velocity = {columns = ["u", "v", "w"], unit = "cm/s"}
+body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}
 [format]
 delimiter = ";"
 """
 EULER = [('["q1", "q2", "q3", "q4"]', '["roll", "pitch", "yaw"]'), ('"xyzw"', '"deg"')]
-AFFINE = [('"rpm"', '"command"\npolynomial = [100.0, 1000.0]')]
-QUADRATIC = [('"rpm"', '"command"\npolynomial = [50, 200.0, 800.0]')]
+AFFINE = [('"rpm"', '"command", polynomial = [100.0, 1000.0]')]
+QUADRATIC = [('"rpm"', '"command", polynomial = [50, 200.0, 800.0]')]
 
 
 def foreign(flight):
@@ -89,17 +74,17 @@ def test_mapped_log_is_the_same_flight(flight, mapped, changes, motors):
     ("changes", "words"),
     [
         ([('world = "NED"', 'world = "SED"')], ("world must be one of ENU, NED", "'SED'")),
-        ([('world = "NED"', "")], ("[frames]", "world is missing")),
+        ([('world = "NED", ', "")], ("[frames]", "world is missing")),
         ([('unit = "mm"', 'unit = "ft"')], ("[position]", "m, cm, mm", "'ft'")),
         ([('unit = "mm"', "unit = 3")], ("[position]", "unit")),
-        ([('unit = "mm"', "")], ("[position]", "unit is missing")),
+        ([(', unit = "mm"', "")], ("[position]", "unit is missing")),
         ([('["u", "v", "w"]', '["u", "v"]')], ("[velocity]", "3 names")),
         ([('["u", "v", "w"]', '"uvw"')], ("[velocity]", "lists")),
         ([('["u", "v", "w"]', '["u", "v", "u"]')], ("[velocity]", "'u' is named twice")),
-        ([("[position]", "[place]")], ("[place]", "no such table")),
-        ([('unit = "deg/s"', 'unit = "deg/s"\nsign = 1')], ("[body_rates]", "sign", "no such key")),
+        ([("position =", "place =")], ("[place]", "no such table")),
+        ([('unit = "deg/s"', 'unit = "deg/s", sign = 1')], ("[body_rates]", "sign", "no such key")),
         ([('"rpm"', '"command"')], ("[motors]", "polynomial")),
-        ([('"rpm"', '"rpm"\npolynomial = [1.0]')], ("[motors]", "polynomial")),
+        ([('"rpm"', '"rpm", polynomial = [1.0]')], ("[motors]", "polynomial")),
         ([('delimiter = ";"', 'delimiter = ";;"')], ("[format]", "delimiter")),
         ([("[format]", "[format")], ("not a readable TOML",)),
         ([("[format]", "x = " + "[" * 2000 + "\n[format]")], ("not a readable TOML",)),

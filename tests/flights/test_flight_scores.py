@@ -8,7 +8,7 @@ import pytest
 from hybrid_jax import Trajectories, rigid_body, rotation
 from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.flights.scores import FlightErrors, errors_between, flight_errors, mean_by_step
+from hybrid_jax.flights.scores import errors_between, flight_errors
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -47,11 +47,6 @@ def test_exact_physics_has_no_error_and_chunks_do_not_matter():
         assert (error < 1e-5).all()
     whole, parts = (flight_errors(HoldState(), windows, chunk=chunk) for chunk in (7, 3))
     np.testing.assert_array_equal(np.stack(whole), np.stack(parts))
-
-
-def test_mean_by_step_averages_over_windows():
-    errors = FlightErrors(*(scale * np.array([[3.0, 1.0], [4.0, 7.0]]) for scale in (1, 2, 3, 4)))
-    np.testing.assert_allclose(mean_by_step(errors).position, [3.5, 4])
 
 
 def test_windows_of_other_states_are_refused():

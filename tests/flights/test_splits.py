@@ -1,13 +1,12 @@
-"""Training and held-out flights are disjoint, and contiguous windows are of one flight."""
+"""Training and held-out flights are disjoint."""
 
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.cleaning import lag_motors
-from hybrid_jax.flights.rotor_lag import choose_time_constant
-from hybrid_jax.flights.splits import contiguous, flight_of, folds, hold_out, manoeuvre_of
+from hybrid_jax.flights.cleaning import choose_time_constant, lag_motors
+from hybrid_jax.flights.splits import flight_of, folds, hold_out, manoeuvre_of
 
 NAMES = [f"/logs/{kind}_run{i}.csv.gz" for kind in ("chirp", "square", "random") for i in (1, 2, 3)]
 
@@ -60,17 +59,6 @@ def test_impossible_splits_are_refused(logs, refusal):
     refusal(lambda: hold_out(logs, ["melon"], manoeuvre_of), "'melon'", "chirp")
     refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights for training")
     refusal(lambda: folds(logs, 4, manoeuvre_of), "3 different names")
-    refusal(lambda: contiguous([5, 7], 8, 0), "7 windows")
-
-
-def test_contiguous_windows_are_of_one_flight():
-    begins = set()
-    for seed in range(200):
-        found = contiguous([3, 6, 4], 4, seed)
-        assert (np.diff(found) == 1).all()
-        assert len(found) == 4
-        begins.add(int(found[0]))
-    assert begins == {3, 4, 5, 9}
 
 
 def test_chosen_time_constant_has_the_smallest_error(flight):
