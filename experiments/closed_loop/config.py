@@ -137,7 +137,10 @@ PRESETS = {
     ),
     "smoke": preset_like(
         ClosedLoopConfig, SMOKE, sizes=(20,), source_train=20, seconds=1.0, references=("hover", "low_pass"),
-        away_references=("hover",), invariant_hidden=8, invariant_norm="batch", ablation=("statistics",), calls=20,
+        away_references=("hover",), ablation=("statistics",), calls=20,
+        # The ablation's invariant network, so that few programs are compiled.
+        invariant_inputs="no_xy_yaw", invariant_outputs="accelerations", invariant_linear=False, invariant_hidden=8,
+        invariant_norm="batch", invariant_disturbance="always",
     ),
 }  # fmt: skip
 RENAMED = {f"--safe-{field.name[10:]}".replace("_", "-"): f"--{field.name}".replace("_", "-")

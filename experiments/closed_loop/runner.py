@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.closed_loop.scenarios import FORCES, PATHS, Flight, Scenario
+from experiments.runner.precompile import PrecompilePool
 from hybrid_jax.control import (
     Controller,
     add_body_rates,
@@ -59,8 +60,12 @@ class ClosedLoopRunner:
         for i, flight in enumerate(flights):
             groups[structure(flight)].append(i)
         lanes = {key: stack([flights[i] for i in chosen]) for key, chosen in groups.items()}
-        for key in groups:
-            self._run(key, lanes[key], 0)  # compiles, flies nothing
+        compiling = {str(i): partial(self._run, key, lanes[key], 0) for i, key in enumerate(groups)}  # fly nothing
+        with PrecompilePool(compiling) as pool:
+            for name in compiling:
+                pool.wait_for(name)
+        for compiled in compiling.values():  # one after the other where the pool ignores them; errors are raised here
+            compiled()
         began, worked = time.perf_counter(), time.process_time()
         results: dict[int, Arrays] = {}
         for key, chosen in groups.items():
