@@ -25,15 +25,7 @@ VIEWS = {"low_pass": [0, 2]}  # x, z: the altitude matters
 def paths(
     flights: Mapping[str, Mapping[Agent, States]], references: Mapping[str, States], dt: float, title: str
 ) -> Figure:
-    """A row per reference: left the path, right the distance from the reference.
-
-    Args:
-        flights: reference → agent → states every dt [s].
-        references: reference states at the same times.
-
-    Raises:
-        ValueError: no flights.
-    """
+    """A row per reference: left the path, right the distance from it. Both are given as states every dt [s]."""
     if not flights:
         raise ValueError("flights must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 0.9 + 2.9 * len(flights)), layout="constrained")
@@ -63,16 +55,7 @@ def paths(
 
 @mpl.rc_context(STYLE)
 def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence[float], title: str) -> Figure:
-    """Rendered images: a row per flight, a column per time [s].
-
-    Args:
-        flights: name → images, and the distance from the mark [m] in each.
-
-    Raises:
-        ValueError: no flights.
-    """
-    if not flights:
-        raise ValueError("flights must not be empty: there is nothing to draw")
+    """A row per flight, of which images and the distance from the mark [m] in each are given; a column per time [s]."""
     figure = Figure(figsize=(1.75 * len(times) + 0.6, 1.75 * len(flights) + 0.5), layout="constrained")
     panels = figure.subplots(len(flights), len(times), squeeze=False)
     for row, (name, (images, errors)) in zip(panels, flights.items(), strict=True):
