@@ -90,7 +90,7 @@ def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part
     shares = gaps(e.rows, EXTERNAL_FORCE)[adapted]
     for reference in THREE:
         value, low, high = (100 * number for number in shares[reference])
-        sound = np.isfinite(errors[reference, adapted]).all()
+        sound = bool(np.isfinite(errors[reference, adapted]).all())
         words = f"{REFERENCES[reference]}: {value:.1f} % ({low:.1f} … {high:.1f})"
         yield sound and shares[reference].value >= GAP_SHARE, words
 

@@ -1,6 +1,5 @@
 """Write what the closed-loop experiment leaves in its folder: report.json, rows.csv, report.md and the figures."""
 
-from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -85,9 +84,10 @@ def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
     rows, ablated = results_of(outcome.flown), results_of(outcome.ablation)
     verdicts = evaluate(claims(few), Evidence(rows, few, speed_of(outcome, config.seconds, few)))
     drawn, missing = draw(rows, ablated, outcome, few)
-    seconds = Counter(outcome.seconds)
+    seconds = dict(outcome.seconds)
     for each in [*outcome.flown, *outcome.ablation]:  # the ablation repeats some
-        seconds[f"flights {each.scenario.name}"] += each.seconds
+        stage = f"flights {each.scenario.name}"
+        seconds[stage] = seconds.get(stage, 0.0) + each.seconds
     report = Report(
         experiment=name,
         config=config.described(),
