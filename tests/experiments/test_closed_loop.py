@@ -16,6 +16,7 @@ from rich.console import Console
 from smoke import command, experiments, refused, smallest, unbegun
 
 import hybrid_jax as hj
+from experiments.closed_loop.config import RENAMED
 from experiments.closed_loop.flown import flown
 from experiments.closed_loop.models import as_stack, fused, with_statistics_of
 from experiments.closed_loop.rows import TAGS, Agent
@@ -126,10 +127,9 @@ def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(fli
 
 
 def test_old_option_names_are_translated(capsys):
-    names = {"--safe-hidden": "--invariant-hidden", "--safe-linear": "--invariant-linear"}
     given = ["--safe-hidden", "8", "--safe_hidden=8", "--no-safe-linear", "--seconds", "--safe"]
     expected = ["--invariant-hidden", "8", "--invariant-hidden=8", "--no-invariant-linear", "--seconds", "--safe"]
-    assert renamed_options(given, names) == expected
+    assert renamed_options(given, RENAMED) == expected
     assert len(capsys.readouterr().err.splitlines()) == 3
 
 

@@ -64,8 +64,8 @@ def verdicts(rows, speed=SPEED):
     return {verdict.id: verdict for verdict in evaluate(claims(FEW), Evidence(rows, FEW, speed))}
 
 
-def holds(rows, speed=SPEED):
-    return {name: verdict.holds for name, verdict in verdicts(rows, speed).items()}
+def holds(*evidence):
+    return {name: verdict.holds for name, verdict in verdicts(*evidence).items()}
 
 
 def test_a_crash_counts_as_an_infinite_error():
@@ -124,13 +124,12 @@ def test_measured_errors_have_enough_decimals_to_differ():
 
 def test_errors_that_differ_by_rounding_are_equal():
     """Single precision resolves 0.12 µm between 1 and 2 m."""
-    after, both = Agent("invariant", FEW), Agent("invariant", FEW, observer=True)
 
     def close(by: float):
-        level = changed(ROWS, Agent("invariant"), "parameter_shift", position_rmse=0.011)
-        level = changed(level, after, "parameter_shift", position_rmse=0.011 + by)
-        level = changed(level, both, "parameter_shift", position_rmse=0.011)
-        return verdicts(level)
+        rows = ROWS
+        for agent, more in ((Agent("invariant"), 0), (Agent("invariant", FEW), by), (Agent("invariant", FEW, True), 0)):
+            rows = changed(rows, agent, "parameter_shift", position_rmse=0.011 + more)
+        return verdicts(rows)
 
     found = close(1.1e-7)
     assert found["R3b"].holds is True
@@ -229,19 +228,16 @@ def test_references_away_are_among_those_at_home():
 def test_figures_without_data_are_left_out_with_a_note(reference, missing):
     models = {agent: np.zeros(1) for agent in AGENTS}
     arrays = {"states": np.ones((len(models), 11, 13))}
-    home = [
-        Flown(Scenario(domain, reference, 0.0, models, 10.0), arrays, 1.0, 1.0, 1)
-        for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE)
-    ]
+    scenarios = [Scenario(domain, reference, 0.0, models, 10.0) for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE)]
+    home = [Flown(scenario, arrays, 1.0, 1.0, 1) for scenario in scenarios]
     drawn, notes = draw(Results(make_rows(reference), TAGS), Results(), Outcome(home), FEW)
     assert [note.partition(".png is missing")[0].split("_")[0] for note in notes] == missing
     assert len(drawn) + len(notes) == 2 * 3 + 3
 
 
 def test_a_diverged_path_does_not_change_the_limits():
-    wanted = np.zeros((11, 13))
-    wanted[:, 0] = np.linspace(0, 2, 11)
-    lost = wanted.copy()
+    wanted, lost = np.zeros((2, 11, 13))
+    wanted[:, 0] = lost[:, 0] = np.linspace(0, 2, 11)
     lost[5:, 1] = 1e3
     drawn = paths({"hover": {Agent("hybrid"): wanted + 0.01, Agent("oracle"): lost}}, {"hover": wanted}, 0.05, "Paths")
     assert drawn.get_suptitle() == "Paths (below 0.02 cm drawn there)"
