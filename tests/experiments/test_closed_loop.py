@@ -189,5 +189,5 @@ def test_second_run_trains_and_flies_nothing(folder):
     ids=["twice", "not at home", "short", "no physics without velocities"],
 )
 def test_invalid_options_are_refused_before_training(options, named, tmp_path):
-    assert named in refused(unbegun("closed_loop", *smallest(*options, folder=tmp_path)), "closed_loop")
+    assert named in refused(unbegun("closed_loop.__main__", *smallest(*options, folder=tmp_path)), "closed_loop")
     assert not list(tmp_path.iterdir())
