@@ -4,36 +4,30 @@ python -m experiments.closed_loop --help
 """
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 
 from rich.console import Console
 
 from experiments.closed_loop.ablation import train_networks, unnormalised, variants
 from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
 from experiments.closed_loop.flown import Flown, flown
-from experiments.closed_loop.models import (
-    Trained,
-    disturbance_counts,
-    least_squares,
-    model_set,
-    train,
-    unchanged_model_set,
-)
+from experiments.closed_loop.models import Trained, disturbance_counts, least_squares, model_set, train
 from experiments.closed_loop.report import Outcome, write
 from experiments.closed_loop.rows import Agent
-from experiments.closed_loop.scenarios import ModelSet, Scenario
+from experiments.closed_loop.scenarios import DOMAINS, ModelSet, Scenario
 from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.runner import command
+from experiments.runner.stages import stages_of
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
+from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
-DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)
 Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
@@ -51,45 +45,45 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
         write(NAME, config, outcome, Console())
 
 
+def train_one(console: Console, outcome: Outcome, name: str, model: str, config: Config) -> Trained:
+    """Train a model and record its stages."""
+    console.print(name, style="bold", highlight=False)
+    stages = stages_of(config, console)
+    found = train(model, config, stages)
+    outcome.record(name, stages)
+    return found
+
+
 def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:
     """All trained models by their id in `rows.LEARNED`."""
-
-    def trained_as(name: str, model: str, own: Config) -> Trained:
-        found, stages = train(name, model, IRIS, own, console, DOMAINS)
-        outcome.seconds |= {f"{name}, {stage}": seconds for stage, seconds in stages.seconds.items()}
-        outcome.notes += [f"{name}: {note}" for note in stages.notes()]
-        return found
-
-    trained = {name: trained_as(name, model, config) for name, model in MODELS.items()}
-    own, solve = config.invariant(), DISTURBANCES[config.invariant_disturbance]
-    trained["invariant"] = trained_as("invariant", "hybrid", own)
-    fitted, stages = least_squares(trained["invariant"].source, min(own.sizes), solve, own, console, DOMAINS)
-    outcome.notes += [f"least squares: {note}" for note in disturbance_counts(fitted)]
-    outcome.seconds |= {f"least squares, {stage}": seconds for stage, seconds in stages.seconds.items()}
-    return trained | {"least_squares": fitted}
+    trained = {name: train_one(console, outcome, name, model, config) for name, model in MODELS.items()}
+    own = config.invariant()
+    trained["invariant"] = train_one(console, outcome, "invariant", "hybrid", own)
+    stages, solve = stages_of(own, console), DISTURBANCES[config.invariant_disturbance]
+    trained["least_squares"] = least_squares(trained["invariant"].source, solve, own, stages)
+    outcome.record("least squares", stages)
+    outcome.notes += [f"least squares: {note}" for note in disturbance_counts(trained["least_squares"])]
+    return trained
 
 
 def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console, outcome: Outcome) -> None:
     """Fly every model along every reference, before and after the changes; after them also away from home."""
-    sets = {domain.name: model_set(domain, IRIS, trained, *config.ends) for domain in DOMAINS}
-    away = scenarios(config, sets, [(name, config.away) for name in config.flown_away])
-    sets = {SOURCE.name: unchanged_model_set(IRIS, trained), **sets}
+    changed = {domain.name: model_set(domain, trained, config.ends) for domain in DOMAINS}
+    sets = {SOURCE.name: model_set(SOURCE, trained, ()), **changed}
     home = scenarios(config, sets, [(name, 0.0) for name in config.references])
-    found = fly_all(config, Controller(IRIS), [*home, *away], console)
-    outcome.home, outcome.away = found[: len(home)], found[len(home) :]
+    away = scenarios(config, changed, [(name, config.away) for name in config.flown_away])
+    outcome.flown = fly_all(config, Controller(IRIS), [*home, *away], console)
 
 
 def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> None:
     """Train and fly the networks of the ablation."""
     own = config.ablated()
-    made = train_networks(config.ablation, IRIS, own, console, DOMAINS)
-    outcome.seconds |= made.seconds
-    outcome.notes += made.notes
+    trained = train_networks(config.ablation, own, partial(train_one, console, outcome))
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    sets = {domain.name: variants(config.ablation, domain, made.trained, own) for domain in DOMAINS}
+    sets = {domain.name: variants(config.ablation, domain, trained, own) for domain in DOMAINS}
     outcome.ablation = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
     if "quaternion" in config.ablation:
-        sets = {domain.name: unnormalised(domain, made.trained, own) for domain in DOMAINS}
+        sets = {domain.name: unnormalised(domain, trained, own) for domain in DOMAINS}
         controller = Controller(IRIS, unit_quaternion=False)
         outcome.ablation += fly_all(config, controller, scenarios(config, sets, places), console)
 
@@ -100,11 +94,9 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
     return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in own for place in places]
 
 
-def fly_all(
-    config: ClosedLoopConfig, controller: Controller, scenarios: list[Scenario], console: Console
-) -> list[Flown]:
+def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
     """Fly scenarios with one controller, or find them in the cache."""
-    return flown(scenarios, controller, config.seconds, config.cache / NAME, console, config.fresh)
+    return flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
 
 
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:

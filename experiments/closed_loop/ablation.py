@@ -1,18 +1,14 @@
 """Ablation of the invariant residual: its inputs and outputs, its adaptation, and the normalised quaternion."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Literal, NamedTuple
+from typing import Literal
 
-from rich.console import Console
-
-from experiments.closed_loop.models import Trained, fused, train, with_statistics_of
+from experiments.closed_loop.models import Trained, fused, with_statistics_of
 from experiments.closed_loop.rows import Agent
 from experiments.closed_loop.scenarios import ModelSet
 from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
-from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.sim.domain import Domain
-from hybrid_jax.vehicle import Vehicle
 
 Option = Literal["networks", "offset", "statistics", "quaternion"]
 PAPER, INVARIANT = "paper: all of x → all 13", "invariant: no p_x, p_y, yaw → v̇, ω̇"
@@ -27,31 +23,21 @@ COMPARED = (PAPER, INVARIANT)  # the networks to which the other options apply
 SLOW = "invariant, output bias at the common rate"
 
 
-class Ablation(NamedTuple):
-    """Trained networks by name, the seconds of their stages, and notes on these."""
-
-    trained: dict[str, Trained]
-    seconds: dict[str, float]
-    notes: list[str]
-
-
 def train_networks(
-    options: Sequence[Option], vehicle: Vehicle, config: Config, console: Console, domains: Sequence[Domain]
-) -> Ablation:
-    """Train the networks that these options compare."""
+    options: Sequence[Option], config: Config, train: Callable[[str, str, Config], Trained]
+) -> dict[str, Trained]:
+    """The networks that these options compare, trained by `train(name, model, config)`."""
     wanted = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
     if "offset" in options:
         wanted[SLOW] = NETWORKS[INVARIANT]
-    made = Ablation({}, {}, [])
+    trained = {}
     for name, (inputs, outputs) in wanted.items():
         # A network that writes all derivatives is adapted as in the paper.
         fast = outputs == "accelerations" and name != SLOW
         rates = replace(config.rates, offset=config.rates.offset if fast else None)
         own = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
-        made.trained[name], stages = train(f"ablation, {name}", "hybrid", vehicle, own, console, domains)
-        made.seconds.update({f"ablation, {name}, {stage}": spent for stage, spent in stages.seconds.items()})
-        made.notes.extend(f"{name}: {note}" for note in stages.notes())
-    return made
+        trained[name] = train(f"ablation, {name}", "hybrid", own)
+    return trained
 
 
 def variants(options: Sequence[Option], domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:
@@ -59,19 +45,16 @@ def variants(options: Sequence[Option], domain: Domain, trained: dict[str, Train
     observer.
     """
     (few,) = config.sizes
-
-    def models() -> Iterator[tuple[Agent, AbstractVectorField]]:
-        for name, found in trained.items():
-            yield _agent(name, few), found.adapted[domain.name, few]
-        if "statistics" in options and config.norm == "batch":
-            for name in COMPARED:
-                wrong = with_statistics_of(trained[name].source, trained[name].adapted[domain.name, few])
-                yield _agent(f"{_short(name)}, batch statistics of the source", few), wrong
+    adapted = {name: found.adapted[domain.name, few] for name, found in trained.items()}
+    models = {_agent(name, few): field for name, field in adapted.items()}
+    if "statistics" in options and config.norm == "batch":
         for name in COMPARED:
-            agent = _agent(f"{_short(name)}, not adapted, + observer", 0)
-            yield replace(agent, observer=True), trained[name].source
-
-    return {agent: fused(field) for agent, field in models()}
+            agent = _agent(f"{_short(name)}, batch statistics of the source", few)
+            models[agent] = with_statistics_of(trained[name].source, adapted[name])
+    for name in COMPARED:
+        agent = _agent(f"{_short(name)}, not adapted, + observer", 0)
+        models[replace(agent, observer=True)] = trained[name].source
+    return {agent: fused(field) for agent, field in models.items()}
 
 
 def unnormalised(domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:

@@ -1,15 +1,15 @@
 """Hypotheses about closed-loop flight, as data: each text states the definition that its predicate evaluates."""
 
 import math
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.rows import LEARNED, ORACLE, REFERENCES, SOURCES, UNCHANGED, Agent, of, uncrashed
+from experiments.closed_loop.rows import LEARNED, ORACLE, REFERENCES, SOURCES, UNCHANGED, Agent, away, uncrashed
 from experiments.closed_loop.tables import gaps
 from experiments.reporting.claims import Claim, Inconclusive
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
@@ -43,113 +43,102 @@ class Evidence:
     speed: Speed | None
 
     def group(self, domain: str, reference: str, agent: Agent, distance: float = 0.0) -> Results:
-        rows = self.rows.where(domain=domain, reference=reference, distance=distance, **of(agent))
+        rows = self.rows.where(domain=domain, reference=reference, distance=distance, **asdict(agent))
         if not len(rows):
-            away = f", {distance:g} m away" if distance else ""
-            raise Inconclusive(f"there are no flights of {agent.name}, {domain}, {REFERENCES[reference]}{away}")
+            place = f"{domain}, {REFERENCES[reference]}{away(distance)}"
+            raise Inconclusive(f"there are no flights of {agent.name}, {place}")
         return rows
 
-    def errors(self, domain: str, reference: str, agent: Agent, distance: float = 0.0) -> np.ndarray:
-        """Position RMSE [cm] of each seed; infinite for a crash."""
-        return self.group(domain, reference, agent, distance).numbers(uncrashed("position_rmse", 100.0))
+    def errors(self, *place: Any) -> np.ndarray:
+        """Position RMSE [cm] of each seed of a `group`; infinite for a crash."""
+        return self.group(*place).numbers(uncrashed("position_rmse", 100.0))
 
     def references(self, agent: Agent) -> list[str]:
         """What an agent flew at home under the parameter shift."""
-        own = self.rows.where(domain=PARAMETER_SHIFT, distance=0.0, **of(agent))
+        own = self.rows.where(domain=PARAMETER_SHIFT, distance=0.0, **asdict(agent))
         if not len(own):
             raise Inconclusive(f"there are no flights of {agent.name}, {PARAMETER_SHIFT}")
         return [name for name in REFERENCES if name in own["reference"]]
 
 
-Outcome = tuple[bool, str]
+Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
 
 
 def claims(few: int) -> list[Claim[Evidence]]:
-    """All hypotheses, those on a model for each of SOURCES.
-
-    Args:
-        few: the smallest N.
-    """
-    made = [Claim(name, text, predicate) for name, (text, predicate) in SPEED_CLAIMS.items()]
-    for (number, (text, predicate)), (letter, model) in product(CLAIMS.items(), zip("abc", SOURCES, strict=True)):
-        agents = Agent(SOURCES[model]), Agent(model, few)
-        made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", partial(predicate, *agents)))
+    """All hypotheses, those on a model for each of SOURCES; `few` is the smallest N."""
+    made = [Claim(name, text, predicate) for name, text, predicate in SPEED_CLAIMS]
+    for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
+        predicate = partial(_in_all, parts, Agent(SOURCES[model]), Agent(model, few))
+        made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", predicate))
     return sorted(made, key=lambda claim: claim.id)
 
 
-def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    words, holds = [], []
-    for reference in THREE:
-        before, after = (e.errors(EXTERNAL_FORCE, reference, agent).mean() for agent in (source, adapted))
-        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))} ({before / after:.2f} ×)")
-        holds.append(before >= WIND_FACTOR * after)
+def _in_all(parts: Callable[..., Iterable[Part]], source: Agent, adapted: Agent, e: Evidence) -> Part:
+    holds, words = zip(*parts(source, adapted, e), strict=True)
     return all(holds), "; ".join(words)
 
 
-def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
+def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+    for reference in THREE:
+        before, after = (e.errors(EXTERNAL_FORCE, reference, agent).mean() for agent in (source, adapted))
+        words = f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))} ({before / after:.2f} ×)"
+        yield before >= WIND_FACTOR * after, words
+
+
+def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     errors = {pair: e.errors(EXTERNAL_FORCE, *pair) for pair in product(THREE, (source, adapted, ORACLE))}
-    shares = {reference: gaps(e.rows, EXTERNAL_FORCE)[adapted][reference] for reference in THREE}
-    words = [
-        f"{REFERENCES[r]}: {100 * s.value:.1f} % ({100 * s.low:.1f} … {100 * s.high:.1f})" for r, s in shares.items()
-    ]
-    sound = all(np.isfinite(errors[reference, adapted]).all() for reference in THREE)
-    return sound and all(share.value >= GAP_SHARE for share in shares.values()), "; ".join(words)
+    shares = gaps(e.rows, EXTERNAL_FORCE)[adapted]
+    for reference in THREE:
+        value, low, high = (100 * number for number in shares[reference])
+        sound = bool(np.isfinite(errors[reference, adapted]).all())
+        words = f"{REFERENCES[reference]}: {value:.1f} % ({low:.1f} … {high:.1f})"
+        yield sound and shares[reference].value >= GAP_SHARE, words
 
 
-def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    words, holds = [], []
+def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     for reference in e.references(adapted):
         errors = [e.errors(PARAMETER_SHIFT, reference, agent) for agent in (adapted, source)]
         after, before = (values.mean() for values in errors)
         interval = mean_difference(list(errors[0]), list(errors[1]))
         significant = interval.low > 0 or interval.high < 0
         remark = ", equal" if _equal(before, after) else ", significant" if significant else ""
-        words.append(f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))}{remark}")
-        holds.append(after <= before or _equal(before, after))
-    return all(holds), "; ".join(words)
+        words = f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))}{remark}"
+        yield after <= before or _equal(before, after), words
 
 
-def _none_worse_observed(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
+def _none_worse_observed(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     return _none_worse(replace(source, observer=True), replace(adapted, observer=True), e)
 
 
-def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    def error(domain: str, reference: str, agent: Agent) -> float:
-        return e.group(domain, reference, agent).spread(uncrashed("excess", 100.0)).mean
+def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+    def error(*place: Any) -> float:
+        return e.group(*place).spread(uncrashed("excess", 100.0)).mean
 
-    words, holds = [], []
     for reference in e.references(adapted):
         value = error(PARAMETER_SHIFT, reference, adapted)
         others = f"source {error(PARAMETER_SHIFT, reference, source):+.0f} %"
-        if len(e.rows.where(domain=UNCHANGED, reference=reference, **of(source))):
+        if len(e.rows.where(domain=UNCHANGED, reference=reference, **asdict(source))):
             others += f", before the change {error(UNCHANGED, reference, source):+.0f} %"
-        words.append(f"{REFERENCES[reference]}: {value:+.1f} % ({others})")
-        holds.append(abs(value) <= 100 * COST_TOLERANCE)
-    return all(holds), "; ".join(words)
+        yield abs(value) <= 100 * COST_TOLERANCE, f"{REFERENCES[reference]}: {value:+.1f} % ({others})"
 
 
-def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
+def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     agents = adapted, replace(source, observer=True), replace(adapted, observer=True)
-    words, holds = [], []
     for domain, reference in product((PARAMETER_SHIFT, EXTERNAL_FORCE), THREE):
         *single, both = (e.errors(domain, reference, agent).mean() for agent in agents)
         texts, equal = _cm(*single, both), _equal(both, min(single))
-        where = f"{LABELS[domain]}, {REFERENCES[reference]}"
-        words.append(f"{where}: {texts[0]}, {texts[1]} → {texts[2]}{', equal' if equal else ''}")
-        holds.append(both < min(single) and not equal)
-    return all(holds), "adapted, observer → both: " + "; ".join(words)
+        words = f"adapted {texts[0]}, observer {texts[1]} → both {texts[2]}{', equal' if equal else ''}"
+        yield both < min(single) and not equal, f"{LABELS[domain]}, {REFERENCES[reference]}: {words}"
 
 
-def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Outcome:
-    places = e.rows.where(lambda row: row["distance"] > 0, **of(adapted)).group("domain", "reference", "distance")
+def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
+    places = e.rows.where(lambda row: row["distance"] > 0, **asdict(adapted)).group("domain", "reference", "distance")
     if not places:
         raise Inconclusive("nothing was flown away from home")
-    words, holds = [], []
     for domain, reference, distance in places:
-        home, away = (e.errors(domain, reference, adapted, d).mean() for d in (0.0, distance))
-        words.append(f"{LABELS[domain]}, {REFERENCES[reference]}: {' → '.join(_cm(home, away))}")
-        holds.append(away <= AWAY_FACTOR * home)
-    return all(holds), "; ".join(words)
+        home, there = (e.errors(domain, reference, adapted, d).mean() for d in (0.0, distance))
+        words = f"{LABELS[domain]}, {REFERENCES[reference]}: {' → '.join(_cm(home, there))}"
+        yield there <= AWAY_FACTOR * home, words
 
 
 def _measured(e: Evidence) -> Speed:
@@ -158,13 +147,13 @@ def _measured(e: Evidence) -> Speed:
     return e.speed
 
 
-def _fast_call(e: Evidence) -> Outcome:
+def _fast_call(e: Evidence) -> Part:
     speed = _measured(e)
     words = f"{speed.call_ms:.2f} ms of processor time, {speed.median_ms:.2f} ms on the clock (median)"
     return speed.call_ms <= CALL_MS, words
 
 
-def _fast_flights(e: Evidence) -> Outcome:
+def _fast_flights(e: Evidence) -> Part:
     speed = _measured(e)
     share = FLIGHTS * FLIGHT_SECONDS / speed.flown_seconds / 60
     minutes, alone = share * speed.seconds, share * speed.processor_seconds / speed.devices
@@ -190,53 +179,28 @@ def _cm(*means: float) -> list[str]:
 _THREE = ", ".join(REFERENCES[reference] for reference in THREE)
 _EQUAL = f"equal: within {1e6 * RESOLUTION:.2f} µm, the rounding of single precision"
 _SIGNIFICANT = f"significant: the 95 % interval of the paired difference excludes 0; {_EQUAL}"
-CLAIMS: dict[int, tuple[str, Callable[[Agent, Agent, Evidence], Outcome]]] = {
-    1: (
-        f"in the wind the mean RMSE of the source model is at least {WIND_FACTOR:g} times that of the model adapted "
-        f"with the smallest N, on each of {_THREE}.",
-        _smaller_in_wind,
-    ),
-    2: (
-        f"in the wind adaptation with the smallest N closes at least {GAP_SHARE:.0%} of the gap between the source "
+CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]] = [
+    (1, f"in the wind the mean RMSE of the source model is at least {WIND_FACTOR:g} times that of the model adapted "
+        f"with the smallest N, on each of {_THREE}.", _smaller_in_wind),
+    (2, f"in the wind adaptation with the smallest N closes at least {GAP_SHARE:.0%} of the gap between the source "
         f"model's RMSE and that of the true vehicle in the mean wind, on each of {_THREE}, and no seed crashes (ratio "
-        "of means over seeds; 95 % interval).",
-        _closes_the_gap,
-    ),
-    3: (
-        "under the parameter shift the mean RMSE after adaptation with the smallest N is not above that of the source "
-        f"model on any reference ({_SIGNIFICANT}).",
-        _none_worse,
-    ),
-    4: (
-        "under the parameter shift, adapted with the smallest N, the actual open-loop cost of plans is within "
+        "of means over seeds; 95 % interval).", _closes_the_gap),
+    (3, "under the parameter shift the mean RMSE after adaptation with the smallest N is not above that of the source "
+        f"model on any reference ({_SIGNIFICANT}).", _none_worse),
+    (4, "under the parameter shift, adapted with the smallest N, the actual open-loop cost of plans is within "
         f"{COST_TOLERANCE:.0%} of the predicted one on every reference (mean over seeds; sum over calls every 0.5 s; "
         "the denominator is at least the cost of an offset of 5 mm; for comparison the source model, after the change "
-        "and on the unchanged vehicle).",
-        _cost_predicted,
-    ),
-    5: (
-        "adaptation with the smallest N and observer together have a smaller mean RMSE than either alone (the observer "
-        f"on the source model), under both changes and on each of {_THREE} ({_EQUAL}).",
-        _observer_adds,
-    ),
-    6: (
-        f"adapted with the smallest N, the mean RMSE away from home is at most {AWAY_FACTOR:g} times that at home, in "
-        "each domain and on each reference flown there.",
-        _same_away,
-    ),
-    9: (
-        "with the observer before and after, under the parameter shift, the mean RMSE after adaptation with the "
-        f"smallest N is not above that of the source model on any reference ({_SIGNIFICANT}).",
-        _none_worse_observed,
-    ),
-}
-SPEED_CLAIMS: dict[str, tuple[str, Callable[[Evidence], Outcome]]] = {
-    "R7": (
-        f"A call of the controller with the adapted hybrid takes at most {CALL_MS:g} ms on one core (processor time).",
-        _fast_call,
-    ),
-    "R8": (
-        f"{FLIGHTS} flights of {FLIGHT_SECONDS:g} s take at most {FLIGHT_MINUTES:g} minutes (without compiling).",
-        _fast_flights,
-    ),
-}
+        "and on the unchanged vehicle).", _cost_predicted),
+    (5, "adaptation with the smallest N and observer together have a smaller mean RMSE than either alone (the observer "
+        f"on the source model), under both changes and on each of {_THREE} ({_EQUAL}).", _observer_adds),
+    (6, f"adapted with the smallest N, the mean RMSE away from home is at most {AWAY_FACTOR:g} times that at home, in "
+        "each domain and on each reference flown there.", _same_away),
+    (9, "with the observer before and after, under the parameter shift, the mean RMSE after adaptation with the "
+        f"smallest N is not above that of the source model on any reference ({_SIGNIFICANT}).", _none_worse_observed),
+]  # fmt: skip
+SPEED_CLAIMS: list[tuple[str, str, Callable[[Evidence], Part]]] = [
+    ("R7", f"A call of the controller with the adapted hybrid takes at most {CALL_MS:g} ms on one core (processor "
+           "time).", _fast_call),
+    ("R8", f"{FLIGHTS} flights of {FLIGHT_SECONDS:g} s take at most {FLIGHT_MINUTES:g} minutes (without compiling).",
+           _fast_flights),
+]  # fmt: skip

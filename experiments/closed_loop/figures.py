@@ -1,7 +1,10 @@
-"""Figures of closed-loop flight: errors, shares of the gap, open-loop costs, and flights away from home."""
+"""Figures of closed-loop flight: errors, shares of the gap, open-loop costs, and flights away from home.
+
+Each raises ValueError if the rows hold nothing to draw.
+"""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import matplotlib as mpl
@@ -10,7 +13,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from experiments.closed_loop.rows import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, by_agent, centimetres
+from experiments.closed_loop.claims import COST_TOLERANCE
+from experiments.closed_loop.rows import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, centimetres
 from experiments.closed_loop.tables import gaps
 from experiments.reporting.plots import COLOURS, STYLE, Line, error_legend, error_panel, legend_below, tick_errors
 from experiments.reporting.results import Results
@@ -28,52 +32,35 @@ COLOURS_OF = {
 PALE = {"hybrid": "#7FC4EA", "invariant": "#E9C6D9"}  # source models beside adapted ones
 MARKERS = dict(zip(REFERENCES, "os^Dv*", strict=True))
 SHARES = (-25.0, 125.0)  # %: shares outside are marked at the edge
-COST_TOLERANCE = 0.1
 SMALLEST_ERROR = 0.01  # cm: smaller errors are drawn here; with the true model a hovering vehicle does not move
 SMALLEST_COST = 1e-3
 XLABEL = "position RMSE [cm]  (log scale)"
 
 
 def errors(rows: Results, domain: str) -> Figure:
-    """A panel per reference, a line per agent, a dot per seed.
-
-    Raises:
-        ValueError: no rows of this domain at home.
-    """
-    found = rows.where(domain=domain, distance=0.0).sort(reference=list(REFERENCES)).group("reference")
-    panels = {REFERENCES[reference]: group for reference, group in found.items()}
-    return _error_panels(panels, lambda agent: agent.name, domain, "position error of each model")
+    """A panel per reference at home, a line per agent, a dot per seed."""
+    home = rows.where(domain=domain, distance=0.0).sort(reference=list(REFERENCES))
+    return _error_panels(home, "name", domain, "position error of each model")
 
 
 def ablation(rows: Results, domain: str) -> Figure:
-    """A panel per reference and distance, a line per variant.
-
-    Raises:
-        ValueError: no rows of this domain.
-    """
-    found = rows.where(domain=domain).group("reference", "distance")
-    panels = {REFERENCES[name] + (f", {d:g} m from home" if d else ""): group for (name, d), group in found.items()}
-    return _error_panels(panels, lambda agent: agent.variant, domain, "ablation of the invariant residual")
+    """A panel per reference and distance, a line per variant."""
+    return _error_panels(rows.where(domain=domain), "variant", domain, "ablation of the invariant residual")
 
 
 @mpl.rc_context(STYLE)
 def away_from_home(rows: Results) -> Figure:
-    """Each model at home and away: a column per reference, a row per domain.
-
-    Raises:
-        ValueError: nothing was flown both at home and away from it.
-    """
-    order = {"domain": list(DOMAINS), "reference": list(REFERENCES)}
-    found = rows.sort(**order).group("domain", "reference", "distance")
-    away = [cell for cell in found if cell[2] and (*cell[:2], 0.0) in found]
-    if not away:
+    """Each model at home and away: a column per reference, a row per domain."""
+    found = rows.sort(domain=list(DOMAINS), reference=list(REFERENCES)).group("domain", "reference", "distance")
+    cells = [cell for cell in found if cell[2] and (*cell[:2], 0.0) in found]
+    if not cells:
         raise ValueError("rows must not be empty: nothing was flown both at home and away from it")
-    domains, references = (list(dict.fromkeys(cell[i] for cell in away)) for i in (0, 1))
-    height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(by_agent(found[cell])) for cell in away))
+    domains, references = (list(dict.fromkeys(cell[i] for cell in cells)) for i in (0, 1))
+    height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(by_agent(found[cell])) for cell in cells))
     figure = Figure(figsize=(3.6 * len(references) + 2, height), layout="constrained")
     panels = figure.subplots(len(domains), len(references), squeeze=False, sharey="row")
     smallest = math.inf
-    for domain, reference, distance in away:
+    for domain, reference, distance in cells:
         axes = panels[domains.index(domain), references.index(reference)]
         axes.set_title(f"{DOMAINS[domain].capitalize()}, {REFERENCES[reference]}")
         home, there = (by_agent(found[domain, reference, d]) for d in (0.0, distance))
@@ -81,7 +68,7 @@ def away_from_home(rows: Results) -> Figure:
     style: Any = {"color": "0.3", "linestyle": ""}
     entries = {
         "at home": Line2D([], [], marker="o", markersize=5, **style),
-        f"{away[0][2]:g} m away": Line2D([], [], marker=">", markersize=7, **style),
+        away(cells[0][2])[2:]: Line2D([], [], marker=">", markersize=7, **style),
     }
     title = "The same flights at home and away from it" + floor_note(smallest, SMALLEST_ERROR, " (", ")")
     return legend_below(figure, title, "mean over seeds", 2, entries)
@@ -89,11 +76,7 @@ def away_from_home(rows: Results) -> Figure:
 
 @mpl.rc_context(STYLE)
 def shares(rows: Results, domain: str) -> Figure:
-    """The share of the gap to the true vehicle that each way to adapt closes, a panel per reference.
-
-    Raises:
-        ValueError: rows without a source model or the true vehicle.
-    """
+    """The share of the gap to the true vehicle that each way to adapt closes, a panel per reference."""
     found = gaps(rows, domain)
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     if not names:
@@ -116,11 +99,7 @@ def shares(rows: Results, domain: str) -> Figure:
 
 @mpl.rc_context(STYLE)
 def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
-    """Actual against predicted cost of plans, mean over seeds: a panel per domain, a marker per reference.
-
-    Raises:
-        ValueError: no rows of these agents.
-    """
+    """Actual against predicted cost of plans, mean over seeds: a panel per domain, a marker per reference."""
     found = {domain: rows.where(domain=domain, distance=0.0) for domain in DOMAINS if domain in rows["domain"]}
     if not any(agent in by_agent(group) for group in found.values() for agent in agents):
         raise ValueError("rows must hold one of the agents: there is nothing to draw")
@@ -129,12 +108,10 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
     for axes, (domain, group) in zip(panels, found.items(), strict=True):
         _draw_costs(axes, group, agents)
         axes.set(title=DOMAINS[domain].capitalize(), xlabel="predicted cost of a plan", ylabel="actual cost, open loop")
-    handles = [Line2D([], [], color=_shade(agent), marker="o", linestyle="", label=agent.name) for agent in agents]
-    handles += [
-        Line2D([], [], color="0.5", marker=MARKERS[name], linestyle="", label=label)
-        for name, label in REFERENCES.items()
-        if any(name in group["reference"] for group in found.values())
-    ]
+    entries = [(agent.name, _shade(agent), "o") for agent in agents]
+    flown = {name for group in found.values() for name in group["reference"]}
+    entries += [(REFERENCES[name], "0.5", MARKERS[name]) for name in REFERENCES if name in flown]
+    handles = [Line2D([], [], color=c, marker=m, linestyle="", label=label) for label, c, m in entries]
     figure.legend(handles=handles, loc="outside right center")
     title = "Predicted and actual cost of plans, open loop for 1 s (grey: within 10 %; below 0.001 drawn there)"
     figure.suptitle(title, fontsize=12)
@@ -147,20 +124,19 @@ def floor_note(smallest: float, floor: float, before: str, after: str = "") -> s
 
 
 @mpl.rc_context(STYLE)
-def _error_panels(panels: Mapping[str, Results], label: Callable[[Agent], str], domain: str, what: str) -> Figure:
-    """A panel of each of these groups by title, a line per agent."""
-    if not panels:
+def _error_panels(rows: Results, label: str, domain: str, what: str) -> Figure:
+    """A panel per reference and distance, a line per agent with this attribute of it as its label."""
+    groups = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
+    if not groups:
         raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
-    groups = [by_agent(group) for group in panels.values()]
-    figure, grid = _grid(len(panels), [label(agent) for group in groups for agent in group])
-    for axes, title, group in zip(grid, panels, groups, strict=False):
-        lines = [_line(label(agent), agent, rows) for agent, rows in group.items()]
-        error_panel(axes, lines, title)
+    figure, grid = _grid(len(groups), [getattr(agent, label) for group in groups.values() for agent in group])
+    for axes, ((reference, distance), group) in zip(grid, groups.items(), strict=False):
+        lines = [_line(getattr(agent, label), agent, own) for agent, own in group.items()]
+        error_panel(axes, lines, REFERENCES[reference] + away(distance))
         axes.set_xlabel(XLABEL)
-    all_errors = np.concatenate([100 * group.numbers(ERROR) for group in panels.values()])
-    note = floor_note(all_errors.min(), SMALLEST_ERROR, "; ")
+    note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
     title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
-    return error_legend(figure, title, any(any(group["crashed"]) for group in panels.values()))
+    return error_legend(figure, title, any(rows["crashed"]))
 
 
 def _line(label: str, agent: Agent, rows: Results) -> Line:
@@ -181,28 +157,32 @@ def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure
     return figure, panels
 
 
-def _draw_away(axes: Axes, home: Mapping[Agent, Results], away: Mapping[Agent, Results]) -> float:
+def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, Results]) -> float:
     """Draw mean errors at home and away, joined by a line; returns the smallest [cm]."""
-    means = {agent: (centimetres(home[agent]), centimetres(rows)) for agent, rows in away.items()}
+    means = {agent: (centimetres(home[agent]), centimetres(rows)) for agent, rows in there.items()}
     values = [value for pair in means.values() for value in pair]
     finite = [max(value, SMALLEST_ERROR) for value in values if math.isfinite(value)] or [1.0]
-    axes.set(xscale="log", xlim=(min(finite) / 1.4, max(finite) * 1.8), ylim=(len(away) - 0.4, -0.6), xlabel=XLABEL)
+    edge = max(finite) * 1.8
+    axes.set(xscale="log", xlim=(min(finite) / 1.4, edge), ylim=(len(means) - 0.4, -0.6), xlabel=XLABEL)
     tick_errors(axes.xaxis, *axes.get_xlim())
-    axes.set_yticks(range(len(away)), [agent.name for agent in away])
-    edge = axes.get_xlim()[1]
-    for y, (agent, (here, there)) in enumerate(means.items()):
-        start, end = max(here, SMALLEST_ERROR), min(max(there, SMALLEST_ERROR), edge)
-        colour, crashed = COLOURS_OF[agent.model], sum(away[agent]["crashed"])
+    axes.set_yticks(range(len(means)), [agent.name for agent in means])
+    for y, (agent, (here, error)) in enumerate(means.items()):
+        start, end = max(here, SMALLEST_ERROR), min(max(error, SMALLEST_ERROR), edge)
+        colour, crashed = COLOURS_OF[agent.model], sum(there[agent]["crashed"])
         axes.plot([start, end], [y, y], color=colour, linewidth=1)
         axes.plot(start, y, "o", color=colour, markersize=5)
         axes.plot(end, y, "x" if crashed else ">", color=colour, markersize=7, clip_on=False)
-        number = f"{there:.2g}" if there >= SMALLEST_ERROR else f"{there:.2f}"
-        words = f"{crashed} of {len(away[agent])} crash" if crashed else number
-        side: Any = {"va": "bottom", "ha": "right"} if crashed else {"va": "center", "ha": "left"}
-        offset = (-8, 4) if crashed else (7, 0)
-        at: Any = {"textcoords": "offset points", "fontsize": 7, "annotation_clip": False}
-        axes.annotate(words, (end, y), offset, **at, **side)
+        if crashed:
+            _note(axes, f"{crashed} of {len(there[agent])} crash", (end, y), (-8, 4), va="bottom", ha="right")
+        else:
+            number = f"{error:.2g}" if error >= SMALLEST_ERROR else f"{error:.2f}"
+            _note(axes, number, (end, y), (7, 0), va="center", ha="left")
     return min(values)
+
+
+def _note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[int, int], **align: str) -> None:
+    style: Any = {"textcoords": "offset points", "fontsize": 7, "annotation_clip": False, **align}
+    axes.annotate(words, at, offset, **style)
 
 
 def _draw_share(axes: Axes, y: int, share: Interval, colour: str) -> None:
@@ -217,9 +197,8 @@ def _draw_share(axes: Axes, y: int, share: Interval, colour: str) -> None:
     filled = "white" if math.isnan(low) else colour
     axes.plot(x, y, marker, color=colour, markersize=5, clip_on=False, markerfacecolor=filled)
     if x != value:
-        offset, align = ((6, 3), "left") if value < x else ((-6, 3), "right")
-        at: Any = {"textcoords": "offset points", "fontsize": 7}
-        axes.annotate(f"{value:.0f}", (x, y), offset, va="bottom", ha=align, **at)
+        offset, side = ((6, 3), "left") if value < x else ((-6, 3), "right")
+        _note(axes, f"{value:.0f}", (x, y), offset, va="bottom", ha=side)
 
 
 def _draw_costs(axes: Axes, rows: Results, agents: Sequence[Agent]) -> None:

@@ -9,7 +9,7 @@ import jax
 import numpy as np
 from rich.console import Console
 
-from experiments.closed_loop.rows import NUMBERS, TAGS, Agent, of
+from experiments.closed_loop.rows import NUMBERS, TAGS, Agent
 from experiments.closed_loop.runner import CALL_EVERY, DRAW_EVERY, ClosedLoopRunner
 from experiments.closed_loop.scenarios import Scenario
 from experiments.reporting.results import Results
@@ -37,14 +37,12 @@ class Flown:
     devices: int  # number of them
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per flight: its tags, NUMBERS, and whether it crashed."""
-        place = {"domain": self.scenario.domain.name}
-        where = {"reference": self.scenario.reference, "distance": self.scenario.distance}
+        """One row per flight: its tags and NUMBERS."""
+        place = {"reference": self.scenario.reference, "distance": self.scenario.distance}
         return [
-            {**place, **of(agent), **where, "seed": seed}
-            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS[:3]}
+            {"domain": self.scenario.domain.name, **asdict(agent), **place, "seed": seed}
+            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS}
             | {"crashed": bool(self.arrays["crashed"][i])}
-            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS[3:]}
             for i, (agent, seed) in enumerate(self.scenario.keys())
         ]
 
@@ -61,11 +59,9 @@ def results_of(scenarios: Sequence[Flown]) -> Results:
 def flown(
     scenarios: list[Scenario], controller: Controller, seconds: float, folder: Path, console: Console, fresh: bool
 ) -> list[Flown]:
-    """The results of all scenarios, from the cache or flown now.
+    """The results of all scenarios in flights of so many seconds, found in the cache `folder` or flown now.
 
     Args:
-        seconds: length of a flight.
-        folder: of the cache.
         fresh: move results of other versions aside and fly again.
 
     Raises:

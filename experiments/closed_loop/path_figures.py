@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 
 from experiments.closed_loop.figures import COLOURS_OF, floor_note
 from experiments.closed_loop.rows import KNOWN, REFERENCES, Agent
-from experiments.reporting.plots import STYLE, tick_errors
+from experiments.reporting.plots import STYLE, legend_below, tick_errors
 from hybrid_jax.state import POSITION
 
 States = Float[np.ndarray, "t 13"]
@@ -25,15 +25,7 @@ VIEWS = {"low_pass": [0, 2]}  # x, z: the altitude matters
 def paths(
     flights: Mapping[str, Mapping[Agent, States]], references: Mapping[str, States], dt: float, title: str
 ) -> Figure:
-    """A row per reference: left the path, right the distance from the reference.
-
-    Args:
-        flights: reference → agent → states every dt [s].
-        references: reference states at the same times.
-
-    Raises:
-        ValueError: no flights.
-    """
+    """A row per reference: left the path, right the distance from it. Both are given as states every dt [s]."""
     if not flights:
         raise ValueError("flights must not be empty: there is nothing to draw")
     figure = Figure(figsize=(9.5, 0.9 + 2.9 * len(flights)), layout="constrained")
@@ -55,24 +47,12 @@ def paths(
         left.set(xlabel="x [m]", ylabel=f"{'xyz'[view[1]]} [m]", title=f"{REFERENCES[reference]}: {side}")
         right.set(yscale="log", xlabel="time [s]", ylabel="[cm]", title="distance from the reference (log scale)")
         tick_errors(right.yaxis, *right.get_ylim())
-    handles, labels = panels[0, 0].get_legend_handles_labels()
-    figure.legend(handles, labels, loc="outside lower center", ncols=3)
-    figure.suptitle(title + floor_note(smallest, SMALLEST_ERROR, " (", ")"), fontsize=12)
-    return figure
+    return legend_below(figure, title + floor_note(smallest, SMALLEST_ERROR, " (", ")"))
 
 
 @mpl.rc_context(STYLE)
 def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence[float], title: str) -> Figure:
-    """Rendered images: a row per flight, a column per time [s].
-
-    Args:
-        flights: name → images, and the distance from the mark [m] in each.
-
-    Raises:
-        ValueError: no flights.
-    """
-    if not flights:
-        raise ValueError("flights must not be empty: there is nothing to draw")
+    """A row per flight, of which images and the distance from the mark [m] in each are given; a column per time [s]."""
     figure = Figure(figsize=(1.75 * len(times) + 0.6, 1.75 * len(flights) + 0.5), layout="constrained")
     panels = figure.subplots(len(flights), len(times), squeeze=False)
     for row, (name, (images, errors)) in zip(panels, flights.items(), strict=True):
@@ -89,13 +69,12 @@ def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence
 
 def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:
     """Limits from the reference, so that a flight that diverges does not shrink the others."""
+    low, high = wanted.min(axis=0), wanted.max(axis=0)
     if not top:
-        axes.set(xlim=(wanted[:, 0].min() - 0.5, wanted[:, 0].max() + 0.5), ylim=(0.0, 1.25 * wanted[:, 1].max()))
+        axes.set(xlim=(low[0] - 0.5, high[0] + 0.5), ylim=(0.0, 1.25 * high[1]))
         return
-    centre = (wanted.max(axis=0) + wanted.min(axis=0)) / 2
-    half = max(0.6, 0.62 * np.ptp(wanted, axis=0).max())
-    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - 0.6 * half, centre[1] + 0.6 * half))
-    axes.set_aspect("equal")
+    (x, y), half = (low + high) / 2, max(0.6, 0.62 * (high - low).max())
+    axes.set(xlim=(x - half, x + half), ylim=(y - 0.6 * half, y + 0.6 * half), aspect="equal")
 
 
 def _dash(agent: Agent) -> str:

@@ -1,6 +1,6 @@
 """Write what the closed-loop experiment leaves in its folder: report.json, rows.csv, report.md and the figures."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.closed_loop import figures
-from experiments.closed_loop.claims import Evidence, Speed, claims
+from experiments.closed_loop.claims import THREE, Evidence, Speed, claims
 from experiments.closed_loop.flown import Flown, results_of
 from experiments.closed_loop.path_figures import paths, strip
-from experiments.closed_loop.rows import DOMAINS, ORACLE, Agent
+from experiments.closed_loop.rows import DOMAINS, ORACLE, SOURCES, Agent
 from experiments.closed_loop.runner import DRAW_EVERY
 from experiments.closed_loop.scenarios import PATHS
 from experiments.closed_loop.tables import ablation_tables, gap_tables, speed_table, tables
@@ -23,6 +23,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner.environment import environment
+from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
 from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
@@ -65,33 +66,37 @@ unchanged vehicle, on which the source networks were trained.
 class Outcome:
     """All results: flown scenarios, times of a call by model, seconds of the stages of training, and notes on these."""
 
-    home: list[Flown] = field(default_factory=list)
-    away: list[Flown] = field(default_factory=list)
+    flown: list[Flown] = field(default_factory=list)
     ablation: list[Flown] = field(default_factory=list)
     speeds: dict[str, dict[str, float]] = field(default_factory=dict)
     seconds: dict[str, float] = field(default_factory=dict)
     notes: list[str] = field(default_factory=list)
 
-    def flown(self) -> list[Flown]:
-        """All scenarios."""
-        return [*self.home, *self.away, *self.ablation]
+    def record(self, name: str, stages: Stages) -> None:
+        """Keep the seconds of the stages of a model, and the notes on them."""
+        self.seconds |= {f"{name}, {stage}": seconds for stage, seconds in stages.seconds.items()}
+        self.notes += [f"{name}: {note}" for note in stages.notes()]
 
 
 def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
     """Write the report and its figures, and print the tables."""
     out, few = config.out / name, min(config.sizes)
-    rows, ablated = results_of([*outcome.home, *outcome.away]), results_of(outcome.ablation)
+    rows, ablated = results_of(outcome.flown), results_of(outcome.ablation)
     verdicts = evaluate(claims(few), Evidence(rows, few, speed_of(outcome, config.seconds, few)))
     drawn, missing = draw(rows, ablated, outcome, few)
+    seconds = dict(outcome.seconds)
+    for each in [*outcome.flown, *outcome.ablation]:  # the ablation repeats some
+        stage = f"flights {each.scenario.name}"
+        seconds[stage] = seconds.get(stage, 0.0) + each.seconds
     report = Report(
-        name,
-        config.described(),
-        environment(outcome.seconds | simulation_seconds(outcome.flown())),
-        rows,
-        verdicts,
-        save_figures(out, drawn),
-        [*missing, *outcome.notes],
-        {"ablation": ablated.rows, "speed": outcome.speeds},
+        experiment=name,
+        config=config.described(),
+        environment=environment(seconds),
+        rows=rows,
+        claims=verdicts,
+        figures=save_figures(out, drawn),
+        notes=[*missing, *outcome.notes],
+        extra={"ablation": ablated.rows, "speed": outcome.speeds},
         head=HEAD.strip(),
         tables=[
             verdict_table(verdicts, "Hypotheses"),
@@ -105,18 +110,9 @@ def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
     write_report(out, report, console)
 
 
-def simulation_seconds(flown: Sequence[Flown]) -> dict[str, float]:
-    """Seconds by name of the scenario; the ablation repeats some."""
-    seconds: dict[str, float] = {}
-    for each in flown:
-        name = f"flights {each.scenario.name}"
-        seconds[name] = seconds.get(name, 0.0) + each.seconds
-    return seconds
-
-
 def speed_of(outcome: Outcome, seconds: float, few: int) -> Speed:
     """Speed of one call, and of all flights of so many seconds."""
-    call, flown = outcome.speeds[Agent("hybrid", few).name], outcome.flown()
+    call, flown = outcome.speeds[Agent("hybrid", few).name], [*outcome.flown, *outcome.ablation]
     return Speed(
         call_ms=call["processor_ms"],
         median_ms=call["median_ms"],
@@ -131,64 +127,50 @@ def draw(
     rows: Results, ablated: Results, outcome: Outcome, few: int
 ) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
     """Figures with their captions by file, and notes on those that could not be drawn."""
+    sources, adapted = [Agent("hybrid"), Agent("invariant")], [Agent(model, few) for model in SOURCES]
+    followed = (Agent("nominal"), sources[0], *adapted, ORACLE)
+    wanted: dict[str, tuple[str, Callable[[], Figure]]] = {}
+    for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
+        for file, caption, drawing in (
+            ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
+            ("gap", "Share of the gap to the true vehicle", partial(figures.shares, rows, domain)),
+            ("paths", "Flights of seed 0", partial(flown_paths, outcome.flown, domain, followed)),
+            ("ablation", "Ablation of the invariant residual", partial(figures.ablation, ablated, domain)),
+        ):
+            if file != "ablation" or len(ablated):
+                wanted[f"{file}_{domain}"] = f"{caption}, {DOMAINS[domain]}", drawing
+    costs = partial(figures.open_loop_costs, rows, (Agent("nominal"), *sources, *adapted, ORACLE))
+    wanted["open_loop_costs"] = "Predicted and actual open-loop cost of plans", costs
+    wanted["away"] = "The same flights away from home", partial(figures.away_from_home, rows)
+    hover = partial(rendered, outcome.flown, few)
+    wanted["strip"] = "Hover in the wind; the red mark is the reference", hover
     made, missing = {}, []
-    for file, caption, drawn in _figures(rows, ablated, outcome, few):
+    for file, (caption, drawing) in wanted.items():
         try:
-            made[file] = drawn(), caption
+            made[file] = drawing(), caption
         except ValueError as error:  # nothing of it was flown, or there is no renderer
             missing.append(f"{file}.png is missing: {error}.")
     return made, missing
 
 
-def _figures(
-    rows: Results, ablated: Results, outcome: Outcome, few: int
-) -> Iterator[tuple[str, str, Callable[[], Figure]]]:
-    """File, caption and drawing of each figure."""
-    sources, adapted = [Agent("hybrid"), Agent("invariant")], [Agent(m, few) for m in ("hybrid", "invariant")]
-    adapted.append(Agent("least_squares", few))
-    followed = (Agent("nominal"), sources[0], *adapted, ORACLE)
-    for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
-        name = DOMAINS[domain]
-        yield f"errors_{domain}", f"Position RMSE of all seeds, {name}", partial(figures.errors, rows, domain)
-        yield f"gap_{domain}", f"Share of the gap to the true vehicle, {name}", partial(figures.shares, rows, domain)
-        flights = partial(flown_paths, outcome.home, domain, followed)
-        yield f"paths_{domain}", f"Flights of seed 0, {name}", flights
-        if len(ablated):
-            drawn = partial(figures.ablation, ablated, domain)
-            yield f"ablation_{domain}", f"Ablation of the invariant residual, {name}", drawn
-    costs = partial(figures.open_loop_costs, rows, (Agent("nominal"), *sources, *adapted, ORACLE))
-    yield "open_loop_costs", "Predicted and actual open-loop cost of plans", costs
-    yield "away", "The same flights away from home", partial(figures.away_from_home, rows)
-    yield "strip", "Hover in the wind; the red mark is the reference", partial(rendered, outcome.home, few)
-
-
 def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) -> Figure:
-    """Flights of seed 0 and their references.
-
-    Raises:
-        ValueError: none of the references of this figure was flown.
-    """
-    own = {each.scenario.reference: each for each in flown if each.scenario.domain.name == domain}
-    chosen = [name for name in ("hover", "figure_eight", "low_pass") if name in own]
-    flights = {name: {agent: own[name].states(agent) for agent in agents} for name in chosen}
+    """Flights of seed 0 and their references."""
+    own = {each.scenario.name: each for each in flown}
+    at_home = {name: own[f"{domain} {name}"] for name in THREE if f"{domain} {name}" in own}
+    flights = {name: {agent: each.states(agent) for agent in agents} for name, each in at_home.items()}
     controller = Controller(IRIS)
     dt = DRAW_EVERY * controller.period
     wanted = {}
-    for name in chosen:
-        length = len(own[name].states(agents[0]))
-        states = sample(PATHS[name], controller, dt * (length - 1))
-        wanted[name] = np.asarray(states[: DRAW_EVERY * length : DRAW_EVERY])
+    for name, states in flights.items():
+        length = len(states[agents[0]])
+        reference = sample(PATHS[name], controller, dt * (length - 1))
+        wanted[name] = np.asarray(reference[: DRAW_EVERY * length : DRAW_EVERY])
     return paths(flights, wanted, dt, f"{DOMAINS[domain].capitalize()}: flights of one seed")
 
 
 def rendered(flown: Sequence[Flown], few: int) -> Figure:
-    """Rendered images of hover in the wind, before and after adaptation.
-
-    Raises:
-        ValueError: this machine cannot render, or nothing hovered.
-    """
-    place = (EXTERNAL_FORCE.name, "hover")
-    found = [each for each in flown if (each.scenario.domain.name, each.scenario.reference) == place]
+    """Rendered images of hover in the wind, before and after adaptation."""
+    found = [each for each in flown if each.scenario.name == f"{EXTERNAL_FORCE.name} hover"]
     if not found:
         raise ValueError("nothing hovered in the wind")
     dt = DRAW_EVERY * Controller(IRIS).period

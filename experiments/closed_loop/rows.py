@@ -1,9 +1,8 @@
 """The tags of closed-loop results, their labels, and the agents that flew."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, fields
-from typing import Any
 
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
 from experiments.reporting.results import Results, Row
@@ -31,11 +30,7 @@ KNOWN = {"nominal": "nominal physics", "oracle": "true vehicle, mean wind"}
 
 @dataclass(frozen=True, order=True)
 class Agent:
-    """A controller with its prediction model.
-
-    "invariant" has a translation- and yaw-invariant residual; "least_squares" is its source model with θ_p and a
-    constant disturbance refitted.
-    """
+    """A controller with its prediction model."""
 
     model: str  # a key of KNOWN or LEARNED
     n_train: int = 0  # target trajectories for adaptation; 0 for a source model
@@ -52,9 +47,9 @@ class Agent:
 
 ORACLE = Agent("oracle")
 TAGS = ("domain", *(field.name for field in fields(Agent)), "reference", "distance", "seed")
-# Tracking performance in m, rad, m and as a share; the mean predicted and actual open-loop cost of plans, and their
-# relative error. The last three keep their names of earlier reports.
-NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "saturation", "promised", "realised", "excess")
+# Tracking performance in m, rad, m, whether it crashed, the share of saturated inputs; the mean predicted and actual
+# open-loop cost of plans, and their relative error. The last three keep their names of earlier reports.
+NUMBERS = ("position_rmse", "yaw_rmse", "largest_error", "crashed", "saturation", "promised", "realised", "excess")
 
 
 def uncrashed(column: str, factor: float = 1.0) -> Callable[[Row], float]:
@@ -70,14 +65,9 @@ def by_agent(rows: Results) -> dict[Agent, Results]:
     return {Agent(*key): group for key, group in rows.group(*asdict(ORACLE)).items()}
 
 
-def of(agent: Agent) -> dict[str, Any]:
-    """The tags of an agent, for `Results.where`."""
-    return asdict(agent)
-
-
-def references(rows: Results) -> dict[str, Mapping[str, str]]:
-    """Label → tags of each reference that was flown, as the columns of a table."""
-    return {label: {"reference": name} for name, label in REFERENCES.items() if name in rows["reference"]}
+def away(distance: float) -> str:
+    """What a name of a place has at its end."""
+    return f", {distance:g} m away" if distance else ""
 
 
 def centimetres(rows: Results) -> float:

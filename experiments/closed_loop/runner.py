@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from experiments.closed_loop.scenarios import FORCES, PATHS, Flight, Scenario
+from experiments.runner.precompile import PrecompilePool
 from hybrid_jax.control import (
     Controller,
     add_body_rates,
@@ -25,7 +26,7 @@ from hybrid_jax.io.archive import Arrays
 from hybrid_jax.sim.forces import Wrench
 from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.state import POSITION, STATE_SIZE
-from hybrid_jax.sweep.lanes import LaneMap, lane, stack
+from hybrid_jax.sweep.lanes import LaneMap, stack
 
 WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of all
 CALL_EVERY = 50  # calls between two whose open-loop cost is computed
@@ -33,12 +34,7 @@ DRAW_EVERY = 5  # states between two that are kept for figures
 
 
 class ClosedLoopRunner:
-    """Flies scenarios with one controller.
-
-    Args:
-        seconds: length of a flight.
-        scenarios: all that will be flown; programs are compiled for the largest.
-    """
+    """Flies scenarios, which must all be given so that programs have places for the largest, with one controller."""
 
     def __init__(self, controller: Controller, seconds: float, scenarios: Sequence[Scenario]):
         references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
@@ -46,11 +42,11 @@ class ClosedLoopRunner:
         spinning = list(PATHS).index("upset")
         starts[spinning] = add_body_rates(jnp.asarray(references[spinning, 0]))
         self.shared = (references, starts)
-        self._function = partial(simulate, controller)
-        self._capacity: Counter = Counter()
+        most: Counter[tuple] = Counter()
         for scenario in scenarios:
-            self._capacity |= Counter(structure(flight) for flight in scenario.flights())
-        self._programs: dict[tuple, LaneMap] = {}
+            most |= Counter(map(structure, scenario.flights()))
+        function = partial(simulate, controller)
+        self._programs = {key: LaneMap(function, _width(n), min_capacity=n) for key, n in most.items()}
 
     def fly(self, scenario: Scenario) -> tuple[Arrays, dict[str, Any]]:
         """Results of all flights of a scenario, one per row, and the time they took without compiling [s]."""
@@ -58,25 +54,25 @@ class ClosedLoopRunner:
         flights = list(scenario.flights())
         for i, flight in enumerate(flights):
             groups[structure(flight)].append(i)
-        lanes = {key: stack([flights[i] for i in chosen]) for key, chosen in groups.items()}
-        for key in groups:
-            self._run(key, lanes[key], 0)  # compiles, flies nothing
+        runs = [
+            partial(self._programs[key], stack([flights[i] for i in own]), self.shared, np.ones(len(own)))
+            for key, own in groups.items()
+        ]
+        compiling = {str(i): partial(run, []) for i, run in enumerate(runs)}  # fly nothing
+        with PrecompilePool(compiling) as pool:
+            for name in compiling:
+                pool.wait_for(name)
+        for compiled in compiling.values():  # one after the other where the pool ignores them; errors are raised here
+            compiled()
         began, worked = time.perf_counter(), time.process_time()
-        results: dict[int, Arrays] = {}
-        for key, chosen in groups.items():
-            found = self._run(key, lanes[key], len(chosen))
-            results |= {i: lane(found, place) for place, i in enumerate(chosen)}
+        found = [run(range(len(own))) for run, own in zip(runs, groups.values(), strict=True)]
         spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
-        return stack([results[i] for i in range(len(flights))]), spent
+        order = np.argsort(np.concatenate(list(groups.values())))
+        return jax.tree.map(lambda *parts: np.concatenate(parts)[order], *found), spent
 
-    def _run(self, key: tuple, lanes: Flight, active: int) -> Arrays:
-        """Fly the first `active` lanes. They are padded to the capacity, so that all scenarios share a program."""
-        capacity = self._capacity[key]
-        if key not in self._programs:
-            width = min(WIDTH.get(jax.default_backend(), -(-capacity // jax.device_count())), capacity)
-            self._programs[key] = LaneMap(self._function, width)
-        padded = lane(lanes, np.resize(np.arange(len(lanes.path)), capacity))
-        return self._programs[key](padded, self.shared, np.ones(capacity), range(active))
+
+def _width(flights: int) -> int:
+    return min(WIDTH.get(jax.default_backend(), -(-flights // jax.device_count())), flights)
 
 
 def structure(flight: Flight) -> tuple:

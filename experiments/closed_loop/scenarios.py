@@ -8,16 +8,17 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from experiments.closed_loop.rows import Agent
+from experiments.closed_loop.rows import Agent, away
 from hybrid_jax.control import figure_eight, hover, low_pass, step
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.references import Path
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, Domain
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain
 from hybrid_jax.sim.forces import Parameters
 from hybrid_jax.sweep.lanes import count, lane
 
 ALTITUDE = 1.5  # m
+DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)  # the two changes
 FORCES = EXTERNAL_FORCE.forces  # all that act in any domain
 ModelSet = Mapping[Agent, AbstractVectorField]  # stacked over seeds
 
@@ -62,8 +63,7 @@ class Scenario:
     @property
     def name(self) -> str:
         """In messages and file names."""
-        away = f" {self.distance:g} m away" if self.distance else ""
-        return f"{self.domain.name} {self.reference}{away}"
+        return f"{self.domain.name} {self.reference}{away(self.distance).replace(',', '')}"
 
     def keys(self) -> list[tuple[Agent, int]]:
         """The agent and the seed of each flight."""

@@ -12,8 +12,8 @@ from experiments.closed_loop.rows import (
     SOURCES,
     UNCHANGED,
     Agent,
+    away,
     by_agent,
-    references,
     uncrashed,
 )
 from experiments.reporting.results import Results
@@ -33,10 +33,10 @@ def tables(rows: Results) -> list[Table]:
     }
     made = []
     for (domain, distance), group in rows.sort(domain=list(DOMAINS), distance=None).group("domain", "distance").items():
-        place = DOMAINS[domain] + (f", {distance:g} m from home" if distance else "")
         lines = {agent.name: own for agent, own in by_agent(group).items()}
+        columns = {label: {"reference": name} for name, label in REFERENCES.items() if name in group["reference"]}
         for title, text in list(titles.items())[: 1 if distance else None]:
-            made.append(cross_table(f"{title}, {place}", lines, references(group), text))
+            made.append(cross_table(f"{title}, {DOMAINS[domain]}{away(distance)}", lines, columns, text))
     return made
 
 
@@ -46,10 +46,7 @@ def gap_tables(rows: Results) -> list[Table]:
     for domain in DOMAINS:
         shares = gaps(rows, domain)
         columns = [name for name in REFERENCES if any(name in line for line in shares.values())]
-        lines = [
-            (agent.name, *(_share_text(line[name]) if name in line else EMPTY for name in columns))
-            for agent, line in shares.items()
-        ]
+        lines = [(agent.name, *(_share_text(line.get(name)) for name in columns)) for agent, line in shares.items()]
         title = f"Share of the gap from the source model to the true vehicle that is closed [%], {DOMAINS[domain]}"
         title += " (95 % interval, paired over the seeds that did not crash)"
         made += [Table(title, ("model", *(REFERENCES[name] for name in columns)), lines)] if lines else []
@@ -62,8 +59,8 @@ def gaps(rows: Results, domain: str) -> dict[Agent, dict[str, Interval]]:
     for reference in REFERENCES if domain != UNCHANGED else ():
         flown = by_agent(rows.where(domain=domain, reference=reference, distance=0.0))
         for agent, group in flown.items():
-            source = flown.get(Agent(SOURCES.get(agent.model, "hybrid")))
-            if agent.model in SOURCES and (agent.n_train or agent.observer) and source and ORACLE in flown:
+            source = flown.get(Agent(SOURCES.get(agent.model, "")))
+            if source and ORACLE in flown and (agent.n_train or agent.observer):
                 after, before = group.paired(source, ERROR)
                 best = group.paired(flown[ORACLE], ERROR)[1]
                 shares.setdefault(agent, {})[reference] = share_of_gap(list(before), list(after), list(best))
@@ -75,8 +72,8 @@ def ablation_tables(rows: Results) -> list[Table]:
     made = []
     for domain, group in rows.group("domain").items():
         columns = {
-            REFERENCES[reference] + (f", {away:g} m away" if away else ""): {"reference": reference, "distance": away}
-            for reference, away in group.group("reference", "distance")
+            REFERENCES[reference] + away(distance): {"reference": reference, "distance": distance}
+            for reference, distance in group.group("reference", "distance")
         }
         sizes = ", ".join(f"N = {n}" for n in group.unique("n_train") if n)
         title = f"Ablation of the invariant residual: RMSE [cm], {DOMAINS[domain]}, {sizes}"
@@ -114,8 +111,10 @@ def cost_text(rows: Results) -> str:
     return f"{sound.spread('promised').mean:.3g}; {spread_text(error, '+.1f', '.0f')}"
 
 
-def _share_text(share: Interval) -> str:
-    if math.isnan(share.value):
+def _share_text(share: Interval | None) -> str:
+    if share is None:
+        return EMPTY
+    value, low, high = (100 * number for number in share)
+    if math.isnan(value):
         return "no gap"
-    ends = "gap not significant" if math.isnan(share.low) else f"{100 * share.low:.0f} … {100 * share.high:.0f}"
-    return f"{100 * share.value:.0f} ({ends})"
+    return f"{value:.0f} ({'gap not significant' if math.isnan(low) else f'{low:.0f} … {high:.0f}'})"

@@ -23,13 +23,9 @@ WARM_UP = 10  # calls that are not counted
 def on_one_core(
     fields: Mapping[str, AbstractVectorField], controller: Controller, calls: int, cache: Path
 ) -> dict[str, dict[str, float]]:
-    """`call_times` of each field, in a process with one CPU core.
+    """`call_times` of each field, in a process with one CPU core: more do not make its small matrix products faster.
 
-    The matrix products of a call are too small to gain from more threads. A system that cannot bind a process to a core
-    (macOS) leaves it all of them.
-
-    Args:
-        cache: see `runtime.configure`.
+    A system that cannot bind a process to a core (macOS) leaves it all of them.
     """
     # Spawned, not forked: JAX already runs threads here and has fixed the devices.
     timed = partial(call_times, controller=controller, calls=calls)
@@ -48,10 +44,7 @@ def use_one_core(cache: Path) -> None:
 
 
 def call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:
-    """Calls along a figure-8: median and 99th percentile of wall-clock time, mean processor time of all cores [ms].
-
-    On a machine that does other work, wall-clock time is longer than processor time.
-    """
+    """Calls along a figure-8: median and 99th percentile of wall-clock time, mean processor time of all cores [ms]."""
     control, simulate = eqx.filter_jit(controller), eqx.filter_jit(advance)
     reference = sample(figure_eight(3.5), controller, controller.period * (WARM_UP + calls))
     plan, x = controller.begin(), reference[0]
@@ -64,5 +57,5 @@ def call_times(field: AbstractVectorField, controller: Controller, calls: int) -
         clocked.append(time.perf_counter() - began)
         x = jax.block_until_ready(simulate(field, x, u, controller.period))
     clocked, worked = 1e3 * np.array(clocked[WARM_UP:]), 1e3 * np.array(worked[WARM_UP:])
-    found = {"median_ms": np.median(clocked), "p99_ms": np.percentile(clocked, 99), "processor_ms": worked.mean()}
-    return {name: float(value) for name, value in found.items()}
+    median, p99 = np.percentile(clocked, [50, 99])
+    return {"median_ms": float(median), "p99_ms": float(p99), "processor_ms": float(worked.mean())}

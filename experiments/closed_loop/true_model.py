@@ -16,17 +16,11 @@ from hybrid_jax.vehicle import Vehicle
 
 @portable
 class TrueField(AbstractVectorField):
-    """ẋ = f_p(x, u) + (drag, ground effect, a constant force).
+    """ẋ = f_p(x, u) + (drag, ground effect, a constant force)."""
 
-    Attributes:
-        body: f_p.
-        drag: [kg/s].
-        push: constant force [N, world].
-    """
-
-    body: RigidBody
-    drag: Float[Array, ""]
-    push: Float[Array, "3"]
+    body: RigidBody  # f_p
+    drag: Float[Array, ""]  # coefficient [kg/s]
+    push: Float[Array, "3"]  # constant force [N, world]
 
     def __call__(self, x: State, u: Input) -> State:
         vehicle, theta = self.body.vehicle, self.body.theta()
@@ -41,11 +35,7 @@ class TrueField(AbstractVectorField):
 
 
 def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
-    """The true vehicle of a domain under its forces, of the wind only the mean.
-
-    Args:
-        vehicle: that of the models, from which the true one may differ in Ix, Iy and k.
-    """
+    """The true vehicle of a domain under its forces, of the wind only the mean; `vehicle` is that of the models."""
     truth = nominal(domain.vehicle)
     body = RigidBody({name: jnp.log(truth[name] / value) for name, value in nominal(vehicle).items()}, vehicle)
     push = jnp.array([0.0, WIND_MEAN if wind in domain.forces else 0.0, 0.0])

@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.names import HYBRID, label
 from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below
-from hybrid_jax.sim.survey import tilt
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, VELOCITY
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
@@ -103,3 +102,8 @@ def _draw_space(axes: Any, states: States) -> None:
     axes.set_zlim(bottom=0)
     axes.locator_params(nbins=5)
     axes.set_box_aspect(None, zoom=0.8)  # room for the label of z
+
+
+def tilt(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, " n"]:
+    """The angle between body z and world z [deg]."""
+    return np.degrees(np.arccos(np.clip(1 - 2 * (q[:, 1] ** 2 + q[:, 2] ** 2), -1, 1)))

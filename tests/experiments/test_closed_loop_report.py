@@ -1,6 +1,7 @@
 """Tables, hypotheses and figures of closed-loop flight, on rows with known numbers."""
 
 import math
+from dataclasses import asdict
 
 import numpy as np
 import pytest
@@ -11,7 +12,7 @@ from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flown import Flown
 from experiments.closed_loop.path_figures import paths, strip
 from experiments.closed_loop.report import Outcome, draw
-from experiments.closed_loop.rows import ERROR, REFERENCES, TAGS, Agent, of
+from experiments.closed_loop.rows import ERROR, REFERENCES, TAGS, Agent
 from experiments.closed_loop.scenarios import Scenario
 from experiments.closed_loop.tables import ablation_tables, gap_tables, gaps, tables
 from experiments.reporting.claims import evaluate
@@ -40,7 +41,7 @@ def make_rows(reference="hover", distance=0.0):
     """The seeds of trained models are 1 % apart."""
     return [
         {
-            "domain": domain, **of(agent), "reference": reference, "distance": distance, "seed": seed,
+            "domain": domain, **asdict(agent), "reference": reference, "distance": distance, "seed": seed,
             "position_rmse": mean * (1 + 0.01 * seed), "yaw_rmse": 0.01, "largest_error": 2 * mean, "crashed": False,
             "saturation": 0.0, "promised": 1.0, "realised": 1.05, "excess": 0.05,
         }
@@ -51,13 +52,11 @@ def make_rows(reference="hover", distance=0.0):
 
 
 ROWS = Results([row for reference in REFERENCES for row in make_rows(reference)] + make_rows(distance=60.0), TAGS)
-
-
 WORSE_AWAY = Results([{**row, "position_rmse": row["position_rmse"] * (1.2 if row["distance"] else 1)} for row in ROWS])
 
 
 def changed(rows, agent, domain="external_force", reference="hover", **values):
-    place = {"domain": domain, "reference": reference, **of(agent)}
+    place = {"domain": domain, "reference": reference, **asdict(agent)}
     return Results([{**row, **values} if place.items() <= row.items() else row for row in rows], TAGS)
 
 
@@ -65,13 +64,12 @@ def verdicts(rows, speed=SPEED):
     return {verdict.id: verdict for verdict in evaluate(claims(FEW), Evidence(rows, FEW, speed))}
 
 
-def holds(rows, speed=SPEED):
-    return {name: verdict.holds for name, verdict in verdicts(rows, speed).items()}
+def holds(*evidence):
+    return {name: verdict.holds for name, verdict in verdicts(*evidence).items()}
 
 
 def test_a_crash_counts_as_an_infinite_error():
-    row = ROWS[0]
-    results = Results([{**row, "position_rmse": math.nan}, {**row, "crashed": True, "seed": 1}], TAGS)
+    results = Results([{**ROWS[0], "position_rmse": math.nan}, {**ROWS[0], "crashed": True, "seed": 1}], TAGS)
     assert results.numbers(ERROR).tolist() == [math.inf] * 2
 
 
@@ -87,9 +85,7 @@ def test_share_of_the_gap_is_zero_for_the_source_and_computed_from_means():
 
 
 def test_all_hypotheses_hold_on_these_rows():
-    found = holds(ROWS)
-    assert set(found.values()) == {True}
-    assert len(found) == 3 * 7 + 2
+    assert list(holds(ROWS).values()) == [True] * (3 * 7 + 2)
 
 
 @pytest.mark.parametrize(
@@ -111,34 +107,29 @@ def test_all_hypotheses_hold_on_these_rows():
 )
 def test_one_missed_goal_fails_only_its_hypothesis(goal, rows):
     failed = {name for name, outcome in holds(rows).items() if not outcome}
+    # A larger error in the wind also leaves more of the gap; a smaller one at home is a larger ratio away from it.
+    also = {"R2a", "R2b", "R2c", "R1a", "R1b", "R1c"} if goal.startswith("R1") else {"R6a", "R6b", "R6c"}
     assert goal in failed
-    assert (
-        {name[:2] for name in failed} <= {goal[:2], "R2"}
-        if goal.startswith("R1")
-        else failed <= {goal, "R6a", "R6b", "R6c"}
-    )
+    assert failed <= {goal, *also}
 
 
 def test_measured_errors_have_enough_decimals_to_differ():
-    by_little = changed(ROWS, Agent("invariant", FEW), "parameter_shift", "step", position_rmse=0.020203)
-    found = verdicts(by_little)
-    assert found["R3b"].holds is False
-    assert "step: 2.0200 cm → 2.0203 cm" in found["R3b"].measured
-    assert "hover: 2.02 cm → 1.11 cm" in found["R3b"].measured
+    found = verdicts(changed(ROWS, Agent("invariant", FEW), "parameter_shift", "step", position_rmse=0.020203))["R3b"]
+    assert found.holds is False
+    assert "step: 2.0200 cm → 2.0203 cm" in found.measured
+    assert "hover: 2.02 cm → 1.11 cm" in found.measured
     same = Results([{**row, "position_rmse": 1e-9} for row in ROWS], TAGS)
-    found = verdicts(same)
-    assert "hover: 0.00 cm → 0.00 cm" in found["R3b"].measured
+    assert "hover: 0.00 cm → 0.00 cm" in verdicts(same)["R3b"].measured
 
 
 def test_errors_that_differ_by_rounding_are_equal():
     """Single precision resolves 0.12 µm between 1 and 2 m."""
-    after, both = Agent("invariant", FEW), Agent("invariant", FEW, observer=True)
 
     def close(by: float):
-        level = changed(ROWS, Agent("invariant"), "parameter_shift", position_rmse=0.011)
-        level = changed(level, after, "parameter_shift", position_rmse=0.011 + by)
-        level = changed(level, both, "parameter_shift", position_rmse=0.011)
-        return verdicts(level)
+        rows = ROWS
+        for agent, more in ((Agent("invariant"), 0), (Agent("invariant", FEW), by), (Agent("invariant", FEW, True), 0)):
+            rows = changed(rows, agent, "parameter_shift", position_rmse=0.011 + more)
+        return verdicts(rows)
 
     found = close(1.1e-7)
     assert found["R3b"].holds is True
@@ -173,16 +164,15 @@ def test_tables_have_a_line_per_agent_and_count_crashes():
     assert {line[0]: line[1] for line in wind.lines}["hybrid, N = 100"] == "∞ (3 of 3 seeds crashed, median ∞)"
     assert len(tables(ROWS)) == 2 * (5 + 1)
     assert len(gap_tables(ROWS)) == 2
-    hybrid = ROWS.where(**of(Agent("hybrid", FEW)))
-    ablated = Results([{**row, "variant": "paper"} for row in hybrid], TAGS)
-    table = ablation_tables(ablated)[0]
+    (table, _) = ablation_tables(ROWS.where(**asdict(Agent("hybrid", FEW))).tagged(variant="paper"))
     assert table.header[-1] == "hover, 60 m away"
     assert len(table.lines) == 1
 
 
 def test_cost_hypothesis_also_reports_the_unchanged_vehicle():
-    unadapted = ROWS.where(model=["invariant", "oracle"], n_train=0, observer=False)
-    unadapted = unadapted.where(domain="parameter_shift", distance=0.0)
+    unadapted = ROWS.where(
+        model=["invariant", "oracle"], n_train=0, observer=False, domain="parameter_shift", distance=0.0
+    )
     rows = Results([{**row, "domain": "source", "excess": 0.5} for row in unadapted], TAGS) + ROWS
     found = verdicts(rows)
     assert found["R4b"].measured.startswith("hover: +5.0 % (source +5 %, before the change +50 %); ")
@@ -195,10 +185,9 @@ def test_cost_hypothesis_also_reports_the_unchanged_vehicle():
 
 
 def test_figures_have_a_panel_per_reference():
-    drawn = figures.errors(ROWS, "external_force")
-    assert [axes.get_title() for axes in drawn.axes] == list(REFERENCES.values())
-    names = [label.get_text() for label in drawn.axes[0].get_yticklabels()]
-    assert names == [agent.name for agent in AGENTS]
+    drawn = figures.errors(ROWS, "external_force").axes
+    assert [axes.get_title() for axes in drawn] == list(REFERENCES.values())
+    assert [label.get_text() for label in drawn[0].get_yticklabels()] == [agent.name for agent in AGENTS]
     assert len(figures.shares(ROWS, "external_force").axes) == len(REFERENCES)
     assert len(figures.away_from_home(ROWS).axes) == 2
     assert len(figures.open_loop_costs(ROWS, [Agent("hybrid")]).axes) == 2
@@ -239,19 +228,16 @@ def test_references_away_are_among_those_at_home():
 def test_figures_without_data_are_left_out_with_a_note(reference, missing):
     models = {agent: np.zeros(1) for agent in AGENTS}
     arrays = {"states": np.ones((len(models), 11, 13))}
-    home = [
-        Flown(Scenario(domain, reference, 0.0, models, 10.0), arrays, 1.0, 1.0, 1)
-        for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE)
-    ]
-    drawn, notes = draw(Results(make_rows(reference), TAGS), Results(), Outcome(home=home), FEW)
+    scenarios = [Scenario(domain, reference, 0.0, models, 10.0) for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE)]
+    home = [Flown(scenario, arrays, 1.0, 1.0, 1) for scenario in scenarios]
+    drawn, notes = draw(Results(make_rows(reference), TAGS), Results(), Outcome(home), FEW)
     assert [note.partition(".png is missing")[0].split("_")[0] for note in notes] == missing
     assert len(drawn) + len(notes) == 2 * 3 + 3
 
 
 def test_a_diverged_path_does_not_change_the_limits():
-    wanted = np.zeros((11, 13))
-    wanted[:, 0] = np.linspace(0, 2, 11)
-    lost = wanted.copy()
+    wanted, lost = np.zeros((2, 11, 13))
+    wanted[:, 0] = lost[:, 0] = np.linspace(0, 2, 11)
     lost[5:, 1] = 1e3
     drawn = paths({"hover": {Agent("hybrid"): wanted + 0.01, Agent("oracle"): lost}}, {"hover": wanted}, 0.05, "Paths")
     assert drawn.get_suptitle() == "Paths (below 0.02 cm drawn there)"
