@@ -55,6 +55,7 @@ def report_of(everything):
     return sound
 
 
+@pytest.mark.slow
 def test_one_command_gathers_the_ratios_of_all(everything):
     run, reports = everything
     assert set(reports) >= {*get_args(Benchmark)}
@@ -68,6 +69,7 @@ def test_one_command_gathers_the_ratios_of_all(everything):
     assert "Failed to import" not in run.stderr
 
 
+@pytest.mark.slow
 def test_the_environment_agrees_with_c_mujoco(report_of):
     report = report_of("environment")
     (row,) = report["rows"]
@@ -75,6 +77,7 @@ def test_the_environment_agrees_with_c_mujoco(report_of):
     assert set(row["steps_per_second"]) == {"ours", "ours_with_forces", "mujoco"}
 
 
+@pytest.mark.slow
 def test_three_integrators_predict_alike_and_have_the_same_gradient(report_of):
     report = report_of("rollout")
     *cases, forward = report["rows"]
@@ -87,6 +90,7 @@ def test_three_integrators_predict_alike_and_have_the_same_gradient(report_of):
     assert {ratio["at_most"] for ratio in report["ratios"]} == {1.05, None}
 
 
+@pytest.mark.slow
 def test_our_gradient_step_is_the_plain_one(report_of):
     report = report_of("training_step")
     (row,) = report["rows"]
@@ -96,6 +100,7 @@ def test_our_gradient_step_is_the_plain_one(report_of):
     assert set(row["seconds"]) == set(row["compile_seconds"]) == {"ours", "plain"}
 
 
+@pytest.mark.slow
 def test_widths_of_chunks_train_alike(report_of):
     report = report_of("sweep")
     *cells, stopped, choice = report["rows"]
@@ -105,6 +110,7 @@ def test_widths_of_chunks_train_alike(report_of):
     assert choice["best_width"] in (1, 2)
 
 
+@pytest.mark.slow
 def test_weak_scaling_is_measured_in_processes_of_their_own(report_of):
     report = report_of("scaling")
     for row in report["rows"]:
@@ -115,6 +121,7 @@ def test_weak_scaling_is_measured_in_processes_of_their_own(report_of):
     assert len(report["ratios"]) == sum(row["lanes"] > 1 for row in report["rows"])
 
 
+@pytest.mark.slow
 def test_growth_is_measured_along_every_axis_and_drawn(report_of, folder):
     report = report_of("growth")
     rows = {axis: [row for row in report["rows"] if row["axis"] == axis] for axis in growth.AXES}
@@ -125,6 +132,7 @@ def test_growth_is_measured_along_every_axis_and_drawn(report_of, folder):
     assert (folder / "all-growth.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_log_is_read_as_numpy_reads_it(report_of):
     both, once = report_of("ingest")["rows"]
     assert both["difference"] < 1e-9

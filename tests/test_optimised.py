@@ -1,14 +1,18 @@
-"""Laws of what is compiled, on programs as users have them: the rest of the suite does not optimise (conftest.py)."""
+"""Laws of compiled programs, optimised as users have them; the rest of the suite does not optimise (conftest.py)."""
 
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 from hybrid_jax.runtime import FLAGS, WHOLE_LOOPS
 
+pytestmark = pytest.mark.slow
+
 ROOT = Path(__file__).parents[1]
-LAWS = ("tests/test_sweep.py", "tests/test_residual.py")
+LAWS = ("tests/sweep/test_sweep.py", "tests/networks/test_residual.py")
 
 
 def test_they_hold():

@@ -17,6 +17,8 @@ from hybrid_jax.dynamics.base import Hybrid as OurHybrid
 from hybrid_jax.dynamics.base import train_batch
 from hybrid_jax.integrate import RK4, rollout
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def peers(tmp_path_factory):

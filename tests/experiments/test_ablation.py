@@ -100,6 +100,7 @@ def test_noise_has_its_size_and_spares_the_test_split():
     np.testing.assert_allclose(np.linalg.norm(noisy.splits["train"].x0[:, 3:7], axis=1), 1, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_run_writes_report_page_and_figures(tmp_path):
     (run,) = experiments("ablation", "ablation", folder=tmp_path, options=("--over", "noise"))
     assert run.returncode == 0, run.stderr

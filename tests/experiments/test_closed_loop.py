@@ -134,6 +134,7 @@ def folder(tmp_path_factory):
     return folder
 
 
+@pytest.mark.slow
 def test_report_has_all_keys_rows_and_figures(folder):
     out = folder / "out" / "closed_loop"
     report = json.loads((out / "report.json").read_text())
@@ -157,6 +158,7 @@ def test_report_has_all_keys_rows_and_figures(folder):
     assert "no p_x, p_y, yaw" in (out / "report.md").read_text()
 
 
+@pytest.mark.slow
 def test_second_run_trains_and_flies_nothing(folder):
     less = ("--references", "hover", "--away-references", "hover", "--ablation", "--calls", "1")
     again = command("closed_loop", *less, folder=folder, out=folder / "again")

@@ -35,6 +35,7 @@ def field(folder, domain, model, mode="fine_tuned", n=20):
     return hybrid_jax.load(folder / "models" / domain / f"{model}-{mode}-{n}-seed0.npz").field
 
 
+@pytest.mark.slow
 def test_the_report_keeps_its_contract(folder):
     report = json.loads((folder / "report.json").read_text())
     rows = [row for row in report["rows"] if row["model"] in METHODS]
@@ -56,6 +57,7 @@ def test_the_report_keeps_its_contract(folder):
     load_report(folder)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("domain", DOMAINS)
 def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
     source = field(folder, domain, "hybrid", "source_only", 0)

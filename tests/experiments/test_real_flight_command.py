@@ -217,6 +217,7 @@ def simulated(tmp_path_factory):
     return folder / "out" / "real_flight", run
 
 
+@pytest.mark.slow
 def test_simulated_run_writes_a_complete_report(simulated):
     out, run = simulated
     report = json.loads((out / "report.json").read_text())
@@ -239,6 +240,7 @@ def test_simulated_run_writes_a_complete_report(simulated):
     assert "Traceback" not in run.stderr
 
 
+@pytest.mark.slow
 def test_adaptation_changes_all_parameters(simulated):
     rows = json.loads((simulated[0] / "report.json").read_text())["rows"]
     theta = {(row["fold"], row["model"], row["mode"]): row["theta"] for row in rows}
@@ -249,6 +251,7 @@ def test_adaptation_changes_all_parameters(simulated):
             assert {name for name, value in source.items() if value == 0.0} == {"cable_pull[0]", "cable_pull[1]"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["hybrid", "no_physics", "physics_only"])
 def test_saved_models_load_and_predict(simulated, name):
     """In a process that imports nothing of the experiment."""
