@@ -118,6 +118,7 @@ def test_what_a_network_gets_wrong_is_not_taken_for_a_push():
     assert found.fit.mse == pytest.approx(float(alone.mse), rel=1e-4)
 
 
+@pytest.mark.slow
 def test_noise_is_seldom_taken_for_a_push_and_hides_none_that_is_felt():
     quiet, pushed = flights(CHANGED), flights(disturbed_by(jnp.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])))
     fit = jax.jit(jax.vmap(lambda windows: select_disturbance(HYBRID, windows).needed))

@@ -125,6 +125,7 @@ def rows(said_and_written):
     return {(row["case"], row["noise_on"], row["parameter"]): row for row in said_and_written[1]["rows"]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("noise_on", ["targets", "all"])
 @pytest.mark.parametrize("name", ["Ix", "Iy", "k"])
 def test_intervals_cover_the_truth_of_exact_physics(noise_on, name, rows):

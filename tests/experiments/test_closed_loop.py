@@ -98,6 +98,7 @@ def flights(models, tmp_path_factory):
     return runs[0]
 
 
+@pytest.mark.slow
 def test_a_flight_of_a_scenario_equals_the_flight_alone(models, flights):
     _, hybrid = models
     reference = sample(PATHS["figure_eight"], CONTROLLER, SECONDS)
@@ -116,6 +117,7 @@ def test_a_flight_of_a_scenario_equals_the_flight_alone(models, flights):
         assert row["position_rmse"] == pytest.approx(float(found.position_rmse), abs=2e-4)
 
 
+@pytest.mark.slow
 def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(flights):
     rows = {row["model"]: row for row in flights.rows()}
     assert rows["oracle"]["position_rmse"] < rows["nominal"]["position_rmse"]

@@ -6,14 +6,13 @@ import math
 import matplotlib as mpl
 import numpy as np
 import pytest
-from hybrid_jax.sim.survey import tilt
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from reports import ODD_ROWS, SIZES, TRUTH, changed, make_rows
 from test_ranking import compared_rows, spoilt
 
 from experiments.paper.figures import ranking, scores, theta
-from experiments.paper.flight_figures import example_flight, predictions
+from experiments.paper.flight_figures import example_flight, predictions, tilt
 from experiments.reporting.plots import COLOURS, LARGEST_RATIO, save_figure
 
 

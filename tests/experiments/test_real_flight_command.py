@@ -193,7 +193,7 @@ def test_learn_option_overrides_the_vehicle_file(tmp_path):
     assert chooses_lag
     assert [model.learn for model in models] == [("Ix",)] * 2
     assert not load_vehicle_models(with_lag(tmp_path), replace(config, learn=("Ix",)))[2]
-    with pytest.raises(ValueError, match="each once"):
+    with pytest.raises(ValueError, match="must not name a parameter twice"):
         replace(config, learn=(LAG, LAG))
 
 

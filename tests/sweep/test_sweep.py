@@ -233,6 +233,7 @@ print(final.epoch.tolist(), [np.float32(number).tobytes().hex() for number in fi
 """
 
 
+@pytest.mark.slow
 def test_the_number_of_devices_changes_nothing():
     runs = [
         subprocess.run([sys.executable, "-c", DEVICES, str(n)], capture_output=True, text=True, check=False)

@@ -329,6 +329,7 @@ def test_progress_is_shown_on_stderr_only_when_asked_for(capsys):
         assert (said.out, "2/2" in said.err) == ("", bool(progress))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_fit_with_defaults_beats_the_model_s_own_physics(name):
     system = SYSTEMS[name]()
