@@ -4,6 +4,8 @@ import os
 import subprocess
 import sys
 
+import pytest
+
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
 CONFIGURED = """

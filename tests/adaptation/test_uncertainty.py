@@ -137,6 +137,7 @@ def test_intervals_cover_the_truth_of_exact_physics(noise_on, name, rows):
     assert abs(row["bias"]) < 4 * row["half_width"] / 1.96 / np.sqrt(REPEATS)
 
 
+@pytest.mark.slow
 def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_not(rows):
     """Drag pulls against the lean into the velocity, as a smaller k would."""
     row = rows["unknown drag", "targets", "k"]
@@ -146,6 +147,7 @@ def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_n
     np.testing.assert_allclose(row["bias"], -100 * 0.4**2 * 8 / (1.5 * 9.81) ** 2, atol=0.15)
 
 
+@pytest.mark.slow
 def test_the_command_prints_and_writes_every_case(said_and_written, rows):
     said, written = said_and_written
     assert written["config"]["repeats"] == REPEATS
