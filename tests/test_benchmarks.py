@@ -93,11 +93,13 @@ def test_three_integrators_predict_alike_and_have_the_same_gradient(report_of):
 @pytest.mark.slow
 def test_our_gradient_step_is_the_plain_one(report_of):
     report = report_of("training_step")
-    (row,) = report["rows"]
-    assert row["model"] == "hybrid"
-    assert row["difference"] < 1e-5
-    assert min(row["windows_per_second"], row["gflops"], row["matrix_product_gflops"]) > 0
-    assert set(row["seconds"]) == set(row["compile_seconds"]) == {"ours", "plain"}
+    rows = {row["model"]: row for row in report["rows"]}
+    assert len(rows) > 1  # the paper's model, and fields as a user writes them
+    assert "hybrid" in rows
+    for row in rows.values():
+        assert row["difference"] < 1e-5
+        assert min(row["windows_per_second"], row["gflops"], row["matrix_product_gflops"]) > 0
+        assert set(row["seconds"]) == set(row["compile_seconds"]) == {"ours", "plain"}
 
 
 @pytest.mark.slow
