@@ -15,9 +15,12 @@ from experiments.runner.options import (
     distinct,
     factors,
 )
+from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
+MOST = 10_000_000  # trajectories; these alone take 7 GB
+FITTED = len(LEARNED) + 6  # what constant_disturbance fits: θ_p, and steady accelerations, linear and angular
 Kind = TypeVar("Kind", bound="Config")
 Model = Literal["hybrid", "no_physics", "physics_only", "constant_disturbance"]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
@@ -144,7 +147,11 @@ class Config(Run):
             raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
+        if self.pooled() + self.source_train + self.validation + self.test > MOST:
+            raise ValueError(f"--sizes, --pool, --source-train, --validation and --test must be at most {MOST} together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
+        if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
+            raise ValueError(f"--sizes must each be more than the {FITTED} parameters of constant_disturbance")
         if NO_PHYSICS in chosen and self.residual_outputs != "all":
             refused = f"--residual-outputs {self.residual_outputs}"
             raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")

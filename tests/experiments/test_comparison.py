@@ -81,7 +81,11 @@ def test_what_a_method_does_not_adapt_stays_as_it_was(folder, domain):
         (("--residual-inputs", "no_xy"), "--methods last_layer needs a residual that sees"),
         (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
         (("--repeats", "0"), "--repeats must be an integer of at least 1, got 0"),
-        (("--sizes", "20", "3", "--batch-size", "3"), "--sizes must each be more than the 3 of θ_p"),
+        (("--sizes", "20", "3", "--batch-size", "3"), "--sizes must each be more than the 9 parameters of constant"),
+        (
+            ("--sizes", "20", "3", "--batch-size", "3", "--methods", "hybrid"),
+            "--sizes must each be more than the 3 of θ_p",
+        ),
         (("--encoding.box", "2", "0.5"), "--encoding.box must be two factors, low < high, above 0"),
         (("--encoding.stopping.patience", "-1"), "--encoding.stopping.patience must be an integer of at least 0"),
     ],

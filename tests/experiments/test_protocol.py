@@ -151,6 +151,8 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"sizes": (10,)}, "--sizes"),
         ({"sizes": ()}, "--sizes"),
         ({"sizes": (100, 100)}, "--sizes"),
+        ({"sizes": (100, 1_000_000_000)}, "--sizes"),
+        ({"sizes": (9,), "batch_size": 9}, "constant_disturbance"),
         ({"models": ()}, "--models"),
         ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
         ({"source_train": 50}, "--source-train"),
