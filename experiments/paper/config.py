@@ -148,7 +148,9 @@ class Config(Run):
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         if self.pooled() + self.source_train + self.validation + self.test > MOST:
-            raise ValueError(f"--sizes, --pool, --source-train, --validation and --test must be at most {MOST} together")
+            raise ValueError(
+                f"--sizes, --pool, --source-train, --validation and --test must be at most {MOST} together"
+            )
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
             raise ValueError(f"--sizes must each be more than the {FITTED} parameters of constant_disturbance")
