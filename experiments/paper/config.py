@@ -149,7 +149,7 @@ class Config(Run):
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         if self.pooled() + self.source_train + self.validation + self.test > MOST:
             raise ValueError(
-                f"--sizes, --pool, --source-train, --validation and --test must be at most {MOST} together"
+                f"trajectories: --sizes, --pool, --source-train, --validation, --test: at most {MOST}"
             )
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
