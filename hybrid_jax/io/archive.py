@@ -35,8 +35,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
     for name, array in arrays.items():
         if array.dtype.newbyteorder("=") not in NUMERIC:
             raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
-    header = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}
-    buffer = io.BytesIO()
+    header, buffer = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}, io.BytesIO()
     # An .npz is a zip of .npy; entries made by hand carry no clock, so equal content gives equal bytes.
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(HEADER), encode(header))
@@ -71,11 +70,7 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
-    """SHA-256 (hex) of metadata and arrays. The order of keys and names does not matter.
-
-    Raises:
-        ValueError: the metadata are not JSON.
-    """
+    """SHA-256 (hex) of metadata, as strict JSON, and arrays. The order of keys and names does not matter."""
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
         array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would make a vector of a scalar
@@ -85,11 +80,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
 
 
 def encode(value: Any, **layout: Any) -> bytes:
-    """Encode a value as strict JSON.
-
-    Raises:
-        ValueError: the value has no JSON form.
-    """
+    """Encode a value as strict JSON; ValueError if it has no such form."""
     try:
         return json.dumps(value, allow_nan=False, **layout).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -97,13 +88,9 @@ def encode(value: Any, **layout: Any) -> bytes:
 
 
 def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
-    """The arrays of a tree as NumPy arrays, by path.
-
-    Raises:
-        ValueError: two arrays have the same path.
-    """
+    """The arrays of a tree as NumPy arrays, by path; ValueError if two have the same path."""
     named = {}
-    for keys, leaf in jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))[0]:
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(tree, eqx.is_array)):
         path = jax.tree_util.keystr(keys, simple=True, separator="/")
         if path in named:
             raise ValueError(f"two arrays have the path {path!r}: no key of a dictionary may contain '/'")
@@ -117,16 +104,13 @@ def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) 
     Raises:
         ValueError: paths, shapes or types differ; names `origin` and the first difference.
     """
-
-    def form(array: np.ndarray | None, absent: str) -> str:
-        return absent if array is None else f"{array.dtype}{list(array.shape)}"
-
     expected = named_leaves(like)
+    found, wanted = ({name: f"{a.dtype}{list(a.shape)}" for name, a in side.items()} for side in (arrays, expected))
     for name in sorted(expected.keys() | arrays.keys()):
-        found, wanted = form(arrays.get(name), "absent"), form(expected.get(name), "none")
-        if found != wanted:
+        if found.get(name) != wanted.get(name):
             where = "" if origin is None else f"{origin}: "
-            raise ValueError(f"{where}array {name!r} is {found}, expected {wanted}")
+            said = f"is {found.get(name, 'absent')}, expected {wanted.get(name, 'none')}"
+            raise ValueError(f"{where}array {name!r} {said}")
     dynamic, rest = eqx.partition(like, eqx.is_array)
     leaves, structure = jax.tree.flatten(dynamic)
     filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(expected, leaves, strict=True)]
@@ -165,8 +149,7 @@ def _read_entries(path: Path) -> dict[str, bytes]:
                 raise ValueError(f"entry {entry.filename!r} is compressed")
         if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
             raise ValueError("its entries declare more than the file holds")
-        # Reading an entry whole verifies its CRC.
-        return {name: archive.read(name) for name in archive.namelist()}
+        return {name: archive.read(name) for name in archive.namelist()}  # which verifies the CRC of each
 
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:

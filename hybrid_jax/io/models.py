@@ -21,34 +21,22 @@ from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archi
 from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"
-FORMAT_1 = "hybrid_jax model 1"  # still read: see `renamed`
+FORMAT_1 = "hybrid_jax model 1"  # still read: see `_RENAMED` in structure.py
 
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field and what is known about it.
-
-    Attributes:
-        about: JSON values, such as where the model comes from and its test error.
-    """
+    """A vector field and what is known about it."""
 
     field: AbstractVectorField
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values, such as its origin and test error
 
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The states of one window, or of n, under inputs that are held for dt each.
+        """The state of one window, or of n, at the end of each interval, under inputs that are held for dt [s] each.
 
-        To keep the other windows where some diverge, use `rollout_batch`.
-
-        Args:
-            x0: initial states.
-            u: inputs of t intervals.
-            dt: length of an interval [s].
-
-        Returns:
-            The state at the end of each interval; finite.
+        All are finite. To keep the other windows where some diverge, use `rollout_batch`.
 
         Raises:
             ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
@@ -93,12 +81,11 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:
-    """Read a model that `save` wrote.
+    """Read a model that `save` wrote. The modules that define its classes must have been imported.
 
     Args:
         like: a field of the same structure, whose arrays are replaced by those of the file. Needed for classes and
-            functions that the file cannot name, such as local classes and lambdas. Without it, the modules that define
-            the model's classes must have been imported.
+            functions that the file cannot name, such as local classes and lambdas.
 
     Raises:
         ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
@@ -120,8 +107,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
     """`like` with the arrays of a file."""
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
-    filled = with_leaves({"field": like}, dynamic)["field"]
-    saved = static_values(tree)
+    filled, saved = with_leaves({"field": like}, dynamic)["field"], static_values(tree)
     for key, value in static_values(Structure(like).tree).items():
         if saved.get(key, value) != value:
             raise ValueError(f"{key} is {saved[key]!r}, but {value!r} in `like`")
@@ -129,10 +115,7 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
 
 
 def check_savable(field: Any) -> str | None:
-    """Why `load` could not rebuild this field from a file alone, in one line, or None if it can.
-
-    In most cases `save` still works, and `load` needs `like`.
-    """
+    """Why `load` could not rebuild this field from a file alone, or None if it can. `load` with `like` mostly can."""
     try:
         return Structure(field).problem
     except ValueError as error:
@@ -145,7 +128,6 @@ def describe(field: eqx.Module) -> Any:
     Raises:
         ValueError: a part of the field has no name that a file could refer to.
     """
-    structure = Structure(field)
-    if structure.problem is not None:
+    if (structure := Structure(field)).problem is not None:
         raise ValueError(structure.problem)
     return structure.tree
