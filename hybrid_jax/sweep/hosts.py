@@ -1,8 +1,8 @@
-"""Multi-process utilities: initialisation, gathering results on every process, and detection of lost peers.
+"""Several processes: initialisation, gathering results on every process, and detection of lost peers.
 
-All processes run the same program on the same data and call these functions in the same order. Training runs never
-communicate (see lanes.py): only results, and what process 0 decides or reads, travel between processes. Every function
-that communicates raises PeerLost when another process has ended.
+All processes run the same program on the same data and call these functions in the same order. Only results, and what
+process 0 decides or reads, travel between them. Every function that communicates raises PeerLost when another process
+has ended.
 """
 
 import contextlib
@@ -47,8 +47,7 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
     if len(set(devices.tolist())) > 1:
         raise ValueError(f"all processes must have the same number of devices, got {devices.tolist()}")
     if jax.default_backend() == "cpu":
-        # Open connections report a lost peer at once. The coordination service would abort this process instead,
-        # before its results are saved.
+        # Open connections report a lost peer. The coordination service would abort this process before it can save.
         jax.distributed.shutdown()
 
 

@@ -38,7 +38,7 @@ def trained(field, rates=0.03, key=KEY, train=TRAIN, validation=VALIDATION, sett
 
 def planned(field, subset, n_train, train=TRAIN, epochs=4):
     plan = make_run_config(0.03, subset, n_train, 100, 100, epochs, 0.0)
-    return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)
+    return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)[0]
 
 
 def validated(field):
@@ -132,7 +132,7 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
     errors, fields = [], []
     for until in range(1, 16):
-        state = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
+        state, _ = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
         errors.append(validated(state.field))
         fields.append(state.field)
     best = int(np.argmin(errors))
@@ -220,9 +220,9 @@ def test_double_precision_trains_alone_and_in_a_sweep():
 
 def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
-    good = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
+    good, _ = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
     spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x * jnp.nan)
-    bad = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
+    bad, _ = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
     assert (int(bad.status), int(bad.epoch)) == (DIVERGED, 4)
     assert eqx.tree_equal(bad.best, good.best)
     assert bad.best_mse == good.best_mse
