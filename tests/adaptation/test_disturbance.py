@@ -10,9 +10,8 @@ import pytest
 from test_least_squares import Push, pushes
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.disturbance_selection import left_out, select_disturbance
 from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import normal_equations
+from hybrid_jax.adaptation.uncertainty import left_out, normal_equations, select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
