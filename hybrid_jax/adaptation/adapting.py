@@ -36,8 +36,6 @@ UNITS |= {"centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodyna
 UNITS |= {"rate_damping": "N m s", "velocity_lag": "s"}
 UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w{axis}]": "rad/s²" for axis in "xyz"}
 
-_mse = eqx.filter_jit(rollout_mse)
-
 
 @dataclass(frozen=True)
 class Parameter:
@@ -144,13 +142,14 @@ def adapt(
     if disturbance_of(field) is None and not np.any(disturbance):  # the windows need none
         adapted, disturbance = without_disturbance(adapted), None
     parameters, missing = _parameters(adapted, train, settings, level, exact and status != DIVERGED)
+    mse = eqx.filter_jit(rollout_mse)
     return Adaptation(
         field=adapted,
         method=name,
         parameters=parameters,
         disturbance=disturbance,
-        mse_before=float(_mse(field, windows, solver=settings.solver)),
-        mse_after=float(_mse(adapted, windows, solver=settings.solver)),
+        mse_before=float(mse(field, windows, solver=settings.solver)),
+        mse_after=float(mse(adapted, windows, solver=settings.solver)),
         windows=len(windows),
         steps=int(solution.steps),
         status=STATUS[status],

@@ -1,8 +1,8 @@
 """Expert Augmentation (Wehenkel et al. 2023; paper, Sec. 4.7): estimate θ_p from the past, without target data.
 
-A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box around its own. From these rollouts,
-and from source windows, an encoder learns to estimate θ_p from the past of a flight; the expert with that θ_p predicts
-what comes next. The box is made of factors, so the physics must hold its parameters as logarithms, as `RigidBody` does.
+A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box of factors around its own, which the
+physics must hold as logarithms. From these rollouts, and from source windows, an encoder learns to estimate θ_p from
+the past of a flight; the expert with that θ_p predicts what comes next.
 """
 
 from collections.abc import Callable
@@ -62,7 +62,7 @@ class ExpertAugmented(eqx.Module):
         """θ̂_p of one flight in the physics' own parametrisation; always inside the box."""
         return self.inside(self.encoder(past))
 
-    def inside(self, place: Theta) -> Float[Array, " p"]:
+    def inside(self, place: Theta) -> Theta:
         """The parameters at a place in the box, uniform in the logarithm: −1 is its low end, 1 its high end."""
         (low, high), (own, _) = np.log(self.box), ravel_parameters(self.expert.field)
         return own + (low + high) / 2 + (high - low) / 2 * place

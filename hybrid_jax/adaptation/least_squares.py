@@ -38,10 +38,7 @@ class LeastSquaresFit(eqx.Module):
 
 
 class _LevenbergMarquardt(optimistix.LevenbergMarquardt):
-    """Also stops when the step that it would take next is below the tolerance, and not only at an accepted step.
-
-    At the minimum round-off decides whether a step is accepted: in float32 the damping could grow until it overflows.
-    """
+    """Also stops before a step below the tolerance: round-off may reject such steps until the damping overflows."""
 
     def terminate(self, fn, y, args, options, state, tags):
         step = jnp.abs(state.y_eval - y) / (self.atol + self.rtol * jnp.abs(y))

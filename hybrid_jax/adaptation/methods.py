@@ -46,9 +46,9 @@ class Method(Protocol):
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field to the windows `train`; `validation` is for early stopping and choices.
+        """Adapt a field to `train`; `validation` is for early stopping and choices. ValueError: what it cannot use.
 
-        Methods of the library compile and map over stacked fields. ValueError: a field or windows that it cannot use.
+        Methods of the library compile and map over stacked fields.
         """
         ...
 

@@ -1,8 +1,7 @@
 """Adaptation in closed form: a linear correction of a pre-trained field by ridge regression.
 
-The error of a field over a recorded interval gives its defect, the mean derivative that it lacks. It is regressed on
-the hidden units of the source's network in `last_layer` (O'Connell et al. 2022, Neural-Fly, where an adaptive law does
-it in flight), on state and input in `linear_residual`.
+A field's defect is the mean derivative that it lacks over an interval. It is regressed on the hidden units of its
+network (`last_layer`; O'Connell et al. 2022, Neural-Fly, where an adaptive law does it in flight), or on x and u.
 """
 
 from collections.abc import Callable
@@ -62,10 +61,7 @@ def last_layer(
 def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
-    """The field plus a linear map of [x, u], regressed on the defects; raises as `last_layer`.
-
-    The penalty is on the map of the standardised [x, u], so that units do not matter.
-    """
+    """The field plus a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
     before, u, after = transitions(windows)
     z = jnp.concatenate([(before + after) / 2, u], axis=1)
     mean, scale = mean_and_scale(z)
@@ -81,13 +77,9 @@ def fit_ridge(
     penalties: tuple[float, ...] = PENALTIES,
     settings: Settings | None = None,
 ) -> RidgeFit:
-    """The updated field at the penalty with the least validation loss; pure: it compiles and maps.
-
-    Raises:
-        ValueError: malformed windows, or penalties that are not positive numbers.
-    """
-    for name, windows in (("train", train), ("validation", validation)):
-        check(windows, name)
+    """The updated field at the penalty with the least validation loss; pure: it compiles and maps."""
+    check(train, "train")
+    check(validation, "validation")
     if not penalties:
         raise ValueError("penalties must be some positive numbers, got none")
     for penalty in penalties:
@@ -135,11 +127,9 @@ def mean_and_scale(z: Float[Array, "s n"]) -> tuple[Float[Array, " n"], Float[Ar
 def ridge(
     z: Float[Array, "s n"], y: Float[Array, "s d"], penalty: Penalty
 ) -> tuple[Float[Array, "d n"], Float[Array, " d"]]:
-    """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖², by a singular value decomposition of [z, 1].
-
-    The normal equations would square its condition number, about 1e4 for hidden units, beyond float32.
-    """
+    """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖²."""
     checks.positive("penalty", penalty)
+    # The normal equations would square the design's condition number, about 1e4 for hidden units, beyond float32.
     design = jnp.concatenate([z, jnp.ones((len(z), 1), z.dtype)], axis=1)
     with jax.default_matmul_precision("highest"):  # a GPU's default rounds factors to 10 bits
         left, sizes, right = jnp.linalg.svd(design, full_matrices=False)

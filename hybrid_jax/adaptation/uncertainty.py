@@ -34,8 +34,6 @@ ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 CHUNK = 250  # windows in memory at a time
 
-_quantile = jax.jit(jax.scipy.special.ndtri)
-
 
 class Interval(NamedTuple):
     """An estimate and its confidence interval, in one unit."""
@@ -72,8 +70,7 @@ def covariance_of(
         kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
             sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
             within one may be correlated and of any unit (Huber 1967; White 1980; for clusters Liang and Zeger 1986; the
-            factor is MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for errors of white noise of one
-            variance.
+            factor is MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
         chunk: windows that are held in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
@@ -134,8 +131,7 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
     that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
 
     Raises:
-        ValueError: a level that is not between 0 and 1, or a covariance of another shape, or one that is known not to
-            be finite or to have a negative variance.
+        ValueError: a level not between 0 and 1, or a covariance of another shape, not finite or of negative variance.
     """
     check_level(level)
     theta, unravel = ravel_parameters(physics := physics_of(field))
@@ -145,7 +141,7 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
     variances = jnp.diagonal(array)
     if not checks.is_traced(variances) and (variances < 0).any():
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    away = _quantile((1 + level) / 2) * jnp.sqrt(variances)
+    away = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2) * jnp.sqrt(variances)
     left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
     return {
         name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))

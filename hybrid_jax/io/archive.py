@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -26,12 +25,7 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:
-    """Write an archive atomically. `form` is its kind and version, such as "hybrid_jax model 2".
-
-    Raises:
-        ValueError: the metadata are not JSON, or an array is not numeric.
-        OSError: the file cannot be written.
-    """
+    """Write an archive of a form such as "hybrid_jax model 2" atomically; ValueError if a part cannot be saved."""
     for name, array in arrays.items():
         if array.dtype.newbyteorder("=") not in NUMERIC:
             raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
@@ -46,11 +40,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
 
 
 def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """The metadata and the arrays by name of an archive of one of these forms, after checks.
-
-    Raises:
-        ValueError: the file is missing, truncated, damaged or of another form; one line that names the file.
-    """
+    """The metadata and arrays of an archive of one of these forms; ValueError of one line if a check fails."""
     path = Path(path)
     try:
         entries = _read_entries(path)
@@ -61,7 +51,7 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
         found = digest(header.get("metadata"), arrays)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError) as error:
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError, MemoryError) as error:
         kind = forms[0].rpartition(" ")[0]
         raise ValueError(f"{path}: truncated, damaged or not a {kind}: {first_line(error)}") from error
     if header.get("sha256") != found:
@@ -99,11 +89,7 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
-    """The tree `like` with each array replaced by that of the same path.
-
-    Raises:
-        ValueError: paths, shapes or types differ; names `origin` and the first difference.
-    """
+    """`like` with each array replaced by that of its path; ValueError of `origin` and the first that does not fit."""
     expected = named_leaves(like)
     found, wanted = ({name: f"{a.dtype}{list(a.shape)}" for name, a in side.items()} for side in (arrays, expected))
     for name in sorted(expected.keys() | arrays.keys()):
@@ -153,13 +139,8 @@ def _read_entries(path: Path) -> dict[str, bytes]:
 
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:
-    """The array in a .npy whose header agrees with its size."""
-    file = io.BytesIO(entry)
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"entry {name!r} is a .npy of an unknown version")
-    shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
-    declared = math.prod(shape) * dtype.itemsize if min(shape, default=0) >= 0 else None
-    if dtype.newbyteorder("=") not in NUMERIC or declared != len(entry) - file.tell():
-        raise ValueError(f"entry {name!r} is not numeric, or its size is not that of {dtype}{list(shape)}")
-    order = "F" if in_fortran_order else "C"
-    return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)
+    """The numeric array in a .npy."""
+    array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+    if array.dtype.newbyteorder("=") not in NUMERIC:
+        raise ValueError(f"entry {name!r} is not numeric")
+    return array

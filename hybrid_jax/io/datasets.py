@@ -33,11 +33,7 @@ class Dataset:
         return self.metadata.get("config", {})
 
     def first(self, split: str, count: int | None = None) -> Trajectories:
-        """The first `count` windows of a split, or all. Larger subsets contain smaller ones.
-
-        Raises:
-            ValueError: there is no such split, or it has fewer windows.
-        """
+        """The first `count` windows of a split, or all; ValueError if there are fewer, or no such split."""
         if split not in self.splits:
             raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
         windows = self.splits[split]
@@ -100,12 +96,10 @@ def content_hash(dataset: Dataset) -> str:
 
 def versions(*packages: str) -> dict[str, str]:
     """The version of Python and of each package, or "not installed"."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version()} | dict.fromkeys(packages, "not installed")
     for package in packages:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
     return found
 
 

@@ -13,11 +13,7 @@ import numpy as np
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a temporary file beside `path`, then rename it to `path`. Text is written as UTF-8.
-
-    Raises:
-        OSError: the file cannot be written; an earlier file at `path` is unchanged.
-    """
+    """Write a temporary file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file as it was."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")

@@ -48,7 +48,7 @@ class Model:
         x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
         check_start(self.field, x0)
-        predicted = _predict(self.field, x0, u, dt)
+        predicted = eqx.filter_jit(rollout if x0.ndim == 1 else rollout_batch)(self.field, x0, u, dt)
         diverged = ~np.isfinite(predicted).all(axis=-1)
         if diverged.any():
             *window, interval = np.argwhere(diverged)[0].tolist()
@@ -57,16 +57,10 @@ class Model:
         return predicted
 
 
-@eqx.filter_jit
-def _predict(field, x0, u, dt):
-    return rollout(field, x0, u, dt) if x0.ndim == 1 else rollout_batch(field, x0, u, dt)
-
-
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
     """Write a model to one file: any Equinox module, and JSON values `about` it.
 
-    If the file alone will not be enough to load the model (see `check_savable`), it is saved with a warning that `load`
-    needs `like`.
+    Warns if `load` will need `like`, as the file alone is not enough to rebuild the model; see `check_savable`.
 
     Raises:
         ValueError: `about` is not JSON, or the field contains an object that is no array, number, text, function,
@@ -95,13 +89,13 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     try:
         about, tree = dict(metadata["about"]), metadata["field"]
         field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)
+        if not isinstance(field, eqx.Module):
+            raise TypeError(f"its field is a {type(field).__name__}")
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
-    if isinstance(field, eqx.Module):
-        return Model(cast(AbstractVectorField, field), about)
-    raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
+    return Model(cast(AbstractVectorField, field), about)
 
 
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
@@ -123,11 +117,7 @@ def check_savable(field: Any) -> str | None:
 
 
 def describe(field: eqx.Module) -> Any:
-    """The structure of a field as JSON values: classes, static values and the paths of its arrays, not their values.
-
-    Raises:
-        ValueError: a part of the field has no name that a file could refer to.
-    """
+    """The structure of a field as JSON values, without its arrays; ValueError if a part has no name for a file."""
     if (structure := Structure(field)).problem is not None:
         raise ValueError(structure.problem)
     return structure.tree

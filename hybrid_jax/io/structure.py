@@ -96,11 +96,7 @@ def _address(item: Any) -> str:
 
 
 class Structure:
-    """The structure of a field: JSON values in `tree`.
-
-    Raises:
-        ValueError: no Equinox module, or one with an object that cannot be saved; names its path.
-    """
+    """The structure of a field, JSON values in `tree`; ValueError, with its path, if a part cannot be saved."""
 
     def __init__(self, field: eqx.Module):
         if not isinstance(field, eqx.Module):

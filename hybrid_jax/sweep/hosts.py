@@ -27,11 +27,9 @@ class PeerLost(ConnectionError):
 
 
 def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Join a multi-process run. Call it before the first array is made.
+    """Join a multi-process run, whose process 0 is at `coordinator`, host:port. Call it before the first array is made.
 
-    Args:
-        coordinator: host:port of process 0. Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open
-            MPI, Kubernetes, Cloud TPU).
+    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU).
 
     Raises:
         ValueError: an argument is missing or inconsistent, or the processes differ in their number of devices.

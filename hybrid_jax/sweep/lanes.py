@@ -39,10 +39,7 @@ def count(lanes: PyTree) -> int:
 
 
 def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity: int) -> list[np.ndarray]:
-    """For each device its shard: the active lanes that it runs, in order, in at most `capacity` chunks.
-
-    The most expensive chunk goes first, to the device with the least work.
-    """
+    """For each device its shard: active lanes, the most expensive chunk first, in at most `capacity` chunks."""
     ordered = sorted(active, key=lambda i: -costs[i])  # no lane of a chunk waits long for another
     shards: list[list[int]] = [[] for _ in range(devices)]
     loads = [(0.0, device) for device in range(devices)]  # a heap of the devices that can take more
@@ -76,17 +73,17 @@ class LaneMap:
 
     def __init__(
         self,
-        function: Callable[..., PyTree],
+        function: Callable,
         width: int | None = None,
-        devices: Sequence[Any] | None = None,
-        min_capacity: int = 0,
-        compiler: dict[str, bool | int] | None = None,
+        devices: Sequence | None = None,
+        min_capacity=0,
+        compiler=None,
     ):
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._min_capacity = min_capacity
-        mesh = Mesh(np.array(self.devices), (AXIS,))
-        self._split, self._whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
+        mesh, split, whole = Mesh(np.array(self.devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
+        self._split, self._whole = NamedSharding(mesh, split), NamedSharding(mesh, whole)
 
         def run(static, lanes, chunks, shared):
             width, leaves, structure = static
@@ -95,7 +92,6 @@ class LaneMap:
                 lanes, shared = eqx.combine((lanes, shared), jax.tree.unflatten(structure, leaves))
                 return _loop(function, width, lanes, chunks[0], shared)
 
-            split, whole = PartitionSpec(AXIS), PartitionSpec()
             mapped = jax.shard_map(share, mesh=mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False)
             return mapped(lanes, chunks, shared)
 

@@ -68,8 +68,7 @@ def sweep(
         before it; it affects no other lane.
 
     Raises:
-        ValueError: invalid data, n_train below the batch size or above the number of windows, or a minibatch of one
-            window where a field normalises minibatches.
+        ValueError: invalid data, an n_train that does not fit them, or a minibatch of one window with a BatchNorm.
     """
     states, plans = jax.device_get((states, plans))
     shared = settings.objective.prepare(train, "train"), settings.objective.prepare(validation, "validation")
@@ -97,11 +96,7 @@ def sweep(
 def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
-    """L_MSE of each lane's field in inference mode, on every `every`-th state of windows shared by all lanes.
-
-    Args:
-        min_lanes: to compile for at least; see `sweep`.
-    """
+    """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`."""
     lanes = count(fields := jax.device_get(fields))
     errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
     return errors(fields, (windows,), np.ones(lanes), range(lanes))

@@ -47,8 +47,8 @@ class Channel:
 class ChannelLoss(TrajectoryLoss):
     """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, in place of the square in `TrajectoryLoss`.
 
-    ρ(r) = r² up to `huber` and 2 huber r − huber² beyond (Huber 1964, doubled). It applies to the norm of a channel's
-    error, so that no direction is preferred. Without `huber`, ρ(r) = r².
+    ρ(r) = r²; with `huber` only up to it, and 2 huber r − huber² beyond (Huber 1964, doubled). As r is a norm, no
+    direction is preferred.
 
     Raises:
         ValueError: no channels, or a threshold that is not positive.

@@ -88,9 +88,8 @@ def fit(
             `Hybrid(1e-2, 1e-3)` for physics and residual.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
-        min_epochs: no early stop before this many epochs.
+        min_epochs, max_epochs: no early stop before, and no epoch after.
         patience: stop after this many epochs without a better validation loss.
-        max_epochs: stop after this many epochs.
         regulariser_weight: λ, by default 1e-3.
         settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. The paper's
             is `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
@@ -106,7 +105,11 @@ def fit(
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if rates is None:
         rates = RATE if optimiser is None else 1.0
-    each = _of_each(rates, eqx.filter(field, trainable(field)))
+    try:
+        each = jax.tree.leaves(jax.tree.broadcast(rates, eqx.filter(field, trainable(field))))
+    except (TypeError, ValueError) as error:
+        expected = "a number, or a tree of them that begins as the field does"
+        raise ValueError(f"rates must be {expected}, got {checks.short_repr(rates)}") from error
     plan = make_run_config(each, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     field = ready(field, train)  # scaling changes the tree of the field, but not what is learned
     plan = replace(plan, rates=jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(plan.rates))
@@ -114,13 +117,7 @@ def fit(
 
 
 def checked_arguments(
-    field: Learner,
-    train: Trajectories,
-    validation: Trajectories,
-    key: PRNGKeyArray,
-    settings: Settings | None,
-    optimiser: Optimiser | None,
-    weight: float | None,
+    field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
     """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
     if settings is None:
@@ -161,15 +158,6 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
             check_attitudes(windows, name)
 
 
-def _of_each(rates: PyTree, learned: Learner) -> list:
-    """The rate of each learned array."""
-    try:
-        return jax.tree.leaves(jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), rates, learned))
-    except (TypeError, ValueError) as error:
-        expected = "a number, or a tree of them that begins as the field does"
-        raise ValueError(f"rates must be {expected}, got {checks.short_repr(rates)}") from error
-
-
 def ready(field: Learner, train: Trajectories) -> Learner:
     """The field with its scaling set. Warns if a file of it could not be loaded without more information."""
     if (reason := check_savable(field)) is not None:
@@ -182,29 +170,25 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     validated_on, settings, optimiser = shared
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
-    losses, most = [np.zeros((0, 2))], 1
-    empty = jnp.zeros((BLOCK, 2))
+    losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
+    train = eqx.filter_jit(fitting.run)
     with _reporting(progress, int(plan.max_epochs)) as report:
         try:
             while int(state.status) == RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
                 until = jnp.asarray(first + most, jnp.int32)  # an array, so that one program serves all blocks
-                after, rows = _block(state, plan, data, validated_on, settings, until, optimiser, empty)
+                after, rows = train(state, plan, data, validated_on, settings, until, optimiser, empty)
                 state, losses = after, [*losses, np.asarray(rows)[: int(after.epoch) - first]]
                 report(int(state.epoch), state)
                 most = int(np.clip(most * BLOCK_SECONDS / (time.perf_counter() - began), 1, min(BLOCK, 4 * most)))
-        except KeyboardInterrupt as interrupt:
-            raise FitInterrupted(_result(state, losses)) from interrupt
-    return _result(state, losses)
-
-
-_block = eqx.filter_jit(fitting.run)
-
-
-def _result(state: FitState, losses: list[np.ndarray]) -> FitResult:
+        except KeyboardInterrupt as error:
+            interrupt = error
     history, status = History(*np.concatenate(losses).T), fitting.STATUS_NAMES[int(state.status)]
     best_epoch, epochs = int(state.best_epoch), int(state.epoch)
-    return FitResult(state.best, state.best_mse, best_epoch, state.field, epochs, status, history, state)
+    result = FitResult(state.best, state.best_mse, best_epoch, state.field, epochs, status, history, state)
+    if interrupt is not None:
+        raise FitInterrupted(result) from interrupt
+    return result
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once

@@ -64,10 +64,7 @@ def run(
     optimiser: Optimiser = ADAM,
     losses: Float[Array, "e 2"] | None = None,
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
-    """Continue until the run has stopped or has completed `until` epochs, on data as prepared by the objective.
-
-    The training and the validation loss of the first epochs are recorded in the rows of `losses`.
-    """
+    """Continue until the run has stopped or has completed `until` epochs; `losses` takes those of the first epochs."""
     first = state.epoch
     # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)
@@ -132,11 +129,7 @@ def gradient_step(
 
 
 def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
-    """A configuration with every number as an array, as `vmap` needs it.
-
-    Raises:
-        ValueError: a rate or weight that is negative or not finite, or a count that is too small; says which.
-    """
+    """A configuration with every number as an array, as `vmap` needs it; ValueError if one is out of range."""
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
     counts = {"n_train": n_train, "min_epochs": min_epochs, "patience": patience, "max_epochs": max_epochs}

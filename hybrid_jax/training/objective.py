@@ -19,16 +19,10 @@ Learner = Any  # an Equinox module: a vector field, or anything that the objecti
 
 
 class Objective(Protocol):
-    """Maps windows to a training loss and a validation loss. It must be hashable.
-
-    A subclass inherits `batch` and `observe`, which by default change nothing.
-    """
+    """Maps windows to a training and a validation loss; hashable. By default `batch` and `observe` change nothing."""
 
     def prepare(self, windows: Trajectories, name: str) -> PyTree:
-        """The data of a run, of any type that has a length and can be indexed by an array of integers. Called once.
-
-        ValueError: windows that cannot be used; `name` is the argument's name.
-        """
+        """The data of a run, with a length and indexed by arrays of integers; ValueError, with `name`, if unusable."""
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
         """A minibatch in the layout that `loss` needs."""
@@ -51,10 +45,7 @@ class Objective(Protocol):
 
 @dataclass(frozen=True)
 class TrajectoryLoss(Objective):
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories, plus λ L_reg of a `Hybrid` (paper, Sec. 3.3, Eq. 6).
-
-    Validation leaves L_reg out. A subclass may measure the error in another way.
-    """
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories (paper, Sec. 3.3, Eq. 6), in training plus λ L_reg."""
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
         return check(windows, name)

@@ -25,8 +25,7 @@ class Stage:
     """One training run, with the learning rate of each group of parameters.
 
     A group is named by the beginning of its path in the field, e.g. "physics", "residual/weight_out" or
-    "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Parameters in no group are
-    frozen.
+    "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Other parameters are frozen.
 
     Raises:
         ValueError: a rate that is negative or not finite, or a count below 1.
@@ -62,11 +61,7 @@ def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
 
 
 def cut(windows: Trajectories, steps: int | None) -> Trajectories:
-    """The first `steps` intervals of each window.
-
-    Raises:
-        ValueError: the windows are shorter.
-    """
+    """The first `steps` intervals of each window, or all; ValueError if there are fewer."""
     if steps is None:
         return windows
     checks.count("steps", steps)
@@ -76,10 +71,7 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
 
 
 def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
-    """A run at its start with the validation loss of its field, on data as prepared by the objective.
-
-    `best` then is that field until an epoch is better.
-    """
+    """A run at its start with the validation loss of its field, which is `best` until an epoch is better."""
     error = settings.objective.validate(state.field, validation, settings)
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
 
@@ -101,8 +93,7 @@ def fit_in_stages(
     Every stage is validated on whole windows. Only what is better there than the field that it began with is kept.
 
     Raises:
-        ValueError: as `fit`; windows shorter than a stage needs; rates of a group that the field does not have; or no
-            stages.
+        ValueError: as `fit`; no stages; windows shorter than a stage needs; or rates of a group that the field has not.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if not stages:
@@ -111,10 +102,7 @@ def fit_in_stages(
     steps = [(rates_by_group(field, stage.rates), cut(data, stage.steps), stage) for stage in stages]
     for (rates, windows, stage), stage_key in zip(steps, jax.random.split(key, len(stages)), strict=True):
         plan = make_run_config(rates, jnp.arange(len(data)), len(data), 0, stage.patience, stage.epochs, weight)
-        state = _validated(start(field, stage_key, shared[-1]), *shared[:2])
+        state = eqx.filter_jit(judged)(start(field, stage_key, shared[-1]), *shared[:2])
         results.append(drive(state, plan, windows, shared, progress))
         field = results[-1].best
     return results
-
-
-_validated = eqx.filter_jit(judged)
