@@ -68,12 +68,6 @@ def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
         np.testing.assert_allclose(many(field, x.T, u.T).T, one, rtol=1e-5, atol=1e-5)
 
 
-def test_a_model_with_one_is_kept(tmp_path):
-    field = hj.Hybrid(disturbed(body(), PUSH), network())
-    hj.save(tmp_path / "model.npz", field)
-    assert eqx.tree_equal(hj.load(tmp_path / "model.npz").field, field)
-
-
 class Drag(AbstractVectorField):
     """What neither θ_p nor a constant can be, and no network of these tests knows."""
 
