@@ -57,7 +57,7 @@ def epoch_of(model: Model, seeds: int, windows: int) -> Case:
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)[0]
 
     mapped, lanes = LaneMap(epoch), training_runs(model, seeds, windows)
     shared = many_windows(windows), many_windows(VALIDATION)

@@ -55,7 +55,7 @@ def make_program(preset: Preset, lanes: int, devices: int, width: int) -> Progra
 
     def epoch(lane, train, validation):
         state, plan = lane
-        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)
+        return fitting.run(state, plan, train, validation, SETTINGS, state.epoch + 1)[0]
 
     mapped = LaneMap(epoch, width, jax.local_devices()[:devices])
     start = lane(training_runs(preset.model, preset.lanes[-1], preset.n_train), np.arange(lanes))

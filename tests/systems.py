@@ -144,8 +144,8 @@ def _system(truth, changed, model, start, inputs, dt) -> System:
     return System(truth, changed, model, *made)
 
 
-def _pendulum(wrap=lambda network: network, norm="batch") -> System:
-    residual = hj.residual_network(2, 1, jax.random.key(1), hidden=16, norm=norm)
+def _pendulum(wrap=lambda network: network) -> System:
+    residual = hj.residual_network(2, 1, jax.random.key(1), hidden=16)
     return _system(
         truth=pendulum(0.5, 0.8),
         changed=pendulum(0.7, 0.8),
@@ -241,5 +241,5 @@ SYSTEMS: dict[str, Callable[[], System]] = {
     "multirotor": cache(_multirotor),
     "ring_dense": cache(_dense),
     "ring_convolution": cache(_convolution),
-    "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network), norm="layer")),
+    "wrapper": cache(lambda: _pendulum(lambda network: Gain(jnp.zeros(()), network))),
 }

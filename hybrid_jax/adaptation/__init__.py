@@ -9,33 +9,18 @@ By default least squares fits the physical parameters θ_p and, if the windows n
 network stays as it is. `METHODS` lists the other methods by name; `Method` says how to write one.
 """
 
-from hybrid_jax.adaptation.adapting import adapt
-from hybrid_jax.adaptation.disturbance_selection import DisturbanceSelection, select_disturbance
+from hybrid_jax.adaptation.adapting import Adaptation, Parameter, adapt
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.adaptation.methods import METHODS, FineTune, LeastSquares, Method, Ridge, Solution, Source
-from hybrid_jax.adaptation.result import Adaptation, Parameter
-from hybrid_jax.adaptation.uncertainty import Interval, covariance_of, intervals
+from hybrid_jax.adaptation.uncertainty import (
+    DisturbanceSelection,
+    Interval,
+    covariance_of,
+    intervals,
+    select_disturbance,
+)
 
-__all__ = [
-    "METHODS",
-    "Adaptation",
-    "Augmentation",
-    "DisturbanceSelection",
-    "ExpertAugmented",
-    "FineTune",
-    "Interval",
-    "LeastSquares",
-    "LeastSquaresFit",
-    "Method",
-    "Parameter",
-    "Ridge",
-    "Solution",
-    "Source",
-    "adapt",
-    "covariance_of",
-    "expert_augmented",
-    "fit_least_squares",
-    "intervals",
-    "select_disturbance",
-]
+__all__ = ["METHODS", "Adaptation", "Augmentation", "DisturbanceSelection", "ExpertAugmented", "FineTune", "Interval"]
+__all__ += ["LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
+__all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "select_disturbance"]

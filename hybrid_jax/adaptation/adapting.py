@@ -1,30 +1,34 @@
-"""`adapt`: one call that adapts any field to windows of a changed system, by any method."""
+"""`adapt`: one call that adapts any field to windows of a changed system, by any method; one result for all methods."""
 
 import warnings
+from dataclasses import asdict, dataclass
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
+from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import check_windows
 from hybrid_jax.adaptation.methods import METHODS, Method, Solution, scale_of
-from hybrid_jax.adaptation.result import NOT_LEAST_SQUARES, STATUS, UNDETERMINED, Adaptation, Parameter
 from hybrid_jax.adaptation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
+from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
 from hybrid_jax.integrate import checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.training.channels import MULTIROTOR, Channel, ChannelLoss
-from hybrid_jax.training.fitting import DIVERGED
+from hybrid_jax.training.channels import scaled_loss
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
 HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
-FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
+STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGED: "diverged"}
+NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
+UNDETERMINED = "the windows do not determine the parameters"
 
 # Of a rigid body's parameters, and of its disturbance; another class may have a class attribute `units` like this.
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
@@ -32,7 +36,65 @@ UNITS |= {"centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodyna
 UNITS |= {"rate_damping": "N m s", "velocity_lag": "s"}
 UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w{axis}]": "rad/s²" for axis in "xyz"}
 
-_mse = eqx.filter_jit(rollout_mse)
+
+@dataclass(frozen=True)
+class Parameter:
+    """A physical parameter and its confidence interval; low and high are None where there is no valid one."""
+
+    value: float
+    low: float | None = None
+    high: float | None = None
+    unit: str | None = None
+
+    def __str__(self) -> str:
+        around = "" if self.low is None or self.high is None else f"  ({self.low:.4g} to {self.high:.4g})"
+        return f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}{around}"
+
+
+@dataclass(frozen=True, eq=False)
+class Adaptation:
+    """An adapted field and what is known about it."""
+
+    field: AbstractVectorField
+    method: str  # its name, or its class if it was passed as a value
+    parameters: dict[str, Parameter]  # of physics and disturbance; see `uncertainty.named_parameters`
+    disturbance: Float[np.ndarray, " d"] | None  # the constant part of ẋ, if there is one
+    mse_before: float  # L_MSE of the source field on all windows
+    mse_after: float  # and of the adapted one
+    windows: int  # their number
+    steps: int  # epochs, or evaluations of the Jacobian; 0 for a closed form
+    status: str  # one of `STATUS`
+    level: float  # confidence level of the intervals
+    without_intervals: str | None  # why there are none, if so
+
+    @property
+    def converged(self) -> bool:
+        """Whether the method stopped by itself, at a finite error."""
+        return self.status == STATUS[STOPPED]
+
+    def report(self) -> str:
+        """A summary in plain text, a few lines."""
+        after = f" after {self.steps} steps" if self.steps else ""
+        lines = [
+            f"Adapted to {self.windows} windows by {self.method}: {self.status}{after}.",
+            f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after.",
+        ]
+        if self.parameters:
+            note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
+            width = max(map(len, self.parameters))
+            lines.append(f"Parameters ({note}):")
+            lines += [f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items()]
+        lines.append(f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}.")
+        if self.parameters and self.without_intervals is not None:
+            lines.append(f"No intervals: {self.without_intervals}.")
+        return "\n".join(lines)
+
+    def to_dict(self) -> dict[str, Any]:
+        """Everything but the field, as JSON values."""
+        parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
+        disturbance = None if self.disturbance is None else self.disturbance.tolist()
+        found = vars(self) | {"converged": self.converged, "disturbance": disturbance, "parameters": parameters}
+        return {name: value for name, value in found.items() if name != "field"}
 
 
 def adapt(
@@ -62,9 +124,9 @@ def adapt(
     check_windows(field, windows)
     check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
+    check_windows(field, held_out, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
-    for part, data in (("windows", windows), ("validation", held_out)):
-        check_windows(field, data, part)
+    for data in (windows, held_out):
         checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
@@ -75,38 +137,25 @@ def adapt(
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
-    adapted, found = solution.field, disturbance_of(solution.field)
+    adapted, found, status = solution.field, disturbance_of(solution.field), int(solution.status)
     disturbance = None if found is None else np.asarray(found.vector(windows.x0.shape[-1]))
     if disturbance_of(field) is None and not np.any(disturbance):  # the windows need none
         adapted, disturbance = without_disturbance(adapted), None
-    finite = int(solution.status) != DIVERGED
-    parameters, missing = _parameters(adapted, train, settings, level, exact and finite)
+    parameters, missing = _parameters(adapted, train, settings, level, exact and status != DIVERGED)
+    mse = eqx.filter_jit(rollout_mse)
     return Adaptation(
         field=adapted,
         method=name,
         parameters=parameters,
         disturbance=disturbance,
-        mse_before=float(_mse(field, windows, solver=settings.solver)),
-        mse_after=float(_mse(adapted, windows, solver=settings.solver)),
+        mse_before=float(mse(field, windows, solver=settings.solver)),
+        mse_after=float(mse(adapted, windows, solver=settings.solver)),
         windows=len(windows),
         steps=int(solution.steps),
-        status=STATUS[int(solution.status)],
+        status=STATUS[status],
         level=level,
         without_intervals=missing,
     )
-
-
-def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
-    """A loss relative to the RMS change over a window of each state, or of each vector in the state of a rigid body."""
-    d = windows.x0.shape[-1]
-    parts = MULTIROTOR.values() if moves_a_rigid_body(field) else [slice(i, i + 1) for i in range(d)]
-    x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
-
-    def rms(values: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(np.sum(np.square(values), axis=-1))))
-
-    scales = [max(rms(end[:, part] - x0[:, part]), FLOOR * rms(end[:, part])) or 1.0 for part in parts]
-    return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
 
 
 def _named(method: str | Method) -> tuple[str, Method]:
@@ -121,10 +170,8 @@ def _named(method: str | Method) -> tuple[str, Method]:
 
 def _split(windows: Trajectories, validation: Trajectories | None, needed: bool) -> tuple[Trajectories, Trajectories]:
     """The windows to train on and those to validate with; the same where none are needed."""
-    if validation is not None:
-        return windows, validation
-    if not needed:
-        return windows, windows
+    if validation is not None or not needed:
+        return windows, windows if validation is None else validation
     if len(windows) < 2:
         raise ValueError("windows: one is too few to hold some out; pass validation=")
     last = len(windows) - max(1, len(windows) // HELD_OUT)
@@ -144,16 +191,15 @@ def _parameters(
     if not 0 < _size(field) <= NAMED:
         return {}, NOT_LEAST_SQUARES
     own = physics_of(without_disturbance(field))
-    units = UNITS if isinstance(own, AbstractRigidBody) else getattr(own, "units", {})
-    values = {
-        name: Parameter(float(value), unit=units.get(name, units.get(name.split("[")[0])))
-        for name, value in named_parameters(field).items()
-    }
+    known = UNITS if isinstance(own, AbstractRigidBody) else getattr(own, "units", {})
+    values = named_parameters(field)
+    units = {name: known.get(name, known.get(name.split("[")[0])) for name in values}
+    alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
     if not exact:
-        return values, NOT_LEAST_SQUARES
+        return alone, NOT_LEAST_SQUARES
     scale = scale_of(settings.objective, windows.x0.shape[-1])
     covariance = covariance_of(field, windows, solver=settings.solver, scale=scale)
     if not np.isfinite(covariance).all():
-        return values, UNDETERMINED
+        return alone, UNDETERMINED
     found = intervals(field, covariance, level)
-    return {name: Parameter(*map(float, found[name]), unit=one.unit) for name, one in values.items()}, None
+    return {name: Parameter(*map(float, found[name]), unit=units[name]) for name in values}, None

@@ -1,9 +1,8 @@
 """Expert Augmentation (Wehenkel et al. 2023; paper, Sec. 4.7): estimate θ_p from the past, without target data.
 
-A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box around its own. An encoder learns
-from these rollouts, labelled with their θ_p, and from source windows to estimate θ_p from the past of a flight; the
-expert with that θ_p predicts what comes next. The box is made of factors, so the physics must hold its parameters as
-logarithms, as `RigidBody` does.
+A hybrid trained on the source (the expert) is rolled out with θ_p drawn from a box of factors around its own, which the
+physics must hold as logarithms. From these rollouts, and from source windows, an encoder learns to estimate θ_p from
+the past of a flight; the expert with that θ_p predicts what comes next.
 """
 
 from collections.abc import Callable
@@ -17,13 +16,13 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.least_squares import ravel_parameters
+from hybrid_jax.adaptation.least_squares import Theta, ravel_parameters
 from hybrid_jax.adaptation.methods import Solution
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse
-from hybrid_jax.training.objective import Settings
+from hybrid_jax.training.objective import Objective, Settings
 from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories, check, split
 
@@ -38,7 +37,7 @@ class Encoder(eqx.Module):
     biases: tuple[Float[Array, " out"], ...]
     seen: RunningStats  # of its inputs over source flights
 
-    def __call__(self, past: Trajectories) -> Float[Array, " p"]:
+    def __call__(self, past: Trajectories) -> Theta:
         z = (encoder_inputs(past) - self.seen.mean) * jax.lax.rsqrt(self.seen.variance + 1e-12)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
             z = jax.nn.relu(weight @ z + bias)
@@ -56,24 +55,19 @@ class ExpertAugmented(eqx.Module):
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         """The expert with the mean estimate of θ_p over the heads of the windows; the field is not used."""
-        channels = 2 * train.x0.shape[-1] + train.u.shape[-1]
-        past = self.encoder.weights[0].shape[1] // channels
+        past = self.encoder.weights[0].shape[1] // (2 * train.x0.shape[-1] + train.u.shape[-1])
         return Solution(self.with_parameters(_mean_over(self.estimate, cut(train, past))))
 
-    def estimate(self, past: Trajectories) -> Float[Array, " p"]:
+    def estimate(self, past: Trajectories) -> Theta:
         """θ̂_p of one flight in the physics' own parametrisation; always inside the box."""
         return self.inside(self.encoder(past))
 
-    def inside(self, place: Float[Array, " p"]) -> Float[Array, " p"]:
+    def inside(self, place: Theta) -> Theta:
         """The parameters at a place in the box, uniform in the logarithm: −1 is its low end, 1 its high end."""
-        low, high = np.log(self.box)
-        return self.own() + (low + high) / 2 + (high - low) / 2 * place
+        (low, high), (own, _) = np.log(self.box), ravel_parameters(self.expert.field)
+        return own + (low + high) / 2 + (high - low) / 2 * place
 
-    def own(self) -> Float[Array, " p"]:
-        """The expert's own parameters."""
-        return ravel_parameters(self.expert.field)[0]
-
-    def with_parameters(self, parameters: Float[Array, " p"]) -> AbstractVectorField:
+    def with_parameters(self, parameters: Theta) -> AbstractVectorField:
         """The expert with other parameters."""
         return ravel_parameters(self.expert.field)[1](parameters)
 
@@ -89,10 +83,10 @@ def expert_augmented(
 
     Args:
         past: windows of source flight, as long as those that the encoder will read; they set the scale of its inputs.
-        box: lowest and highest factor on each of the expert's parameters.
+        box: lowest and highest factor on each of the expert's parameters, 0 < low <= high.
 
     Raises:
-        ValueError: the box is not 0 < low <= high, or past windows that are malformed.
+        ValueError: another box, or past windows that are malformed.
     """
     if len(box) != 2 or not 0 < box[0] <= box[1] < np.inf:
         raise ValueError(f"box must be two factors, 0 < low <= high, got {box}")
@@ -107,7 +101,7 @@ def expert_augmented(
         for k, fan_in, out in zip(keys, sizes[:-1], sizes[1:], strict=True)
     )
     seen = RunningStats(inputs.mean(0), inputs.var(0))
-    return ExpertAugmented(Encoder(weights, tuple(jnp.zeros(out) for out in sizes[1:]), seen), Frozen(expert), box)
+    return ExpertAugmented(Encoder(weights, tuple(map(jnp.zeros, sizes[1:])), seen), Frozen(expert), box)
 
 
 def encoder_inputs(past: Trajectories) -> Float[Array, " r"]:
@@ -117,21 +111,14 @@ def encoder_inputs(past: Trajectories) -> Float[Array, " r"]:
     return jnp.concatenate([states[:-1], jnp.diff(states, axis=0), jnp.asarray(past.u)], axis=1).ravel()
 
 
-class Labelled(eqx.Module):
+class Labelled(Trajectories):
     """Windows, each with the seed of the θ_p with which the expert flies it, or RECORDED."""
 
-    windows: Trajectories
     augmentation_seed: Int[Array | np.ndarray, "*n"]
-
-    def __len__(self) -> int:
-        return len(self.windows)
-
-    def __getitem__(self, index) -> "Labelled":
-        return Labelled(self.windows[index], self.augmentation_seed[index])
 
 
 @dataclass(frozen=True)
-class Augmentation:
+class Augmentation(Objective):
     """The objective of an `ExpertAugmented`: L_MSE of its predictions + weight × MSE(θ̂_p, θ_p) on augmented flights.
 
     Every source window is used twice: as recorded, and as the expert flies it with a θ_p from the box.
@@ -150,32 +137,24 @@ class Augmentation:
             raise ValueError(f"{name}: windows of {windows.horizon} intervals, more than past={self.past} expected")
         seeds = np.arange(len(windows), dtype=np.int32)
         twice = jax.tree.map(lambda leaf: np.concatenate([leaf, leaf]), windows)
-        return Labelled(twice, np.concatenate([np.full_like(seeds, RECORDED), seeds]))
-
-    def batch(self, picked: Labelled, settings: Settings) -> Labelled:
-        return picked
+        return Labelled(**vars(twice), augmentation_seed=np.concatenate([np.full_like(seeds, RECORDED), seeds]))
 
     def loss(self, field: ExpertAugmented, batch: Labelled, settings: Settings, weight: Float[Array, ""]):
         prediction, label = jax.vmap(lambda one: self._errors(field, one, settings))(batch)
         augmented = batch.augmentation_seed != RECORDED
         return jnp.mean(prediction) + weight * jnp.sum(label * augmented) / jnp.maximum(augmented.sum(), 1), None
 
-    def observe(self, field: ExpertAugmented, batch: Labelled, seen: None) -> ExpertAugmented:
-        return field
-
     def validate(self, field: ExpertAugmented, data: Labelled, settings: Settings) -> Float[Array, ""]:
         return _mean_over(lambda one: self._errors(field, one, settings)[0], data)
 
-    def augmented(
-        self, field: ExpertAugmented, one: Labelled, settings: Settings
-    ) -> tuple[Trajectories, Float[Array, " p"]]:
+    def augmented(self, field: ExpertAugmented, one: Labelled, settings: Settings) -> tuple[Trajectories, Theta]:
         """One window as recorded, or as the expert flies it, and its θ_p."""
+        own, _ = ravel_parameters(field.expert.field)
         key = jax.random.fold_in(jax.random.key(self.seed), one.augmentation_seed)
-        own = field.own()
         drawn = field.inside(jax.random.uniform(key, own.shape, minval=-1.0, maxval=1.0))
-        window, recorded = one.windows, one.augmentation_seed == RECORDED
-        other = rollout(field.with_parameters(drawn), window.x0, window.u, window.dt, settings.solver)
-        return replace(window, x=jnp.where(recorded, window.x, other)), jnp.where(recorded, own, drawn)
+        recorded = one.augmentation_seed == RECORDED
+        other = rollout(field.with_parameters(drawn), one.x0, one.u, one.dt, settings.solver)
+        return replace(one, x=jnp.where(recorded, one.x, other)), jnp.where(recorded, own, drawn)
 
     def _errors(self, field: ExpertAugmented, one: Labelled, settings: Settings):
         """L_MSE of the prediction of one window, and the mean squared error of θ̂_p."""

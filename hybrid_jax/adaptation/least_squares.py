@@ -1,8 +1,7 @@
 """Nonlinear least squares for the physical parameters θ_p; a hybrid's residual stays as it is.
 
-Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands, and with few
-parameters a Jacobian costs as much as a few rollouts. θ_p is in the physics' own parametrisation: for a `RigidBody` the
-log-ratios.
+Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands. θ_p is in the
+physics' own parametrisation: for a `RigidBody` the log-ratios.
 """
 
 from collections.abc import Callable
@@ -13,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import optimistix
 from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
@@ -26,6 +25,7 @@ DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Niels
 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
+Theta = Float[Array, " p"]
 
 
 class LeastSquaresFit(eqx.Module):
@@ -37,19 +37,8 @@ class LeastSquaresFit(eqx.Module):
     converged: Bool[Array, ""]  # whether it stopped before `max_steps`, at a finite L_MSE
 
 
-class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
-    """`optimistix.LevenbergMarquardt` that also stops when the step it would take next is below the tolerance.
-
-    Optimistix looks at accepted steps only. At the minimum round-off decides which step is accepted, and in float32 a
-    run could go on rejecting until its damping overflows.
-    """
-
-    rtol: float
-    atol: float
-    norm: Callable[[PyTree], Float[Array, ""]] = optimistix.max_norm
-    descent: optimistix.DampedNewtonDescent = eqx.field(default_factory=optimistix.DampedNewtonDescent)
-    search: optimistix.ClassicalTrustRegion = eqx.field(default_factory=optimistix.ClassicalTrustRegion)
-    verbose: Callable[..., None] = lambda **_: None
+class _LevenbergMarquardt(optimistix.LevenbergMarquardt):
+    """Also stops before a step below the tolerance: round-off may reject such steps until the damping overflows."""
 
     def terminate(self, fn, y, args, options, state, tags):
         step = jnp.abs(state.y_eval - y) / (self.atol + self.rtol * jnp.abs(y))
@@ -61,14 +50,10 @@ class _LevenbergMarquardt(optimistix.AbstractGaussNewton):
 def fit_least_squares(
     field: AbstractVectorField, windows: Trajectories, solver: Solver = None, max_steps: int = 100, scale: Scale = None
 ) -> LeastSquaresFit:
-    """Minimise L_MSE in inference mode over the θ_p of the field's physics.
+    """Minimise L_MSE, with the error of each state over `scale`, in inference mode over the θ_p of the field's physics.
 
     Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. In float32 the
     precision is about 1e-3 standard errors.
-
-    Args:
-        windows: of any length.
-        scale: divides the error of each state.
 
     Raises:
         ValueError: the physics has no parameter, or windows that are malformed or not of this field.
@@ -87,9 +72,8 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
 
 def check_determined(field: AbstractVectorField, n: int) -> None:
     """Refuse n windows if the physics has as many parameters or more, or none."""
-    p = ravel_parameters(field)[0].size
+    p, name = ravel_parameters(field)[0].size, type(physics_of(field)).__name__
     if n <= p:
-        name = type(physics_of(field)).__name__
         raise ValueError(f"windows: {n} are too few for the {p} parameters of {name}, at least {p + 1} are needed")
 
 
@@ -97,8 +81,11 @@ def check_determined(field: AbstractVectorField, n: int) -> None:
 def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale) -> LeastSquaresFit:
     start, unravel = ravel_parameters(field)
 
-    def residuals(theta: Float[Array, " p"]) -> Float[Array, "n t d"]:
+    def residuals(theta: Theta) -> Float[Array, "n t d"]:
         return jax.vmap(lambda window: prediction_errors(unravel(theta), window, solver, scale))(windows)
+
+    def mse(residuals: Float[Array, "n t d"]) -> Float[Array, ""]:
+        return jnp.mean(jnp.sum(jnp.square(residuals), axis=-1))
 
     # Each parameter is measured by what it does to the residuals, and these by their size at the start, so that the
     # damping and the tolerances, which are absolute numbers, mean the same for any units, data and field (Moré 1978).
@@ -107,40 +94,34 @@ def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: 
     effects = jax.vmap(push)(jnp.eye(start.size, dtype=start.dtype))
     unit = size / _nonzero(jnp.linalg.norm(effects.reshape(start.size, -1), axis=1))
 
-    def theta_at(z: Float[Array, " p"]) -> Float[Array, " p"]:
+    def theta_at(z: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
 
-    def objective(z: Float[Array, " p"], _) -> Float[Array, "n t d"]:
+    def objective(z: Theta, _) -> Float[Array, "n t d"]:
         return (residuals(theta_at(z)) / (size * DAMPING**0.5)).astype(z.dtype)
 
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.75
     found = optimistix.least_squares(
         objective,
-        _LevenbergMarquardt(tolerance, tolerance),
+        _LevenbergMarquardt(tolerance, tolerance),  # pyright: ignore[reportCallIssue]
         jnp.zeros(start.shape),  # of JAX's default precision, as the solver's own numbers are
         options={"jac": "fwd"},
         max_steps=max_steps,
         throw=False,
     )
     theta = theta_at(found.value)
-    reached = _mse(residuals(theta))
+    reached = mse(residuals(theta))
     finite = jnp.isfinite(reached)
     return LeastSquaresFit(
         field=unravel(jnp.where(finite, theta, start)),
-        mse=jnp.where(finite, reached, _mse(at_start)),
+        mse=jnp.where(finite, reached, mse(at_start)),
         steps=jnp.asarray(found.stats["num_steps"], jnp.int32),
         converged=(found.result == optimistix.RESULTS.successful) & finite,
     )
 
 
-def ravel_parameters(
-    field: AbstractVectorField,
-) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], AbstractVectorField]]:
-    """θ_p as a vector, in the order of the physics' leaves, and the field as a function of it.
-
-    Raises:
-        ValueError: the physics has no trainable parameter.
-    """
+def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:
+    """θ_p as a vector, in the order of the physics' leaves, and the field as a function of it; ValueError if none."""
     physics = physics_of(field)
     learned, rest = eqx.partition(physics, trainable(physics))
     theta, unravel = ravel_pytree(learned)
@@ -155,10 +136,6 @@ def prediction_errors(
     """(x_t − x̂_t) / scale of one window, x̂ in inference mode."""
     errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, solver)
     return errors if scale is None else (errors / scale).astype(errors.dtype)
-
-
-def _mse(residuals: Float[Array, "n t d"]) -> Float[Array, ""]:
-    return jnp.mean(jnp.sum(jnp.square(residuals), axis=-1))
 
 
 def _nonzero(size: Float[Array, "*p"]) -> Float[Array, "*p"]:

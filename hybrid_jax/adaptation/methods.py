@@ -11,8 +11,8 @@ import numpy as np
 from jaxtyping import Array, Int, PyTree
 
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.disturbance_selection import select_disturbance
 from hybrid_jax.adaptation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
+from hybrid_jax.adaptation.uncertainty import select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.training.channels import ChannelLoss
@@ -46,9 +46,9 @@ class Method(Protocol):
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field to the windows `train`; `validation` is for early stopping and choices.
+        """Adapt a field to `train`; `validation` is for early stopping and choices. ValueError: what it cannot use.
 
-        Methods of the library compile and map over stacked fields. ValueError: a field or windows that it cannot use.
+        Methods of the library compile and map over stacked fields.
         """
         ...
 
@@ -96,20 +96,19 @@ class FineTune:
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         if self.frozen and not isinstance(field, Hybrid):
             raise ValueError(f"field must be a Hybrid where its {self.frozen} is frozen, got {type(field).__name__}")
-        marked = replace(field, **{self.frozen: Frozen(getattr(field, self.frozen))}) if self.frozen else field
+        kept = {self.frozen: getattr(field, self.frozen)} if self.frozen else {}
+        marked = replace(field, **{name: Frozen(part) for name, part in kept.items()})
         if not any(jax.tree.leaves(trainable(marked))):
             raise ValueError(f"field: {type(field).__name__} has nothing to train")
-        n, rates = len(train), self.rates
-        if rates is None:
-            rates = Hybrid(1e-2, 1e-3) if isinstance(field, Hybrid) else 1e-3  # pyright: ignore[reportArgumentType]
+        usual = Hybrid(1e-2, 1e-3) if isinstance(field, Hybrid) else 1e-3  # pyright: ignore[reportArgumentType]
+        rates, n = usual if self.rates is None else self.rates, len(train)
         rule = self.min_epochs, self.patience, self.max_epochs, self.regulariser_weight
         config = make_run_config(rates, jnp.arange(n), n, *rule)
         settings = replace(settings, batch_size=min(settings.batch_size, n))
         data, held_out = (settings.objective.prepare(windows, "windows") for windows in (train, validation))
         state = start(marked, jax.random.key(self.seed))
-        state = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs)
-        best = replace(state.best, **{self.frozen: getattr(field, self.frozen)}) if self.frozen else state.best
-        return Solution(best, state.epoch, state.status)
+        state, _ = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs)
+        return Solution(replace(state.best, **kept), state.epoch, state.status)
 
 
 @dataclass(frozen=True)
@@ -120,7 +119,8 @@ class Ridge:
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        return Solution(_fit_ridge(self.update, field, train, validation, self.penalties, settings).field)
+        fit = eqx.filter_jit(ridge.fit_ridge)
+        return Solution(fit(self.update, field, train, validation, self.penalties, settings).field)
 
 
 @dataclass(frozen=True)
@@ -155,6 +155,3 @@ def scale_of(objective: Objective, d: int) -> Scale:
     for channel in objective.channels:
         scale[channel.start : channel.stop] = channel.scale
     return jnp.asarray(scale, float)
-
-
-_fit_ridge = eqx.filter_jit(ridge.fit_ridge)

@@ -1,8 +1,7 @@
 """Adaptation in closed form: a linear correction of a pre-trained field by ridge regression.
 
-The error of a field over a recorded interval gives its defect, the mean derivative that it lacks. It is regressed on
-the hidden units of the source's network in `last_layer` (O'Connell et al. 2022, Neural-Fly, where an adaptive law does
-it in flight), on state and input in `linear_residual`.
+A field's defect is the mean derivative that it lacks over an interval. It is regressed on the hidden units of its
+network (`last_layer`; O'Connell et al. 2022, Neural-Fly, where an adaptive law does it in flight), or on x and u.
 """
 
 from collections.abc import Callable
@@ -38,13 +37,10 @@ class RidgeFit(NamedTuple):
 def last_layer(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> AbstractVectorField:
-    """The field with the output layer of its network changed by ΔW, Δb.
+    """A `ResidualNetwork`, or a `Hybrid` whose residual is one, with its output layer changed by ΔW, Δb.
 
     They minimise Σ ‖e − (ΔW φ̄ + Δb)‖² + penalty ‖(ΔW, Δb)‖² over all intervals, with e the field's defect and φ̄ the
     mean of the hidden units, in inference mode, at the two ends of the interval.
-
-    Args:
-        field: a `ResidualNetwork`, or a `Hybrid` whose residual is one.
 
     Raises:
         ValueError: another field, malformed windows, or a penalty that is not positive.
@@ -52,8 +48,6 @@ def last_layer(
     network = field.residual if isinstance(field, Hybrid) else field
     if not isinstance(network, ResidualNetwork):
         raise ValueError(f"last_layer needs a field whose residual is a ResidualNetwork, got {type(network).__name__}")
-    check(windows, "windows")
-    checks.positive("penalty", penalty)
     before, u, after = transitions(windows)
     activations = jax.vmap(network.activations)
     middle = (activations(before, u) + activations(after, u)) / 2
@@ -67,15 +61,7 @@ def last_layer(
 def linear_residual(
     field: AbstractVectorField, windows: Trajectories, penalty: Penalty, solver: Solver = None
 ) -> Hybrid:
-    """The field plus a linear map of [x, u], regressed on the defects as in `last_layer`.
-
-    The penalty is on the map of the standardised [x, u], so that units do not matter.
-
-    Raises:
-        ValueError: malformed windows, or a penalty that is not positive.
-    """
-    check(windows, "windows")
-    checks.positive("penalty", penalty)
+    """The field plus a linear map of the standardised [x, u], regressed on the defects; raises as `last_layer`."""
     before, u, after = transitions(windows)
     z = jnp.concatenate([(before + after) / 2, u], axis=1)
     mean, scale = mean_and_scale(z)
@@ -91,11 +77,7 @@ def fit_ridge(
     penalties: tuple[float, ...] = PENALTIES,
     settings: Settings | None = None,
 ) -> RidgeFit:
-    """The updated field at the penalty with the least validation loss; pure: it compiles and maps.
-
-    Raises:
-        ValueError: malformed windows, or penalties that are not positive numbers.
-    """
+    """The updated field at the penalty with the least validation loss; pure: it compiles and maps."""
     check(train, "train")
     check(validation, "validation")
     if not penalties:
@@ -112,7 +94,8 @@ def fit_ridge(
 
 
 def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array, "s m"], Float[Array, "s d"]]:
-    """The state before, the input held and the state after, of all intervals of all windows."""
+    """The state before, the input held and the state after, of all intervals of all windows, which are checked."""
+    check(windows, "windows")
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
     return before.reshape(-1, x.shape[2]), u.reshape(-1, u.shape[2]), x.reshape(-1, x.shape[2])
@@ -122,7 +105,7 @@ def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = 
     """e, the derivative that the field lacks in each interval, mean of its two ends, to second order in dt.
 
     With Φ one solver step, (x₁ − Φ(x₀)) / dt is off by ½ dt ∂f/∂x e, as a missing acceleration also changes the
-    position. The same step backwards from x₁ is off by the opposite amount, and the mean of the two has no such error.
+    position; the same step backwards from x₁ is off by the opposite amount.
     """
     (before, u, after), dt = transitions(windows), windows.dt
     before, u, solver = checked(field, before, u[:, None], dt, solver, windows=True)
@@ -137,22 +120,18 @@ def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = 
 def mean_and_scale(z: Float[Array, "s n"]) -> tuple[Float[Array, " n"], Float[Array, " n"]]:
     """The mean and scale of each channel: its standard deviation, or 1e-3 of its mean if that is more, or 1."""
     mean, spread = jnp.mean(z, axis=0), jnp.std(z, axis=0)
-    # The spread of a constant channel is round-off; divided by it, the channel would become a feature.
-    floor = 1e-3 * jnp.abs(mean)
+    floor = 1e-3 * jnp.abs(mean)  # the spread of a constant channel is round-off, which must not become a feature
     return mean, jnp.where(spread + floor > 0, jnp.maximum(spread, floor), 1.0)
 
 
 def ridge(
     z: Float[Array, "s n"], y: Float[Array, "s d"], penalty: Penalty
 ) -> tuple[Float[Array, "d n"], Float[Array, " d"]]:
-    """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖², for a positive penalty.
-
-    One singular value decomposition of [z, 1] serves every penalty. The normal equations would square its condition
-    number, about 1e4 for hidden units, beyond float32.
-    """
+    """W, b that minimise Σ ‖y − (W z + b)‖² + penalty ‖(W, b)‖²."""
+    checks.positive("penalty", penalty)
+    # The normal equations would square the design's condition number, about 1e4 for hidden units, beyond float32.
     design = jnp.concatenate([z, jnp.ones((len(z), 1), z.dtype)], axis=1)
     with jax.default_matmul_precision("highest"):  # a GPU's default rounds factors to 10 bits
         left, sizes, right = jnp.linalg.svd(design, full_matrices=False)
-        shrunk = (sizes / (jnp.square(sizes) + penalty))[:, None] * (left.T @ y)
-        solution = right.T @ shrunk
+        solution = right.T @ ((sizes / (jnp.square(sizes) + penalty))[:, None] * (left.T @ y))
     return solution[:-1].T, solution[-1]

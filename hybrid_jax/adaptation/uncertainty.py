@@ -1,9 +1,8 @@
-"""Covariance and confidence intervals of the physical parameters θ_p, from the Gauss–Newton matrix of L_MSE.
+"""How well windows determine θ_p, from the normal equations of L_MSE: covariance, intervals, a disturbance or none.
 
-θ̂_p minimises Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p of all states of one window. The covariance
-is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are too narrow. It
-contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an amount that no
-interval shows; `experiments/coverage.py` measures both.
+The covariance is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are
+too narrow. It contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an
+amount that no interval shows; `experiments/coverage.py` measures both.
 """
 
 from collections.abc import Callable
@@ -13,13 +12,19 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import least_squares
-from hybrid_jax.adaptation.least_squares import Scale, Solver, prediction_errors, ravel_parameters
+from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of
+from hybrid_jax.dynamics.disturbance import (
+    disturbance_of,
+    physics_of,
+    with_disturbance,
+    with_physics,
+    without_disturbance,
+)
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
 from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
@@ -28,8 +33,6 @@ Kind = Literal["sandwich", "homoscedastic"]
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 CHUNK = 250  # windows in memory at a time
-
-_quantile = jax.jit(jax.scipy.special.ndtri)
 
 
 class Interval(NamedTuple):
@@ -63,23 +66,22 @@ def covariance_of(
     over stacked fields. It is not finite where the windows do not determine the parameters.
 
     Args:
-        field: at, or near, the minimum over θ_p.
+        field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
         kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
             sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
             within one may be correlated and of any unit (Huber 1967; White 1980; for clusters Liang and Zeger 1986; the
-            factor is MacKinnon and White's HC1, 1985). For another loss than the square, its slope and curvature enter
-            M and H (Huber 1967). homoscedastic is σ² H⁻¹, valid if all errors are white noise of one variance.
+            factor is MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
         chunk: windows that are held in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
+            The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
 
     Raises:
-        ValueError: no more windows than parameters, an unknown kind, the homoscedastic one of another loss than the
-            square, or windows that are malformed.
+        ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
     """
     least_squares.check_windows(field, windows)
-    checks.count("chunk", chunk)
     least_squares.check_determined(field, len(windows))
+    checks.count("chunk", chunk)
     if kind not in Kind.__args__:
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
     if error is not None and kind == "homoscedastic":
@@ -108,7 +110,7 @@ def normal_equations(
 
     def one(window: Trajectories) -> NormalEquations:
         def errors(theta):
-            r = prediction_errors(unravel(theta), window, solver, scale)
+            r = least_squares.prediction_errors(unravel(theta), window, solver, scale)
             return r, r
 
         jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
@@ -129,19 +131,17 @@ def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level
     that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
 
     Raises:
-        ValueError: a level that is not between 0 and 1; a covariance of another number of parameters or, where it is
-            known, one that is not finite or has a negative variance.
+        ValueError: a level not between 0 and 1, or a covariance of another shape, not finite or of negative variance.
     """
     check_level(level)
-    physics = physics_of(field)
-    theta, unravel = ravel_parameters(physics)
-    array, p = checks.real_array("covariance", covariance), theta.size
+    theta, unravel = ravel_parameters(physics := physics_of(field))
+    array, p = checks.floating("covariance", covariance), theta.size
     if array.shape != (p, p):
         raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
-    variances = jnp.diagonal(checks.floating("covariance", array))
+    variances = jnp.diagonal(array)
     if not checks.is_traced(variances) and (variances < 0).any():
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    away = _quantile((1 + level) / 2) * jnp.sqrt(variances)
+    away = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2) * jnp.sqrt(variances)
     left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
     return {
         name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
@@ -172,8 +172,7 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
         return found | {f"disturbance[{label}]": value for label, value in zip(labels, values, strict=True)}
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(physics, trainable(physics)))
     values = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
-    theta = getattr(type(physics), "theta", None)
-    if theta is not None:
+    if (theta := getattr(type(physics), "theta", None)) is not None:
         values = theta(physics)
     return {
         f"{name}[{','.join(map(str, at))}]" if at else name: value[at]
@@ -187,3 +186,61 @@ def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     scale = jnp.sqrt(jnp.diagonal(matrix))
     scales = scale[:, None] * scale
     return jnp.linalg.inv(matrix / scales) / scales
+
+
+class DisturbanceSelection(eqx.Module):
+    """The fit that was kept, with a disturbance of zero if none is needed, and why."""
+
+    fit: LeastSquaresFit
+    needed: Bool[Array, ""]
+    gain: Float[Array, ""]  # by how much a disturbance lowers L_MSE of left-out windows, mean over windows
+    standard_error: Float[Array, ""]  # of the gain
+
+
+def select_disturbance(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    solver: Solver = None,
+    max_steps: int = 100,
+    scale: Scale = None,
+    indices: tuple[int, ...] | None = None,
+) -> DisturbanceSelection:
+    """Fit θ_p with and without a constant disturbance and keep the fit that predicts left-out windows better.
+
+    More parameters always fit the same windows better, if only the errors of a network. So each window is predicted by
+    a fit to all others (leave-one-out cross-validation; Stone 1974), and the simpler model is kept unless it is worse
+    by more than one standard error of the difference (Breiman, Friedman, Olshen and Stone, Classification and
+    Regression Trees, 1984, Sec. 3.4.3). A single window, or windows that do not determine θ_p, need no disturbance.
+
+    Pure; raises and arguments as of `fit_least_squares`, but `windows` must be independent. `indices` are the disturbed
+    states, see `with_disturbance`.
+    """
+    starts = with_disturbance(field, indices), without_disturbance(field)
+    fits = [fit_least_squares(start, windows, solver, max_steps, scale) for start in starts]
+    equations = [normal_equations(fit.field, windows, solver, CHUNK, None, scale) for fit in fits]
+    return _selection(fits, equations, windows.horizon)
+
+
+@eqx.filter_jit
+def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
+    disturbed, plain = fits
+    gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)
+    gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))
+    needed = gain > error  # False where one of them is not finite
+    zero = jax.tree.map(jnp.zeros_like, disturbance_of(disturbed.field))
+    padded = with_physics(plain.field, Hybrid(physics_of(plain.field), zero))
+    plain = eqx.tree_at(lambda fit: fit.field, plain, padded)
+    kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
+    return DisturbanceSelection(kept, needed, gain, error)
+
+
+def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
+    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they do not determine θ_p.
+
+    Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
+    """
+    gram, score, square = equations
+    inverses = jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram)
+    steps = -jnp.einsum("npq,nq->np", inverses, jnp.sum(score, axis=0) - score)
+    bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
+    return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

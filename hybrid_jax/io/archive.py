@@ -3,7 +3,6 @@
 import hashlib
 import io
 import json
-import math
 import zipfile
 from collections.abc import Mapping
 from pathlib import Path, PurePosixPath
@@ -26,17 +25,11 @@ Arrays = Mapping[str, np.ndarray]
 
 
 def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> None:
-    """Write an archive atomically. `form` is its kind and version, such as "hybrid_jax model 2".
-
-    Raises:
-        ValueError: the metadata are not JSON, or an array is not numeric.
-        OSError: the file cannot be written.
-    """
+    """Write an archive of a form such as "hybrid_jax model 2" atomically; ValueError if a part cannot be saved."""
     for name, array in arrays.items():
         if array.dtype.newbyteorder("=") not in NUMERIC:
             raise ValueError(f"array {name!r} has type {array.dtype}, which cannot be saved")
-    header = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}
-    buffer = io.BytesIO()
+    header, buffer = {"format": form, "sha256": digest(metadata, arrays), "metadata": metadata}, io.BytesIO()
     # An .npz is a zip of .npy; entries made by hand carry no clock, so equal content gives equal bytes.
     with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
         archive.writestr(zipfile.ZipInfo(HEADER), encode(header))
@@ -47,11 +40,7 @@ def save_archive(path: str | Path, form: str, metadata: Any, arrays: Arrays) -> 
 
 
 def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarray]]:
-    """The metadata and the arrays by name of an archive of one of these forms, after checks.
-
-    Raises:
-        ValueError: the file is missing, truncated, damaged or of another form; one line that names the file.
-    """
+    """The metadata and arrays of an archive of one of these forms; ValueError of one line if a check fails."""
     path = Path(path)
     try:
         entries = _read_entries(path)
@@ -62,7 +51,7 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
         found = digest(header.get("metadata"), arrays)
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
-    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError) as error:
+    except (zipfile.BadZipFile, EOFError, OSError, ValueError, RuntimeError, OverflowError, MemoryError) as error:
         kind = forms[0].rpartition(" ")[0]
         raise ValueError(f"{path}: truncated, damaged or not a {kind}: {first_line(error)}") from error
     if header.get("sha256") != found:
@@ -71,11 +60,7 @@ def load_archive(path: str | Path, *forms: str) -> tuple[Any, dict[str, np.ndarr
 
 
 def digest(metadata: Any, arrays: Arrays) -> str:
-    """SHA-256 (hex) of metadata and arrays. The order of keys and names does not matter.
-
-    Raises:
-        ValueError: the metadata are not JSON.
-    """
+    """SHA-256 (hex) of metadata, as strict JSON, and arrays. The order of keys and names does not matter."""
     found = hashlib.sha256(encode(metadata, sort_keys=True, separators=(",", ":")))
     for name in sorted(arrays):
         array = np.asarray(arrays[name], order="C")  # np.ascontiguousarray would make a vector of a scalar
@@ -85,11 +70,7 @@ def digest(metadata: Any, arrays: Arrays) -> str:
 
 
 def encode(value: Any, **layout: Any) -> bytes:
-    """Encode a value as strict JSON.
-
-    Raises:
-        ValueError: the value has no JSON form.
-    """
+    """Encode a value as strict JSON; ValueError if it has no such form."""
     try:
         return json.dumps(value, allow_nan=False, **layout).encode()
     except (TypeError, ValueError, RecursionError) as error:
@@ -97,13 +78,9 @@ def encode(value: Any, **layout: Any) -> bytes:
 
 
 def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
-    """The arrays of a tree as NumPy arrays, by path.
-
-    Raises:
-        ValueError: two arrays have the same path.
-    """
+    """The arrays of a tree as NumPy arrays, by path; ValueError if two have the same path."""
     named = {}
-    for keys, leaf in jax.tree_util.tree_flatten_with_path(eqx.filter(tree, eqx.is_array))[0]:
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(tree, eqx.is_array)):
         path = jax.tree_util.keystr(keys, simple=True, separator="/")
         if path in named:
             raise ValueError(f"two arrays have the path {path!r}: no key of a dictionary may contain '/'")
@@ -112,21 +89,14 @@ def named_leaves(tree: PyTree) -> dict[str, np.ndarray]:
 
 
 def with_leaves(like: PyTree, arrays: Arrays, origin: str | Path | None = None) -> PyTree:
-    """The tree `like` with each array replaced by that of the same path.
-
-    Raises:
-        ValueError: paths, shapes or types differ; names `origin` and the first difference.
-    """
-
-    def form(array: np.ndarray | None, absent: str) -> str:
-        return absent if array is None else f"{array.dtype}{list(array.shape)}"
-
+    """`like` with each array replaced by that of its path; ValueError of `origin` and the first that does not fit."""
     expected = named_leaves(like)
+    found, wanted = ({name: f"{a.dtype}{list(a.shape)}" for name, a in side.items()} for side in (arrays, expected))
     for name in sorted(expected.keys() | arrays.keys()):
-        found, wanted = form(arrays.get(name), "absent"), form(expected.get(name), "none")
-        if found != wanted:
+        if found.get(name) != wanted.get(name):
             where = "" if origin is None else f"{origin}: "
-            raise ValueError(f"{where}array {name!r} is {found}, expected {wanted}")
+            said = f"is {found.get(name, 'absent')}, expected {wanted.get(name, 'none')}"
+            raise ValueError(f"{where}array {name!r} {said}")
     dynamic, rest = eqx.partition(like, eqx.is_array)
     leaves, structure = jax.tree.flatten(dynamic)
     filled = [from_numpy(arrays[path], array_type(leaf)) for path, leaf in zip(expected, leaves, strict=True)]
@@ -165,18 +135,12 @@ def _read_entries(path: Path) -> dict[str, bytes]:
                 raise ValueError(f"entry {entry.filename!r} is compressed")
         if sum(entry.file_size for entry in archive.infolist()) > path.stat().st_size:
             raise ValueError("its entries declare more than the file holds")
-        # Reading an entry whole verifies its CRC.
-        return {name: archive.read(name) for name in archive.namelist()}
+        return {name: archive.read(name) for name in archive.namelist()}  # which verifies the CRC of each
 
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:
-    """The array in a .npy whose header agrees with its size."""
-    file = io.BytesIO(entry)
-    if np.lib.format.read_magic(file) != (1, 0):
-        raise ValueError(f"entry {name!r} is a .npy of an unknown version")
-    shape, in_fortran_order, dtype = np.lib.format.read_array_header_1_0(file)
-    declared = math.prod(shape) * dtype.itemsize if min(shape, default=0) >= 0 else None
-    if dtype.newbyteorder("=") not in NUMERIC or declared != len(entry) - file.tell():
-        raise ValueError(f"entry {name!r} is not numeric, or its size is not that of {dtype}{list(shape)}")
-    order = "F" if in_fortran_order else "C"
-    return np.ndarray(shape, dtype, entry, file.tell(), order=order).copy(order)
+    """The numeric array in a .npy."""
+    array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+    if array.dtype.newbyteorder("=") not in NUMERIC:
+        raise ValueError(f"entry {name!r} is not numeric")
+    return array

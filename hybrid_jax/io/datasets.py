@@ -8,6 +8,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import jax
 import numpy as np
 
 from hybrid_jax.checks import first_line
@@ -20,16 +21,11 @@ ARRAYS = ("x0", "u", "x")
 
 @dataclass(frozen=True)
 class Dataset:
-    """Windows by the name of their split.
-
-    Attributes:
-        metadata: JSON values. `config` determines the windows; the rest (versions, counts, …) describes them.
-        origin: the file it was read from, for messages.
-    """
+    """Windows by the name of their split."""
 
     splits: Mapping[str, Trajectories]
-    metadata: Mapping[str, Any]
-    origin: str = field(default="dataset", compare=False)
+    metadata: Mapping[str, Any]  # JSON values; `config` determines the windows, the rest (versions, …) describes them
+    origin: str = field(default="dataset", compare=False)  # the file it was read from, for messages
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -37,11 +33,7 @@ class Dataset:
         return self.metadata.get("config", {})
 
     def first(self, split: str, count: int | None = None) -> Trajectories:
-        """The first `count` windows of a split, or all. Larger subsets contain smaller ones.
-
-        Raises:
-            ValueError: there is no such split, or it has fewer windows.
-        """
+        """The first `count` windows of a split, or all; ValueError if there are fewer, or no such split."""
         if split not in self.splits:
             raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
         windows = self.splits[split]
@@ -54,8 +46,8 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
     """Write a dataset atomically. If the file already has these windows and this configuration, it is left unchanged.
 
     Raises:
-        ValueError: windows are malformed, windows of a vehicle have no unit quaternions, metadata are not JSON, or the
-            file exists with other content and `overwrite` is false.
+        ValueError: malformed windows, windows of a vehicle without unit quaternions, metadata that are not JSON, or a
+            file that exists with other content while `overwrite` is false.
         OSError: the file cannot be written.
     """
     path = Path(path)
@@ -66,15 +58,12 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
             if content_hash(load_dataset(path)) == content:
                 return
         raise ValueError(f"{path}: exists with other content; choose another path or pass overwrite=True")
-    header = {"about": dataset.metadata, "splits": _split_table(dataset)}
-    save_archive(path, FORMAT, header, _named_arrays(dataset))
+    splits, arrays = _content(dataset)
+    save_archive(path, FORMAT, {"about": dataset.metadata, "splits": splits}, arrays)
 
 
 def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = None) -> Dataset:
-    """Read and verify a dataset.
-
-    Args:
-        expected_config: entries that its configuration must have; it may have others.
+    """Read and verify a dataset, whose configuration must have the entries of `expected_config` and may have others.
 
     Raises:
         ValueError: the file is missing, damaged or not a dataset, or of another configuration; one line that names the
@@ -90,13 +79,10 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
     except (KeyError, TypeError, AttributeError, ValueError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete dataset: lacks {first_line(error)}") from error
     _check_splits(path, dataset)
-    expected = expected_config or {}
+    expected = dict(expected_config or {})
     wanted, found = _flatten(expected), _flatten({key: dataset.config.get(key) for key in expected})
-    differing = [
-        f"{key} is {found.get(key, 'absent')}, expected {wanted.get(key, 'absent')}"
-        for key in sorted(found.keys() | wanted.keys())
-        if found.get(key) != wanted.get(key)
-    ]
+    pairs = {key: (found.get(key, "absent"), wanted.get(key, "absent")) for key in sorted(found.keys() | wanted.keys())}
+    differing = [f"{key} is {ours}, expected {theirs}" for key, (ours, theirs) in pairs.items() if ours != theirs]
     if differing:
         raise ValueError(f"{path}: other configuration: {'; '.join(differing)}")
     return dataset
@@ -104,17 +90,16 @@ def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = N
 
 def content_hash(dataset: Dataset) -> str:
     """SHA-256 (hex) of the configuration and all windows."""
-    return digest([dataset.config, _split_table(dataset)], _named_arrays(dataset))
+    splits, arrays = _content(dataset)
+    return digest([dataset.config, splits], arrays)
 
 
 def versions(*packages: str) -> dict[str, str]:
     """The version of Python and of each package, or "not installed"."""
-    found = {"python": platform.python_version()}
+    found = {"python": platform.python_version()} | dict.fromkeys(packages, "not installed")
     for package in packages:
-        try:
+        with suppress(PackageNotFoundError):
             found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "not installed"
     return found
 
 
@@ -127,19 +112,14 @@ def _check_splits(path: Path | str, dataset: Dataset) -> None:
             check_attitudes(windows, f"{path}: split {name!r}")
 
 
-def _split_table(dataset: Dataset) -> dict[str, Any]:
-    return {name: {"dt": dataset.splits[name].dt} for name in sorted(dataset.splits)}
+def _content(dataset: Dataset) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """What is saved of each split besides its arrays, and these by name."""
+    splits = {name: dataset.splits[name] for name in sorted(dataset.splits)}
+    arrays = {f"{name}/{part}": np.asarray(getattr(splits[name], part)) for name in splits for part in ARRAYS}
+    return {name: {"dt": windows.dt} for name, windows in splits.items()}, arrays
 
 
-def _named_arrays(dataset: Dataset) -> dict[str, np.ndarray]:
-    places = ((name, part) for name in sorted(dataset.splits) for part in ARRAYS)
-    return {f"{name}/{part}": np.asarray(getattr(dataset.splits[name], part)) for name, part in places}
-
-
-def _flatten(config: Mapping[str, Any], prefix: str = "") -> dict[str, str]:
+def _flatten(config: dict[str, Any]) -> dict[str, str]:
     """Nested keys joined by dots → the value as JSON, which does not distinguish tuples from lists."""
-    flat = {}
-    for key, value in config.items():
-        nested = isinstance(value, Mapping)
-        flat |= _flatten(value, f"{prefix}{key}.") if nested else {f"{prefix}{key}": encode(value).decode()}
-    return flat
+    leaves = jax.tree_util.tree_leaves_with_path(config, is_leaf=lambda node: not isinstance(node, dict))
+    return {jax.tree_util.keystr(path, simple=True, separator="."): encode(value).decode() for path, value in leaves}

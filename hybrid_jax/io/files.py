@@ -13,11 +13,7 @@ import numpy as np
 
 
 def write_atomic(path: str | Path, content: str | bytes) -> None:
-    """Write a temporary file beside `path`, then rename it to `path`. Text is written as UTF-8.
-
-    Raises:
-        OSError: the file cannot be written; an earlier file at `path` is unchanged.
-    """
+    """Write a temporary file beside `path`, text as UTF-8, then rename it; OSError leaves an earlier file as it was."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
@@ -27,8 +23,7 @@ def write_atomic(path: str | Path, content: str | bytes) -> None:
             file.flush()
             os.fsync(file.fileno())  # otherwise a power cut could leave an empty file
         os.replace(temporary, path)
-    except OSError as error:
-        # The error of a full disk names no file.
+    except OSError as error:  # that of a full disk names no file
         raise OSError(f"{path}: cannot be saved: {error.strerror}; what was saved before is intact") from error
     finally:
         temporary.unlink(missing_ok=True)
@@ -47,11 +42,7 @@ def json_text(value: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """The JSON form of nested mappings, sequences, arrays, paths and numbers. Non-finite numbers become null.
-
-    Raises:
-        ValueError: a value of another type.
-    """
+    """The JSON form of nested mappings, sequences, arrays, paths and numbers. Non-finite numbers become null."""
     match value:
         case None | bool() | int() | str():
             return value
@@ -69,18 +60,14 @@ def json_value(value: Any) -> Any:
 
 
 def read_json(path: str | Path) -> Any:
-    """Read a JSON file.
+    """Read a JSON file; ValueError of one line if it cannot be read or is not JSON (NaN and Infinity are not)."""
 
-    Raises:
-        ValueError: the file cannot be read or is not JSON (NaN and Infinity are not); one line.
-    """
+    def refuse(constant: str) -> None:
+        raise ValueError(f"{constant} is not JSON")
+
     try:
-        return json.loads(Path(path).read_bytes(), parse_constant=_refuse)
+        return json.loads(Path(path).read_bytes(), parse_constant=refuse)
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path}: truncated or not JSON: {error}") from error
-
-
-def _refuse(constant: str) -> None:
-    raise ValueError(f"{constant} is not JSON")

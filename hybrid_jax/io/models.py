@@ -21,34 +21,22 @@ from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archi
 from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"
-FORMAT_1 = "hybrid_jax model 1"  # still read: see `renamed`
+FORMAT_1 = "hybrid_jax model 1"  # still read: see `_RENAMED` in structure.py
 
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field and what is known about it.
-
-    Attributes:
-        about: JSON values, such as where the model comes from and its test error.
-    """
+    """A vector field and what is known about it."""
 
     field: AbstractVectorField
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values, such as its origin and test error
 
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The states of one window, or of n, under inputs that are held for dt each.
+        """The state of one window, or of n, at the end of each interval, under inputs that are held for dt [s] each.
 
-        To keep the other windows where some diverge, use `rollout_batch`.
-
-        Args:
-            x0: initial states.
-            u: inputs of t intervals.
-            dt: length of an interval [s].
-
-        Returns:
-            The state at the end of each interval; finite.
+        All are finite. To keep the other windows where some diverge, use `rollout_batch`.
 
         Raises:
             ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
@@ -60,7 +48,7 @@ class Model:
         x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
         check_start(self.field, x0)
-        predicted = _predict(self.field, x0, u, dt)
+        predicted = eqx.filter_jit(rollout if x0.ndim == 1 else rollout_batch)(self.field, x0, u, dt)
         diverged = ~np.isfinite(predicted).all(axis=-1)
         if diverged.any():
             *window, interval = np.argwhere(diverged)[0].tolist()
@@ -69,16 +57,10 @@ class Model:
         return predicted
 
 
-@eqx.filter_jit
-def _predict(field, x0, u, dt):
-    return rollout(field, x0, u, dt) if x0.ndim == 1 else rollout_batch(field, x0, u, dt)
-
-
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:
     """Write a model to one file: any Equinox module, and JSON values `about` it.
 
-    If the file alone will not be enough to load the model (see `check_savable`), it is saved with a warning that `load`
-    needs `like`.
+    Warns if `load` will need `like`, as the file alone is not enough to rebuild the model; see `check_savable`.
 
     Raises:
         ValueError: `about` is not JSON, or the field contains an object that is no array, number, text, function,
@@ -93,12 +75,11 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
 
 
 def load(path: str | Path, like: eqx.Module | None = None) -> Model:
-    """Read a model that `save` wrote.
+    """Read a model that `save` wrote. The modules that define its classes must have been imported.
 
     Args:
         like: a field of the same structure, whose arrays are replaced by those of the file. Needed for classes and
-            functions that the file cannot name, such as local classes and lambdas. Without it, the modules that define
-            the model's classes must have been imported.
+            functions that the file cannot name, such as local classes and lambdas.
 
     Raises:
         ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
@@ -108,20 +89,19 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     try:
         about, tree = dict(metadata["about"]), metadata["field"]
         field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)
+        if not isinstance(field, eqx.Module):
+            raise TypeError(f"its field is a {type(field).__name__}")
     except (KeyError, TypeError, AttributeError, RecursionError, OverflowError) as error:
         raise ValueError(f"{path}: not a complete model: {checks.first_line(error)}") from error
     except ValueError as error:
         raise ValueError(f"{path}: {checks.first_line(error)}") from error
-    if isinstance(field, eqx.Module):
-        return Model(cast(AbstractVectorField, field), about)
-    raise ValueError(f"{path}: not a complete model: its field is a {type(field).__name__}")
+    return Model(cast(AbstractVectorField, field), about)
 
 
 def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
     """`like` with the arrays of a file."""
     dynamic = {key: array for key, array in arrays.items() if not key.startswith("static/")}
-    filled = with_leaves({"field": like}, dynamic)["field"]
-    saved = static_values(tree)
+    filled, saved = with_leaves({"field": like}, dynamic)["field"], static_values(tree)
     for key, value in static_values(Structure(like).tree).items():
         if saved.get(key, value) != value:
             raise ValueError(f"{key} is {saved[key]!r}, but {value!r} in `like`")
@@ -129,10 +109,7 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
 
 
 def check_savable(field: Any) -> str | None:
-    """Why `load` could not rebuild this field from a file alone, in one line, or None if it can.
-
-    In most cases `save` still works, and `load` needs `like`.
-    """
+    """Why `load` could not rebuild this field from a file alone, or None if it can. `load` with `like` mostly can."""
     try:
         return Structure(field).problem
     except ValueError as error:
@@ -140,12 +117,7 @@ def check_savable(field: Any) -> str | None:
 
 
 def describe(field: eqx.Module) -> Any:
-    """The structure of a field as JSON values: classes, static values and the paths of its arrays, not their values.
-
-    Raises:
-        ValueError: a part of the field has no name that a file could refer to.
-    """
-    structure = Structure(field)
-    if structure.problem is not None:
+    """The structure of a field as JSON values, without its arrays; ValueError if a part has no name for a file."""
+    if (structure := Structure(field)).problem is not None:
         raise ValueError(structure.problem)
     return structure.tree

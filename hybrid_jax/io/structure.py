@@ -20,9 +20,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from hybrid_jax import dynamics, networks
 from hybrid_jax.checks import short_repr
+from hybrid_jax.dynamics.base import RunningStats
+from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.io.archive import Arrays, array_type, from_numpy
-from hybrid_jax.io.renamed import RENAMED
+from hybrid_jax.networks import views
+from hybrid_jax.networks.fused import FusedNetwork
+from hybrid_jax.vehicle import Vehicle
 
 _ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid
     log_softmax mish relu relu6 selu sigmoid silu soft_sign softmax softplus sparse_plus sparse_sigmoid squareplus
@@ -32,18 +37,31 @@ _ELEMENTWISE = """abs add arccos arccosh arcsin arcsinh arctan arctan2 arctanh c
     power rad2deg real reciprocal round sign sin sinc sinh sqrt square subtract tan tanh where"""
 _TYPES = """bool_ int8 int16 int32 int64 uint8 uint16 uint32 uint64 float16 bfloat16 float32 float64 complex64
     complex128"""
+_KNOWN = {jax.nn: _ACTIVATIONS, jnp: f"{_ELEMENTWISE} {_TYPES}", np: _TYPES, builtins: "bool int float complex"}
 # The functions and types that a file may name.
 _ALLOWED: dict[str, Any] = {
     f"{module.__name__}.{name}": vars(module)[name]
-    for module, names in (
-        *((jax.nn, _ACTIVATIONS), (jnp, _ELEMENTWISE), (jnp, _TYPES), (np, _TYPES)),
-        (builtins, "bool int float complex"),
-    )
+    for module, names in _KNOWN.items()
     for name in names.split()
     if name in vars(module)
 }
 _ALLOWED["equinox.identity"] = inspect.signature(eqx.nn.MLP).parameters["final_activation"].default
 _PORTABLE: dict[str, Any] = {}  # "@name" → class or function
+
+# Format 1 names a class by its bare name; format 2 by "module:qualname". A class that moves or is renamed gets an entry
+# here: the class today, or a function from the saved fields (name → value) to the object.
+_FORMAT_1 = (Kinematics, Vehicle, views.Accelerations, views.BodyFrame, views.BodyMotion, views.Motion)
+_RENAMED: dict[str, type | Callable[[dict[str, Any]], Any]] = {
+    **{name: item for name, item in (vars(dynamics) | vars(networks)).items() if isinstance(item, type)},
+    **{item.__name__: item for item in _FORMAT_1},
+    "ConstantDisturbance": lambda fields: dynamics.ConstantDisturbance(fields["acceleration"]),
+    "DeployedNetwork": FusedNetwork,
+    "LinearPath": networks.LinearSkip,
+    "NearGround": views.GroundDistance,
+    "Placeless": views.DropXY,
+    "Statistics": RunningStats,
+    "TiltOnly": views.DropXYYaw,
+}
 # Keys of JSON objects: names of things, and content.
 _NAMES = {"class", "kind", "named", "unknown", "array", "static", "key", "dtype"}
 _CONTENT = {"fields", "items", "tuple", "list", "float", "complex"}
@@ -55,13 +73,10 @@ def portable(item: Item, *, name: str | None = None) -> Item: ...
 @overload
 def portable(item: None = None, *, name: str | None = None) -> Callable[[Item], Item]: ...
 def portable(item: Any = None, *, name: str | None = None) -> Any:
-    """Decorator: saved models refer to this class or function by a name that does not depend on its module.
+    """Decorator: saved models refer to this class or function by `name`, by default its own, and not by its module.
 
     An Equinox module needs no decorator unless it may move to another module. A function that a field holds, or a
     dataclass that is no Equinox module, needs it to be loaded without `like`.
-
-    Args:
-        name: stored in files; the item's own name by default.
 
     Raises:
         ValueError: another class or function already has the name.
@@ -81,22 +96,13 @@ def _address(item: Any) -> str:
 
 
 class Structure:
-    """The structure of a field.
-
-    Attributes:
-        tree: JSON values.
-        static_arrays: arrays in static fields, by path; the others are leaves of the field.
-        problem: why `decode` cannot rebuild the field, or None.
-
-    Raises:
-        ValueError: no Equinox module, or one with an object that cannot be saved; names its path.
-    """
+    """The structure of a field, JSON values in `tree`; ValueError, with its path, if a part cannot be saved."""
 
     def __init__(self, field: eqx.Module):
         if not isinstance(field, eqx.Module):
             raise ValueError(f"field must be an Equinox module, got {short_repr(field)}")
-        self.static_arrays: dict[str, Any] = {}
-        self.problem: str | None = None
+        self.static_arrays: dict[str, Any] = {}  # arrays in static fields, by path; the others are leaves of the field
+        self.problem: str | None = None  # why `decode` cannot rebuild the field
         try:
             self.tree = self._encode(field, "field", static=False)
         except RecursionError as error:
@@ -113,25 +119,24 @@ class Structure:
         if kind is dict and all(type(key) in (str, int) for key in value):
             return {"items": [[key, self._encode(item, f"{path}/{key}", static)] for key, item in value.items()]}
         if eqx.is_array(value):
-            tag, place = ("static", f"static/{path}") if static else ("array", path)
             if static:
-                self.static_arrays[place] = value
-            return {tag: place, **array_type(value)}
+                self.static_arrays[path := f"static/{path}"] = value
+            return {"static" if static else "array": path, **array_type(value)}
         if isinstance(value, np.dtype):
             return {"dtype": value.name}
         if (name := _name_of(value)) is not None:
             return {"named": name}
         if is_dataclass(value) and not isinstance(value, type):
             return self._encode_fields(value, path, static)
-        return self._unknown(value, path, static)
+        return self._encode_unknown(value, path, static)
 
     def _encode_fields(self, value: Any, path: str, static: bool) -> Any:
         name = _name_of(type(value)) or _address(type(value))
         try:
             if find_class(name) is not type(value):
-                self._note(f"{path} is of a class that {name} no longer refers to")
+                self.problem = self.problem or f"{path} is of a class that {name} no longer refers to"
         except ValueError as error:
-            self._note(f"{path}: {str(error).partition(';')[0]}")  # without the remedy
+            self.problem = self.problem or f"{path}: {str(error).partition(';')[0]}"  # without the remedy
         static |= not isinstance(value, eqx.Module)
         parts = {
             f.name: self._encode(getattr(value, f.name), f"{path}/{f.name}", static or f.metadata.get("static", False))
@@ -139,18 +144,15 @@ class Structure:
         }
         return {"class": name, "fields": parts}
 
-    def _unknown(self, value: Any, path: str, static: bool) -> Any:
+    def _encode_unknown(self, value: Any, path: str, static: bool) -> Any:
         name = _address(type(value))
         if callable(value):
             name = f"the callable {getattr(value, '__qualname__', name)}, which is not `hybrid_jax.portable`"
         elif not static and jax.tree_util.all_leaves([value]):
-            expected = "an array, number, text, function, container or module"
-            raise ValueError(f"{path} is of type {name}, which cannot be saved; expected {expected}")
-        self._note(reason := f"{path} is {name}")
-        return {"unknown": reason}
-
-    def _note(self, problem: str) -> None:
-        self.problem = self.problem or problem
+            what = f"{path} is of type {name}, which cannot be saved"
+            raise ValueError(f"{what}; expected an array, number, text, function, container or module")
+        self.problem = self.problem or f"{path} is {name}"
+        return {"unknown": f"{path} is {name}"}
 
 
 def decode(value: Any, arrays: Arrays) -> Any:
@@ -191,32 +193,24 @@ def decode(value: Any, arrays: Arrays) -> Any:
     raise ValueError("an entry of its structure is malformed")
 
 
-def static_values(tree: Any, path: str = "field") -> dict[str, Any]:
+def static_values(tree: Any) -> dict[str, Any]:
     """The numbers, text and None in a structure, by path."""
-    match tree:
-        case dict():
-            pairs = [(key, item) for key, item in tree.items() if key not in _NAMES]
-            parts = [(path if key in _CONTENT else f"{path}/{key}", item) for key, item in pairs]
-        case list():
-            parts = [(f"{path}/{index}", item) for index, item in enumerate(tree)]
-        case _:
-            return {path: tree}
-    return {key: value for place, item in parts for key, value in static_values(item, place).items()}
+    found = {}
+    for keys, leaf in jax.tree_util.tree_leaves_with_path(tree, is_leaf=lambda node: node is None):
+        path = jax.tree_util.keystr(keys, simple=True, separator="/").split("/")
+        if not _NAMES & set(path):
+            found["/".join(["field", *(part for part in path if part not in _CONTENT)])] = leaf
+    return found
 
 
 def find_class(name: str) -> type:
-    """The class "module:qualname" of a module that is already imported, or the portable class "@name".
-
-    Raises:
-        ValueError: there is none, or it is no Equinox module.
-    """
+    """The class "module:qualname" of an imported module, or the portable one "@name"; ValueError if it is no module."""
     module, _, qualname = name.partition(":")
     found: Any = _PORTABLE.get(name, sys.modules.get(module))
     if found is None:
-        what = f"the module that makes {name[1:]} portable" if name.startswith("@") else module
-        raise ValueError(f"class {name} is not known here; import {what} first, or pass like=")
-    for part in qualname.split(".") if qualname else ():
-        # Not getattr: a module's or class's own __getattr__ could run code.
+        needed = f"the module that makes {name[1:]} portable" if name.startswith("@") else module
+        raise ValueError(f"class {name} is not known here; import {needed} first, or pass like=")
+    for part in qualname.split(".") if qualname else ():  # not getattr: a class's own __getattr__ could run code
         found = vars(found).get(part) if isinstance(found, type | ModuleType) else None
     trusted = name in _PORTABLE or module.startswith("hybrid_jax.")  # such as Vehicle, a frozen dataclass
     if not isinstance(found, type) or not (issubclass(found, eqx.Module) or (trusted and is_dataclass(found))):
@@ -227,23 +221,19 @@ def find_class(name: str) -> type:
 
 
 def _rebuild(name: str, parts: dict[str, Any]) -> Any:
-    """An object with these fields, made without its `__init__`.
-
-    The checks of this library's own classes (`__check_init__`, `__post_init__`) run, so that a damaged or forged file
-    gives no vehicle of negative mass. Those of other classes do not.
-    """
+    """An object with these fields, made without its `__init__`; but the checks of this library's own classes run."""
     in_format_1 = ":" not in name and not name.startswith("@")
-    cls: Any = RENAMED.get(name) or find_class(f"@{name}" if in_format_1 else name)
+    cls: Any = _RENAMED.get(name) or find_class(f"@{name}" if in_format_1 else name)
     if not isinstance(cls, type):
         return cls(parts)
     made, known = object.__new__(cls), dataclasses.fields(cls)
     values = {f.name: f.default for f in known if f.default is not dataclasses.MISSING} | parts
     if values.keys() != {f.name for f in known}:
-        wanted = ", ".join(f.name for f in known)
-        raise ValueError(f"class {name} has fields {wanted}, but the file has {', '.join(parts) or 'none'}")
+        wanted, given = ", ".join(f.name for f in known), ", ".join(parts) or "none"
+        raise ValueError(f"class {name} has fields {wanted}, but the file has {given}")
     for key, value in values.items():
         object.__setattr__(made, key, value)
-    for base in reversed(cls.__mro__):
+    for base in reversed(cls.__mro__):  # a damaged or forged file must give no vehicle of negative mass
         for check in ("__post_init__", "__check_init__"):
             if base.__module__.startswith("hybrid_jax.") and check in vars(base):
                 vars(base)[check](made)

@@ -1,8 +1,8 @@
-"""Multi-process utilities: initialisation, gathering results on every process, and detection of lost peers.
+"""Several processes: initialisation, gathering results on every process, and detection of lost peers.
 
-All processes run the same program on the same data and call these functions in the same order. Training runs never
-communicate (see lanes.py): only results, and what process 0 decides or reads, travel between processes. Every function
-that communicates raises PeerLost when another process has ended.
+All processes run the same program on the same data and call these functions in the same order. Only results, and what
+process 0 decides or reads, travel between them. Every function that communicates raises PeerLost when another process
+has ended.
 """
 
 import contextlib
@@ -27,11 +27,9 @@ class PeerLost(ConnectionError):
 
 
 def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
-    """Join a multi-process run. Call it before the first array is made.
+    """Join a multi-process run, whose process 0 is at `coordinator`, host:port. Call it before the first array is made.
 
-    Args:
-        coordinator: host:port of process 0. Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open
-            MPI, Kubernetes, Cloud TPU).
+    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU).
 
     Raises:
         ValueError: an argument is missing or inconsistent, or the processes differ in their number of devices.
@@ -47,8 +45,7 @@ def initialize(coordinator: str | None = None, processes: int | None = None, pro
     if len(set(devices.tolist())) > 1:
         raise ValueError(f"all processes must have the same number of devices, got {devices.tolist()}")
     if jax.default_backend() == "cpu":
-        # Open connections report a lost peer at once. The coordination service would abort this process instead,
-        # before its results are saved.
+        # Open connections report a lost peer. The coordination service would abort this process before it can save.
         jax.distributed.shutdown()
 
 

@@ -1,7 +1,6 @@
 """Map one function over many independent lanes: chunks of lanes under `vmap`, chunks in a loop, loops on all devices.
 
-A lane is a slice of a pytree along its first axis. On a CPU a chunk of one lane is fastest, because one lane fills the
-cache; on a GPU a chunk holds all lanes of a device. Which lanes are active is data, not shape: one compilation serves a
+A lane is a slice of a pytree along its first axis. Which lanes are active is data, not shape: one compilation serves a
 sweep to its end. In a multi-process run (see hosts.py) each process feeds its own devices, and all get all results.
 """
 
@@ -21,7 +20,7 @@ from hybrid_jax.sweep import hosts
 
 Numbers = Sequence[Any] | np.ndarray
 AXIS = "lanes"
-WIDTH = {"cpu": 1}  # measured by benchmarks/sweep.py; on other backends a chunk holds all lanes of a device
+WIDTH = {"cpu": 1}  # one lane fills the cache (benchmarks/sweep.py); on a GPU a chunk holds all lanes of a device
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
@@ -30,8 +29,7 @@ def stack(lanes: Sequence[PyTree]) -> PyTree:
 
 
 def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
-    """The lane, or lanes, at an index of the first axis."""
-    # asarray: an entry of a NumPy vector is a scalar, not an array.
+    """The lane, or lanes, at an index of the first axis."""  # asarray: an entry of a NumPy vector is a scalar
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
 
 
@@ -41,12 +39,8 @@ def count(lanes: PyTree) -> int:
 
 
 def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity: int) -> list[np.ndarray]:
-    """For each device its shard: the active lanes that it runs, in order, in at most `capacity` chunks.
-
-    The most expensive chunk goes first, to the device with the least work. Lanes of equal cost share a chunk, so that
-    none waits long for another.
-    """
-    ordered = sorted(active, key=lambda i: -costs[i])
+    """For each device its shard: active lanes, the most expensive chunk first, in at most `capacity` chunks."""
+    ordered = sorted(active, key=lambda i: -costs[i])  # no lane of a chunk waits long for another
     shards: list[list[int]] = [[] for _ in range(devices)]
     loads = [(0.0, device) for device in range(devices)]  # a heap of the devices that can take more
     for chunk in (ordered[i : i + width] for i in range(0, len(ordered), width)):
@@ -60,18 +54,16 @@ def schedule(costs: Numbers, active: Numbers, devices: int, width: int, capacity
 def load_balance(shards: Sequence[np.ndarray], costs: Numbers, width: int) -> Float[np.ndarray, " n"]:
     """For each scheduled lane, the work of the busiest device over that of the lane's own device; 0 for the others."""
     # A chunk takes as long as its most expensive lane, which is its first.
-    loads = [sum(float(costs[i]) for i in shard[::width]) for shard in shards]
-    ratios = np.zeros(len(costs))
+    loads, ratios = [sum(float(costs[i]) for i in shard[::width]) for shard in shards], np.zeros(len(costs))
     for shard, load in zip(shards, loads, strict=True):
         ratios[shard] = max(loads) / load if len(shard) else 0.0
     return ratios
 
 
 class LaneMap:
-    """`function(lane, *shared) -> lane's result`, compiled once for all lanes, chunks and devices.
+    """`function(lane, *shared) -> pytree of arrays`, compiled once for all lanes, chunks and devices.
 
     Args:
-        function: from one lane and the shared arguments to a pytree of arrays.
         width: lanes in a chunk. Default: 1 on a CPU; elsewhere 0, an even share of the lanes for each device.
         devices: where chunks run, ordered by process; by default all devices of all processes.
         min_capacity: lanes to compile for at least, so that calls of fewer lanes share the program. Ignored for width
@@ -81,17 +73,17 @@ class LaneMap:
 
     def __init__(
         self,
-        function: Callable[..., PyTree],
+        function: Callable,
         width: int | None = None,
-        devices: Sequence[Any] | None = None,
-        min_capacity: int = 0,
-        compiler: dict[str, bool | int] | None = None,
+        devices: Sequence | None = None,
+        min_capacity=0,
+        compiler=None,
     ):
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._min_capacity = min_capacity
-        mesh = Mesh(np.array(self.devices), (AXIS,))
-        self._split, self._whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
+        mesh, split, whole = Mesh(np.array(self.devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
+        self._split, self._whole = NamedSharding(mesh, split), NamedSharding(mesh, whole)
 
         def run(static, lanes, chunks, shared):
             width, leaves, structure = static
@@ -100,7 +92,6 @@ class LaneMap:
                 lanes, shared = eqx.combine((lanes, shared), jax.tree.unflatten(structure, leaves))
                 return _loop(function, width, lanes, chunks[0], shared)
 
-            split, whole = PartitionSpec(AXIS), PartitionSpec()
             mapped = jax.shard_map(share, mesh=mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False)
             return mapped(lanes, chunks, shared)
 
@@ -108,7 +99,7 @@ class LaneMap:
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
-        shards, width, capacity = self._schedule(count(lanes), costs, active)
+        shards, width, capacity = self.schedule(count(lanes), costs, active)
         places = np.stack([np.resize(np.concatenate([shard, [0]]), capacity * width) for shard in shards])
         chunks = np.array([-(-len(shard) // width) for shard in shards])
         own = [d for d, device in enumerate(self.devices) if device.process_index == jax.process_index()]
@@ -120,12 +111,7 @@ class LaneMap:
         where = {i: capacity * width * d + j for d, shard in enumerate(shards) for j, i in enumerate(shard)}
         return lane(results, np.array([where[i] for i in active], int))
 
-    def load_balance(self, lanes: PyTree, costs: Numbers, active: Numbers) -> Float[np.ndarray, " n"]:
-        """For each active lane, the work of the busiest device over that of the lane's own device."""
-        shards, width, _ = self._schedule(count(lanes), costs, active)
-        return load_balance(shards, costs, width)[np.asarray(active, int)]
-
-    def _schedule(self, total: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int, int]:
+    def schedule(self, total: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int, int]:
         """Each device's shard, the width of a chunk, and the chunks that a device can take."""
         devices = len(self.devices)
         width = self.width or -(-total // devices)

@@ -1,7 +1,6 @@
 """Many training runs as one compiled program: every seed, size and rate is a lane (see lanes.py).
 
-A host loop trains the active lanes in blocks of epochs. Between blocks it drops the lanes that have stopped, reports
-progress, and can be interrupted.
+A host loop trains the lanes in blocks of epochs. Between blocks it drops those that have stopped and reports progress.
 """
 
 import time
@@ -12,13 +11,13 @@ from functools import lru_cache
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int, PyTree
+from jaxtyping import Array, Float, Int, PyTree
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import LaneMap, count, lane
+from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings, check_minibatch
@@ -56,8 +55,7 @@ def sweep(
     """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
-        states: stacked initial states, one per lane (`fitting.start`, `lanes.stack`).
-        plans: stacked run configurations, one per lane.
+        states, plans: stacked initial states and run configurations, one per lane (`fitting.start`, `lanes.stack`).
         train: the windows that `plans` index into; shared by all lanes, as `validation` is.
         min_capacity: lanes and training windows to compile for at least. Smaller sweeps are padded and share the
             program; padding of lanes needs a fixed width (see `LaneMap`).
@@ -66,12 +64,11 @@ def sweep(
         on_block: called after each block with all states and the progress.
 
     Returns:
-        The stacked final states as host arrays, in the order given. A lane whose loss was not finite has status
-        DIVERGED and the best epoch before it; it affects no other lane.
+        The stacked final states as host arrays. A lane whose loss was not finite has status DIVERGED and the best epoch
+        before it; it affects no other lane.
 
     Raises:
-        ValueError: invalid data, n_train below the batch size or above the number of windows, or a minibatch of one
-            window where a field normalises minibatches.
+        ValueError: invalid data, an n_train that does not fit them, or a minibatch of one window with a BatchNorm.
     """
     states, plans = jax.device_get((states, plans))
     shared = settings.objective.prepare(train, "train"), settings.objective.prepare(validation, "validation")
@@ -80,16 +77,15 @@ def sweep(
     plans, shared = _padded(plans, shared, min_capacity[1])
     shapes = _shapes(lane((states, plans), 0), shared)
     block = _block(settings, width, max(count(states), min_capacity[0]), shapes)
-    # A validation window costs an eighth of a training window.
-    costs = np.asarray(plans.n_train) + len(shared[1]) / 8
+    costs = np.asarray(plans.n_train) + len(shared[1]) / 8  # a validation window costs an eighth of a training window
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
     more, began = FIRST_BLOCK, time.perf_counter()
     while len(active := np.flatnonzero(states.status == fitting.RUNNING)):
         start = time.perf_counter()
         # A device with less work than the busiest trains its lanes for more epochs, so that none is idle.
-        epochs = np.zeros(len(costs), np.int32)
-        epochs[active] = more * block.load_balance(states, costs, active)
+        shards, chunk, _ = block.schedule(len(costs), costs, active)
+        epochs = (more * load_balance(shards, costs, chunk)).astype(np.int32)
         states = _merge(states, active, block((states, plans, epochs), shared, costs, active))
         if on_block is not None:
             on_block(states, _progress(states, plans, time.perf_counter() - began))
@@ -100,22 +96,16 @@ def sweep(
 def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
-    """L_MSE of each lane's field in inference mode, on windows shared by all lanes.
-
-    Args:
-        every: compare with every so many states of a window.
-        min_lanes: to compile for at least; see `sweep`.
-    """
-    fields = jax.device_get(fields)
-    lanes = count(fields)
+    """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`."""
+    lanes = count(fields := jax.device_get(fields))
     errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
     return errors(fields, (windows,), np.ones(lanes), range(lanes))
 
 
 def _padded(plans: RunConfig, shared: tuple[PyTree, PyTree], windows: int) -> tuple[RunConfig, tuple[PyTree, PyTree]]:
     """Pad plans and training data to a number of windows. No plan uses the padding."""
-    listed, (train, validation) = plans.subset.shape[-1], shared
-    subset = np.pad(plans.subset, ((0, 0), (0, max(windows, listed) - listed)))
+    train, validation = shared
+    subset = np.pad(plans.subset, ((0, 0), (0, max(0, windows - plans.subset.shape[-1]))))
     if len(train) < windows:
         train = train[np.minimum(np.arange(windows), len(train) - 1)]
     return replace(plans, subset=subset), (train, validation)
@@ -132,7 +122,7 @@ def _shapes(*trees: PyTree) -> tuple:
 def _block(settings: Settings, width: int | None, lanes: int, shapes: tuple) -> LaneMap:
     def block(lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:
         state, plan, epochs = lane
-        return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)
+        return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)[0]
 
     return LaneMap(block, width, min_capacity=lanes)
 
@@ -158,7 +148,7 @@ def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
 
 
 def _progress(states: FitState, plans: RunConfig, seconds: float) -> Progress:
-    running: Bool[Array, " lanes"] = states.status == fitting.RUNNING
+    running = np.asarray(states.status == fitting.RUNNING)
     at_most = plans.max_epochs - states.epoch
     at_least = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
     return Progress(
@@ -173,13 +163,11 @@ def _progress(states: FitState, plans: RunConfig, seconds: float) -> Progress:
 
 
 def _check(plans: RunConfig, train: PyTree, settings: Settings) -> None:
-    listed = plans.subset.shape[-1]
+    batch, listed = settings.batch_size, plans.subset.shape[-1]
     for size in np.unique(plans.n_train):
-        if not settings.batch_size <= size <= min(listed, len(train)):
-            raise ValueError(
-                f"n_train={size} must lie between batch_size={settings.batch_size} and the number of windows: "
-                f"{len(train)} in train, {listed} in subset"
-            )
+        if not batch <= size <= min(listed, len(train)):
+            windows = f"the number of windows: {len(train)} in train, {listed} in subset"
+            raise ValueError(f"n_train={size} must lie between batch_size={batch} and {windows}")
     # A gather would clamp such an index and silently train on another window.
     outside = plans.subset[(plans.subset < 0) | (plans.subset >= len(train))]
     if outside.size:

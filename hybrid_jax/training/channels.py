@@ -14,13 +14,15 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import mean_over
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
-from hybrid_jax.training.objective import AbstractTrajectoryLoss, Settings
+from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
 
 MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
+FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
 
 
 @dataclass(frozen=True)
@@ -42,11 +44,11 @@ class Channel:
 
 
 @dataclass(frozen=True)
-class ChannelLoss(AbstractTrajectoryLoss):
-    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, plus λ L_reg. Validation leaves L_reg out.
+class ChannelLoss(TrajectoryLoss):
+    """Σ over channels of ρ(‖error‖ / scale), mean over steps and windows, in place of the square in `TrajectoryLoss`.
 
-    ρ(r) = r² up to `huber` and 2 huber r − huber² beyond (Huber 1964, doubled). It applies to the norm of a channel's
-    error, so that no direction is preferred. Without `huber`, ρ(r) = r².
+    ρ(r) = r²; with `huber` only up to it, and 2 huber r − huber² beyond (Huber 1964, doubled). As r is a norm, no
+    direction is preferred.
 
     Raises:
         ValueError: no channels, or a threshold that is not positive.
@@ -62,9 +64,9 @@ class ChannelLoss(AbstractTrajectoryLoss):
             checks.positive("huber", self.huber)
 
     def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        widest = max(channel.stop for channel in self.channels)
-        if check(windows, name).x.shape[-1] < widest:
-            raise ValueError(f"{name}: states of at least {widest} numbers expected, got {windows.x.shape[-1]}")
+        widest, size = max(channel.stop for channel in self.channels), check(windows, name).x.shape[-1]
+        if size < widest:
+            raise ValueError(f"{name}: states of at least {widest} numbers expected, got {size}")
         return windows
 
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
@@ -87,35 +89,46 @@ class ChannelLoss(AbstractTrajectoryLoss):
         return sum(map(one, self.channels[1:]), one(self.channels[0]))
 
 
+def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
+    """ρ(r) from r². The root is taken of 1 where it is not used, as its slope at zero is infinite."""
+    far = square > threshold**2
+    length = jnp.sqrt(jnp.where(far, square, 1.0))
+    return jnp.where(far, 2 * threshold * length - threshold**2, square)
+
+
 def channels_from(
     baseline: AbstractVectorField, windows: Trajectories, parts: Mapping[str, slice] | None = None
 ) -> tuple[Channel, ...]:
     """Channels scaled by the RMS error of a baseline, such as one of baselines.py, at the end of the windows.
 
     Args:
-        parts: the entries of each channel; by default those of state.py for a state of 13, and otherwise one channel
-            for each entry.
+        parts: entries of each channel; by default those of state.py for a state of 13, otherwise each is a channel.
 
     Raises:
         ValueError: malformed windows, or a channel in which the baseline makes no error.
     """
     size = check(windows, "windows").x.shape[-1]
-    if parts is None:
-        parts = MULTIROTOR if size == STATE_SIZE else {f"x[{i}]": slice(i, i + 1) for i in range(size)}
+    parts = _parts(size, size == STATE_SIZE) if parts is None else parts
     predicted = eqx.filter_jit(rollout_batch)(baseline, windows.x0, windows.u, windows.dt)
     difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
-
-    def channel(name: str, part: slice) -> Channel:
-        scale = float(np.sqrt(np.mean(np.sum(np.square(difference[:, part]), axis=-1))))
+    scales = {name: _rms(difference[:, part]) for name, part in parts.items()}
+    for name, scale in scales.items():
         if not 0 < scale < np.inf:
             raise ValueError(f"baseline: its error in {name} must be positive and finite, got {scale}")
-        return Channel(part.start, part.stop, scale)
-
-    return tuple(channel(name, part) for name, part in parts.items())
+    return tuple(Channel(part.start, part.stop, scales[name]) for name, part in parts.items())
 
 
-def _huber(square: Float[Array, "*n"], threshold: float) -> Float[Array, "*n"]:
-    """ρ(r) from r². The root is taken of 1 where it is not used, as its slope at zero is infinite."""
-    far = square > threshold**2
-    length = jnp.sqrt(jnp.where(far, square, 1.0))
-    return jnp.where(far, 2 * threshold * length - threshold**2, square)
+def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
+    """A loss relative to the RMS change over a window of each state, or of each vector in the state of a rigid body."""
+    parts = _parts(windows.x0.shape[-1], moves_a_rigid_body(field)).values()
+    x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
+    scales = [max(_rms(end[:, part] - x0[:, part]), FLOOR * _rms(end[:, part])) or 1.0 for part in parts]
+    return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
+
+
+def _parts(size: int, of_multirotor: bool) -> Mapping[str, slice]:
+    return MULTIROTOR if of_multirotor else {f"x[{i}]": slice(i, i + 1) for i in range(size)}
+
+
+def _rms(vectors: Float[np.ndarray, "n k"]) -> float:
+    return float(np.sqrt(np.mean(np.sum(np.square(vectors), axis=-1))))

@@ -4,6 +4,7 @@ import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 
 import equinox as eqx
@@ -13,25 +14,18 @@ import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, trainable
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.integrate import checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.training.fitting import (
-    ADAM,
-    RUNNING,
-    STATUS_NAMES,
-    FitState,
-    Optimiser,
-    RunConfig,
-    make_run_config,
-    run_recorded,
-    start,
-)
-from hybrid_jax.training.objective import AbstractTrajectoryLoss, Learner, Settings, prepared
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.training import fitting
+from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
+from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch
+from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -49,42 +43,16 @@ class History(eqx.Module):
 
 
 class FitResult(eqx.Module):
-    """A finished training run.
+    """A finished training run."""
 
-    Attributes:
-        state: the final state of the run.
-        history: training and validation loss of every epoch.
-        status: "ok" (stopped early), "capped" (by max_epochs), "diverged", or "running" if it was interrupted.
-    """
-
-    state: FitState
+    best: Learner  # the field of the best validation epoch
+    best_mse: Float[Array, ""]  # its validation loss
+    best_epoch: int  # counted from 1; 0 if it is the initial field
+    field: Learner  # after the last epoch
+    epochs: int
+    status: str  # "ok" (stopped early), "capped" (by max_epochs), "diverged", or "running" if it was interrupted
     history: History
-    status: str
-
-    @property
-    def best(self) -> Learner:
-        """The field of the best validation epoch."""
-        return self.state.best
-
-    @property
-    def best_mse(self) -> Float[Array, ""]:
-        """The validation loss of `best`."""
-        return self.state.best_mse
-
-    @property
-    def best_epoch(self) -> int:
-        """The epoch of `best`, counted from 1; 0 if it is the initial field."""
-        return int(self.state.best_epoch)
-
-    @property
-    def field(self) -> Learner:
-        """The field after the last epoch."""
-        return self.state.field
-
-    @property
-    def epochs(self) -> int:
-        """The number of epochs."""
-        return int(self.state.epoch)
+    state: FitState  # the final state of the run
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -120,71 +88,79 @@ def fit(
             `Hybrid(1e-2, 1e-3)` for physics and residual.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
-        min_epochs: no early stop before this many epochs.
+        min_epochs, max_epochs: no early stop before, and no epoch after.
         patience: stop after this many epochs without a better validation loss.
-        max_epochs: stop after this many epochs.
         regulariser_weight: λ, by default 1e-3.
         settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. The paper's
             is `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
-        progress: True for a progress bar on stderr, or a function of (epoch, state) that is called about twice a
-            second.
+        progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
 
     Raises:
         ValueError: windows that the objective refuses, that do not match the field, or are of a rigid body and have no
-            unit quaternions; fewer training windows than a minibatch; minibatches of one window that are normalised by
-            themselves; a batch norm that cannot be trained; a field with nothing to learn; rates that do not match the
-            field; a weight without a regulariser; another argument out of range.
+            unit quaternions; fewer training windows than a minibatch; a batch norm that cannot be trained, as with
+            minibatches of one window; a field with nothing to learn; rates that do not match the field; a weight
+            without a regulariser; another argument out of range.
         FitInterrupted: Ctrl-C; a KeyboardInterrupt that holds the result so far.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if rates is None:
         rates = RATE if optimiser is None else 1.0
-    rates = _of_each(rates, eqx.filter(field, trainable(field)))
-    make_run_config(rates, 0, 0, min_epochs, patience, max_epochs, weight)  # refuses before the field is evaluated
-    field = ready(field, train)
-    rates = jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(rates)
-    plan = make_run_config(rates, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
-    return drive(start(field, key, shared[-1]), plan, data, shared, progress)
+    try:
+        each = jax.tree.leaves(jax.tree.broadcast(rates, eqx.filter(field, trainable(field))))
+    except (TypeError, ValueError) as error:
+        expected = "a number, or a tree of them that begins as the field does"
+        raise ValueError(f"rates must be {expected}, got {checks.short_repr(rates)}") from error
+    plan = make_run_config(each, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
+    field = ready(field, train)  # scaling changes the tree of the field, but not what is learned
+    plan = replace(plan, rates=jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(plan.rates))
+    return drive(fitting.start(field, key, shared[-1]), plan, data, shared, progress)
 
 
 def checked_arguments(
-    field: Learner,
-    train: Trajectories,
-    validation: Trajectories,
-    key: PRNGKeyArray,
-    settings: Settings | None,
-    optimiser: Optimiser | None,
-    weight: float | None,
+    field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
     """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
     if settings is None:
         settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
-    data, validated_on = prepared(field, train, validation, key, settings)
+    data = settings.objective.prepare(train, "train")
+    validated_on = settings.objective.prepare(validation, "validation")
+    _check_field(field, {"train": train, "validation": validation}, settings)
+    checks.key("key", key)
+    checks.count("settings.batch_size", settings.batch_size)
+    check_minibatch(field, settings)
+    if len(data) < settings.batch_size:
+        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
     if not isinstance(optimiser, Optimiser | None):
         raise ValueError(f"optimiser must be an optax.GradientTransformation, got {checks.short_repr(optimiser)}")
-    if weight is not None and settings.regulariser is None and isinstance(settings.objective, AbstractTrajectoryLoss):
-        raise ValueError(
-            f"regulariser_weight is {checks.short_repr(weight)} but settings.regulariser is None; leave it out, or "
-            "take one of hybrid_jax.training.loss.REGULARISERS"
-        )
+    if weight is not None and settings.regulariser is None and isinstance(settings.objective, TrajectoryLoss):
+        remedy = "leave it out, or take one of hybrid_jax.training.loss.REGULARISERS"
+        given = checks.short_repr(weight)
+        raise ValueError(f"regulariser_weight is {given} but settings.regulariser is None; {remedy}")
     shared = validated_on, settings, ADAM if optimiser is None else _negated(optimiser)
     return data, shared, WEIGHT if weight is None else weight
 
 
-def _of_each(rates: PyTree, learned: Learner) -> list:
-    """The rate of each learned array; a list, as the tree changes when the field is scaled."""
-    try:
-        return jax.tree.leaves(jax.tree.map(lambda rate, part: jax.tree.map(lambda _: rate, part), rates, learned))
-    except (TypeError, ValueError) as error:
-        raise ValueError(
-            f"rates must be a number, or a tree of them that begins as the field does, got {checks.short_repr(rates)}"
-        ) from error
+def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settings) -> None:
+    """Refuse a field that learns nothing, and windows that do not match it. Other learners check their own windows."""
+    if not any(jax.tree.leaves(trainable(field))):
+        missing = "no array of floating-point numbers; a Python float is none, use jnp.asarray"
+        raise ValueError(f"field: {type(field).__name__} has nothing to learn, {missing}")
+    for name, windows in data.items():
+        if isinstance(field, AbstractVectorField):
+            try:
+                x0, u, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+            except ValueError as error:
+                raise ValueError(f"{name}: {error}") from error
+            if x0.dtype != jnp.result_type(windows.x0):
+                raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
+            check_batch_norm(field, x0[:2].T, u[:2, 0].T)
+        if moves_a_rigid_body(field):
+            check_attitudes(windows, name)
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:
     """The field with its scaling set. Warns if a file of it could not be loaded without more information."""
-    reason = check_savable(field)
-    if reason is not None:
+    if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=3)
     return with_scaling(field, train) if isinstance(field, AbstractVectorField) else field
 
@@ -194,28 +170,25 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     validated_on, settings, optimiser = shared
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
-    losses, most = [np.zeros((0, 2))], 1
-    empty = jnp.zeros((BLOCK, 2))
+    losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
+    train = eqx.filter_jit(fitting.run)
     with _reporting(progress, int(plan.max_epochs)) as report:
         try:
             while int(state.status) == RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
                 until = jnp.asarray(first + most, jnp.int32)  # an array, so that one program serves all blocks
-                after, rows = _block(state, empty, plan, data, validated_on, settings, until, optimiser)
-                rows = np.asarray(rows)
-                state, losses = after, [*losses, rows[: int(after.epoch) - first]]
+                after, rows = train(state, plan, data, validated_on, settings, until, optimiser, empty)
+                state, losses = after, [*losses, np.asarray(rows)[: int(after.epoch) - first]]
                 report(int(state.epoch), state)
                 most = int(np.clip(most * BLOCK_SECONDS / (time.perf_counter() - began), 1, min(BLOCK, 4 * most)))
-        except KeyboardInterrupt as interrupt:
-            raise FitInterrupted(_result(state, losses)) from interrupt
-    return _result(state, losses)
-
-
-_block = eqx.filter_jit(run_recorded)
-
-
-def _result(state: FitState, losses: list[np.ndarray]) -> FitResult:
-    return FitResult(state, History(*np.concatenate(losses).T), STATUS_NAMES[int(state.status)])
+        except KeyboardInterrupt as error:
+            interrupt = error
+    history, status = History(*np.concatenate(losses).T), fitting.STATUS_NAMES[int(state.status)]
+    best_epoch, epochs = int(state.best_epoch), int(state.epoch)
+    result = FitResult(state.best, state.best_mse, best_epoch, state.field, epochs, status, history, state)
+    if interrupt is not None:
+        raise FitInterrupted(result) from interrupt
+    return result
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once
@@ -231,12 +204,9 @@ def _reporting(progress: Report | bool | None, most: int) -> Iterator[Report]:
     elif callable(progress):
         yield progress
     else:
-        columns = TextColumn("epoch"), MofNCompleteColumn(), BarColumn(), TextColumn("{task.description}")
-        clocks = TimeElapsedColumn(), TextColumn("at most"), TimeRemainingColumn()
+        columns = "epoch", MofNCompleteColumn(), BarColumn(), "{task.description}"
+        clocks = TimeElapsedColumn(), "at most", TimeRemainingColumn()
         with Progress(*columns, *clocks, console=Console(stderr=True)) as bar:
             task = bar.add_task("compiling", total=most)
-
-            def show(epoch: int, state: FitState) -> None:
-                bar.update(task, completed=epoch, description=f"best validation loss {float(state.best_mse):.3g}")
-
-            yield show
+            best = "best validation loss {:.3g}"
+            yield lambda epoch, state: bar.update(task, completed=epoch, description=best.format(float(state.best_mse)))

@@ -1,7 +1,6 @@
 """One training run as a pure function: minibatches, the optimiser, validation, the best epoch, early stopping.
 
-`RunConfig` holds what may differ between runs of one compiled program (rates, data size, patience, …). `Settings`
-(objective.py) holds what the program is compiled for.
+`RunConfig` holds what may differ between runs of one compiled program; `Settings` holds what it is compiled for.
 """
 
 import equinox as eqx
@@ -22,33 +21,23 @@ STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "
 
 
 class RunConfig(eqx.Module):
-    """Hyper-parameters that may differ between the runs of a sweep.
+    """Hyper-parameters that may differ between the runs of a sweep; see `fit`."""
 
-    Attributes:
-        rates: a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`.
-        subset: indices of the training windows that the run may use; it uses the first n_train.
-        min_epochs, patience, max_epochs: see `fit`.
-        regulariser_weight: λ.
-    """
-
-    rates: PyTree
-    subset: Int[Array, " n"]
-    n_train: Int[Array, ""]
+    rates: PyTree  # a tree prefix of the field: one number, or e.g. `Hybrid(1e-2, 1e-4)`
+    subset: Int[Array, " n"]  # indices of the training windows that the run may use
+    n_train: Int[Array, ""]  # it uses so many, the first of the subset
     min_epochs: Int[Array, ""]
     patience: Int[Array, ""]
     max_epochs: Int[Array, ""]
-    regulariser_weight: Float[Array, ""]
+    regulariser_weight: Float[Array, ""]  # λ
 
 
 class FitState(eqx.Module):
-    """A run between two epochs: all that is needed to continue it.
-
-    `best` is the field with the best validation loss so far, and the initial field before the first epoch.
-    """
+    """A run between two epochs: all that is needed to continue it."""
 
     field: Learner
     adam: PyTree
-    best: Learner
+    best: Learner  # the field with the best validation loss so far, and the initial field before the first epoch
     best_mse: Float[Array, ""]
     best_epoch: Int[Array, ""]
     epoch: Int[Array, ""]
@@ -59,32 +48,23 @@ class FitState(eqx.Module):
 
 def start(field: Learner, key: PRNGKeyArray, optimiser: Optimiser = ADAM) -> FitState:
     """A run at epoch 0. The key sets the order of the minibatches."""
-    zero = jnp.zeros((), jnp.int32)
-    infinity = jnp.array(jnp.inf)
+    zero, infinity = jnp.zeros((), jnp.int32), jnp.array(jnp.inf)
     adam = optimiser.init(eqx.filter(field, trainable(field)))
-    # Raw key data is an ordinary array: it can be stacked, moved to the host and saved.
-    key = jax.random.key_data(key) if jnp.issubdtype(key.dtype, jax.dtypes.prng_key) else key
+    key = jax.random.key_data(key)  # an ordinary array: it can be stacked, moved to the host and saved
     return FitState(field, adam, field, infinity, zero, zero, zero + RUNNING, infinity, key)
 
 
 def run(
-    state: FitState, plan: RunConfig, train: PyTree, validation: PyTree, settings: Settings, until: Int[Array, ""] | int
-) -> FitState:
-    """Continue until the run has stopped or has completed `until` epochs, on data as prepared by the objective."""
-    return run_recorded(state, None, plan, train, validation, settings, until)[0]
-
-
-def run_recorded(
     state: FitState,
-    losses: Float[Array, "e 2"] | None,
     plan: RunConfig,
     train: PyTree,
     validation: PyTree,
     settings: Settings,
     until: Int[Array, ""] | int,
     optimiser: Optimiser = ADAM,
+    losses: Float[Array, "e 2"] | None = None,
 ) -> tuple[FitState, Float[Array, "e 2"] | None]:
-    """`run` that also records the training and the validation loss of its first epochs in the rows of `losses`."""
+    """Continue until the run has stopped or has completed `until` epochs; `losses` takes those of the first epochs."""
     first = state.epoch
     # A user's field may hold leaves that are not arrays (an activation function). A loop carries arrays only.
     arrays, rest = eqx.partition(state, eqx.is_array)
@@ -112,7 +92,7 @@ def _epoch(
     key, order_key = jax.random.split(state.key)
     order, size = _shuffled(plan, order_key), settings.batch_size
     batches = plan.n_train // size
-    arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run_recorded`
+    arrays, rest = eqx.partition(state.field, eqx.is_array)  # as in `run`
 
     def update(i, carry):
         arrays, adam, total = carry
@@ -130,8 +110,7 @@ def gradient_step(
     field: Learner, adam: PyTree, plan: RunConfig, picked: PyTree, settings: Settings, optimiser: Optimiser = ADAM
 ) -> tuple[Learner, PyTree, Float[Array, ""]]:
     """One optimiser step on one minibatch; running statistics are updated with the same minibatch."""
-    learned = trainable(field)
-    parameters, rest = eqx.partition(field, learned)
+    parameters, rest = eqx.partition(field, trainable(field))
     # Gathered once: without the barrier the gather is fused into, and repeated by, everything that reads the minibatch.
     batch = jax.lax.optimization_barrier(settings.objective.batch(picked, settings))
 
@@ -150,11 +129,7 @@ def gradient_step(
 
 
 def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, regulariser_weight) -> RunConfig:
-    """A configuration with every number as an array, as `vmap` needs it.
-
-    Raises:
-        ValueError: a rate or weight that is negative or not finite, or a count that is too small; says which.
-    """
+    """A configuration with every number as an array, as `vmap` needs it; ValueError if one is out of range."""
     for rate in jax.tree.leaves(rates):
         checks.not_negative("rates", rate)
     counts = {"n_train": n_train, "min_epochs": min_epochs, "patience": patience, "max_epochs": max_epochs}
@@ -168,17 +143,14 @@ def make_run_config(rates, subset, n_train, min_epochs, patience, max_epochs, re
 
 def _shuffled(plan: RunConfig, key: PRNGKeyArray) -> Int[Array, " n"]:
     """The first n_train windows of the subset in random order, then the rest."""
-    listed = plan.subset.shape[0]
+    listed, few = plan.subset.shape[0], plan.subset.shape[0] // SHORTCUT
 
     def among(first: int) -> Int[Array, " n"]:
         # The first numbers are the same however many are drawn (jax_threefry_partitionable).
         draws = jax.random.uniform(key, (first,))
-        inside = jnp.arange(first) < plan.n_train
-        order = jnp.argsort(jnp.where(inside, draws, jnp.inf))
+        order = jnp.argsort(jnp.where(jnp.arange(first) < plan.n_train, draws, jnp.inf))
         return plan.subset.at[:first].set(plan.subset[:first][order])
 
-    # A run that uses few of many windows does not pay for sorting all of them.
-    few = listed // SHORTCUT
     return jax.lax.cond(plan.n_train <= few, lambda: among(few), lambda: among(listed))
 
 
@@ -190,8 +162,7 @@ def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new, field, state.best)
     best_epoch = jnp.where(better, finished, state.best_epoch)
     patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
-    status = jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING)
-    status = jnp.where(patient, status, STOPPED)
+    status = jnp.where(patient, jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING), STOPPED)
     # Python integers become 64 bit in double precision, but the loop carries 32 bit.
     status = jnp.where(finite, status, DIVERGED).astype(jnp.int32)
     best_mse = jnp.where(better, error, state.best_mse)

@@ -1,8 +1,6 @@
 """Minibatches, features first, and the regularisers L_reg that keep f_d from replacing f_p.
 
-A regulariser is a function of (hybrid, minibatch, predicted states): the correlation of trajectories (paper, Eq. 7);
-inner product, cosine and Pearson correlation of f_p and f_d (Takeishi and Kalousis 2023; Osaka et al. 2025); or ‖f_d‖²
-(Yin et al. 2021, APHYNITY).
+Inner product, cosine and Pearson correlation of f_p and f_d: Takeishi and Kalousis 2023; Osaka et al. 2025.
 """
 
 from collections.abc import Callable
@@ -14,7 +12,6 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import Hybrid, train_batch
 from hybrid_jax.integrate import RK4, along, rollout_minibatch
-from hybrid_jax.trajectories import Trajectories
 
 
 class Minibatch(eqx.Module):
@@ -28,12 +25,6 @@ class Minibatch(eqx.Module):
 
 
 Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, ""]]
-
-
-def minibatch(windows: Trajectories, solver: diffrax.AbstractSolver) -> Minibatch:
-    """The windows with features first and samples last."""
-    last = (jnp.moveaxis(a, 0, -1) for a in (windows.x0, windows.u, windows.x))
-    return Minibatch(*last, dt=windows.dt, solver=solver)
 
 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
@@ -63,7 +54,7 @@ def pearson(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -
 
 
 def residual_norm(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
-    """‖f_d‖² along the predicted trajectories, mean over samples (Yin et al. 2021)."""
+    """‖f_d‖² along the predicted trajectories, mean over samples (APHYNITY; Yin et al. 2021)."""
     return jnp.mean(jnp.sum(jnp.square(_parts(field, batch, predicted)[1]), axis=0))
 
 
@@ -72,9 +63,9 @@ REGULARISERS: dict[str, Regulariser] = {
 }
 
 
-def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]):
+def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> list[Float[Array, "d s"]]:
     x, u = along(batch.x0, predicted, batch.u)
-    return train_batch(field.physics, x, u), train_batch(field.residual, x, u)
+    return [train_batch(part, x, u) for part in (field.physics, field.residual)]
 
 
 def _unit(columns: Float[Array, "d b"]) -> Float[Array, "d b"]:

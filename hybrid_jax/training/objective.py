@@ -1,40 +1,32 @@
-"""What a training run minimises and validates on, and the checks before it begins."""
+"""What a training run minimises and validates on, and what its program is compiled for."""
 
-from abc import abstractmethod
 from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import diffrax
-import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, PRNGKeyArray, PyTree
+from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, check_batch_norm, trainable, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running_stats
 from hybrid_jax.dynamics.batching import batch_norms
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
-from hybrid_jax.integrate import RK4, along, checked, rollout_minibatch
+from hybrid_jax.integrate import RK4, along, rollout_minibatch
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.training.loss import Minibatch, Regulariser, minibatch
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes
+from hybrid_jax.training.loss import Minibatch, Regulariser
+from hybrid_jax.trajectories import Trajectories, check
 
 Learner = Any  # an Equinox module: a vector field, or anything that the objective can evaluate
 
 
 class Objective(Protocol):
-    """Maps windows to a training loss and a validation loss. It must be hashable."""
+    """Maps windows to a training and a validation loss; hashable. By default `batch` and `observe` change nothing."""
 
     def prepare(self, windows: Trajectories, name: str) -> PyTree:
-        """The data of a run: anything with a length that can be indexed by an array of integers. Called once.
-
-        Raises:
-            ValueError: windows that cannot be used; `name` is the argument's name.
-        """
-        ...
+        """The data of a run, with a length and indexed by arrays of integers; ValueError, with `name`, if unusable."""
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
         """A minibatch in the layout that `loss` needs."""
-        ...
+        return picked
 
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
@@ -44,22 +36,23 @@ class Objective(Protocol):
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
         """The field with its running statistics updated by the minibatch; learned parameters stay as they are."""
-        ...
+        return field
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
         """The validation loss, which early stopping and the choice of the best epoch use."""
         ...
 
 
-class AbstractTrajectoryLoss:
-    """An error of predicted trajectories, plus λ L_reg where the field is a `Hybrid`. Validation leaves L_reg out."""
+@dataclass(frozen=True)
+class TrajectoryLoss(Objective):
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories (paper, Sec. 3.3, Eq. 6), in training plus λ L_reg."""
 
-    @abstractmethod
-    def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
-        """The error of a minibatch, given predicted minus true states."""
+    def prepare(self, windows: Trajectories, name: str) -> Trajectories:
+        return check(windows, name)
 
     def batch(self, picked: Trajectories, settings: "Settings") -> Minibatch:
-        return minibatch(picked, settings.solver)
+        last = (jnp.moveaxis(a, 0, -1) for a in (picked.x0, picked.u, picked.x))
+        return Minibatch(*last, dt=picked.dt, solver=settings.solver)
 
     def loss(self, field: AbstractVectorField, batch: Minibatch, settings: "Settings", weight: Float[Array, ""]):
         predicted = rollout_minibatch(field, batch.x0, batch.u, batch.dt, batch.solver)
@@ -68,20 +61,12 @@ class AbstractTrajectoryLoss:
             value = value + weight * settings.regulariser(field, batch, predicted)
         return value, predicted
 
-    def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
-        x, u = along(batch.x0, seen, batch.u)
-        return update_running_stats(field, x, u)
-
-
-@dataclass(frozen=True)
-class TrajectoryLoss(AbstractTrajectoryLoss):
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖², mean over trajectories, plus λ L_reg (paper, Sec. 3.3, Eq. 6)."""
-
-    def prepare(self, windows: Trajectories, name: str) -> Trajectories:
-        return check(windows, name)
-
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
+        """The error of a minibatch, given predicted minus true states."""
         return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
+
+    def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
+        return update_running_stats(field, *along(batch.x0, seen, batch.u))
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: "Settings") -> Float[Array, ""]:
         return rollout_mse(field, data, solver=settings.solver)
@@ -89,11 +74,7 @@ class TrajectoryLoss(AbstractTrajectoryLoss):
 
 @dataclass(frozen=True)
 class Settings:
-    """What a training program is compiled for; the same for all runs of a sweep.
-
-    Raises:
-        ValueError: a regulariser that is not a function, such as the name of one.
-    """
+    """What a training program is compiled for, the same for all runs of a sweep. Refuses a regulariser by name."""
 
     batch_size: int = 100
     regulariser: Regulariser | None = None
@@ -102,58 +83,12 @@ class Settings:
 
     def __post_init__(self):
         if self.regulariser is not None and not callable(self.regulariser):
-            got = checks.short_repr(self.regulariser)
-            raise ValueError(
-                f"regulariser must be a function, such as one of hybrid_jax.training.loss.REGULARISERS, got {got}"
-            )
-
-
-def prepared(
-    field: Learner, train: Trajectories, validation: Trajectories, key: PRNGKeyArray, settings: Settings
-) -> tuple[PyTree, PyTree]:
-    """Both sets of windows as prepared by the objective, after all checks of what a run is given.
-
-    Raises:
-        ValueError: as `fit` for its windows, key, field and settings.
-    """
-    data = settings.objective.prepare(train, "train")
-    validated_on = settings.objective.prepare(validation, "validation")
-    if not any(jax.tree.leaves(trainable(field))):
-        raise ValueError(
-            f"field: {type(field).__name__} has nothing to learn, no array of floating-point numbers; a Python float "
-            "is none, use jnp.asarray"
-        )
-    for name, windows in (("train", train), ("validation", validation)):
-        _check_match(field, windows, name, settings)
-    checks.key("key", key)
-    checks.count("settings.batch_size", settings.batch_size)
-    check_minibatch(field, settings)
-    if len(data) < settings.batch_size:
-        raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")
-    return data, validated_on
+            expected = "a function, such as one of hybrid_jax.training.loss.REGULARISERS"
+            raise ValueError(f"regulariser must be {expected}, got {checks.short_repr(self.regulariser)}")
 
 
 def check_minibatch(field: Learner, settings: Settings) -> None:
-    """Refuse minibatches of one window where a BatchNorm is trained: minus its own mean, a window is a constant.
-
-    Raises:
-        ValueError: the field learns through a BatchNorm, and the minibatch is smaller than 2.
-    """
+    """Refuse minibatches of one window where a BatchNorm is trained: minus its own mean, a window is a constant."""
     if settings.batch_size < 2 and batch_norms(field):
-        raise ValueError(
-            f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {settings.batch_size}"
-        )
-
-
-def _check_match(field: Learner, windows: Trajectories, name: str, settings: Settings) -> None:
-    """Refuse windows that do not match a vector field. Other learners are checked by their objective."""
-    if isinstance(field, AbstractVectorField):
-        try:
-            x0, u, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
-        except ValueError as error:
-            raise ValueError(f"{name}: {error}") from error
-        if x0.dtype != jnp.result_type(windows.x0):
-            raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
-        check_batch_norm(field, x0[:2].T, u[:2, 0].T)
-    if moves_a_rigid_body(field):
-        check_attitudes(windows, name)
+        size = settings.batch_size
+        raise ValueError(f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {size}")

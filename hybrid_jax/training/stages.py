@@ -1,7 +1,6 @@
 """Training in stages: e.g. physics first and then the residual, or short windows first and then longer ones.
 
-Each stage is one training run with its own learning rates and horizon. It starts from the best field of the stage
-before. A stage that does not improve the validation loss leaves the field as it was.
+Each stage is one training run with its own learning rates and horizon, from the best field of the stage before.
 """
 
 from collections.abc import Mapping, Sequence
@@ -23,32 +22,26 @@ from hybrid_jax.trajectories import Trajectories
 
 @dataclass(frozen=True)
 class Stage:
-    """One training run.
+    """One training run, with the learning rate of each group of parameters.
 
-    Attributes:
-        rates: learning rate of each group of parameters. A group is named by the beginning of its path in the field,
-            e.g. "physics", "residual/weight_out" or "physics/deviations/drag"; "" is the whole field. The longest name
-            that matches counts. Parameters in no group are frozen.
-        steps: intervals of each window that are trained on, from its start; by default all.
-        epochs: stop after this many.
-        patience: stop after this many epochs without a better validation loss.
+    A group is named by the beginning of its path in the field, e.g. "physics", "residual/weight_out" or
+    "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Other parameters are frozen.
 
     Raises:
         ValueError: a rate that is negative or not finite, or a count below 1.
     """
 
     rates: Mapping[str, float]
-    steps: int | None = None
-    epochs: int = 100
-    patience: int = 20
+    steps: int | None = None  # intervals of each window that are trained on, from its start; by default all
+    epochs: int = 100  # stop after this many
+    patience: int = 20  # or after this many without a better validation loss
 
     def __post_init__(self):
         for rate in self.rates.values():
             checks.not_negative("rates", rate)
-        checks.count("epochs", self.epochs)
-        checks.count("patience", self.patience)
-        if self.steps is not None:
-            checks.count("steps", self.steps)
+        for name in ("steps", "epochs", "patience"):
+            if (value := getattr(self, name)) is not None:
+                checks.count(name, value)
 
 
 def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
@@ -59,24 +52,16 @@ def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
     """
     learned = eqx.filter(field, trainable(field))
     paths = list(named_leaves(learned))
+    groups_of = [[group for group in groups if not group or f"{path}/".startswith(f"{group}/")] for path in paths]
     for group in groups:
-        if not any(_is_in(path, group) for path in paths):
+        if not any(group in found for found in groups_of):
             raise ValueError(f"rates: no learned array begins with {group!r}, only {', '.join(paths)}")
-
-    def rate(path, leaf):
-        name = jax.tree_util.keystr(path, simple=True, separator="/")
-        found = [group for group in groups if _is_in(name, group)]
-        return jnp.asarray(groups[max(found, key=len)] if found else 0.0, float)
-
-    return jax.tree_util.tree_map_with_path(rate, learned)
+    rates = [groups[max(found, key=len)] if found else 0.0 for found in groups_of]
+    return jax.tree.structure(learned).unflatten(jnp.asarray(rate, float) for rate in rates)
 
 
 def cut(windows: Trajectories, steps: int | None) -> Trajectories:
-    """The first `steps` intervals of each window.
-
-    Raises:
-        ValueError: the windows are shorter.
-    """
+    """The first `steps` intervals of each window, or all; ValueError if there are fewer."""
     if steps is None:
         return windows
     checks.count("steps", steps)
@@ -86,11 +71,7 @@ def cut(windows: Trajectories, steps: int | None) -> Trajectories:
 
 
 def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
-    """A run at its start with the validation loss of its initial field: `best` is that field until an epoch is better.
-
-    Args:
-        validation: as prepared by the objective.
-    """
+    """A run at its start with the validation loss of its field, which is `best` until an epoch is better."""
     error = settings.objective.validate(state.field, validation, settings)
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
 
@@ -109,30 +90,19 @@ def fit_in_stages(
 ) -> list[FitResult]:
     """Train a field in stages; `results[-1].best` is the trained field. Arguments are those of `fit`.
 
-    Every stage is validated on whole validation windows. Only what is better there than the field that the stage began
-    with is kept, from the first stage on.
+    Every stage is validated on whole windows. Only what is better there than the field that it began with is kept.
 
     Raises:
-        ValueError: as `fit`; windows shorter than a stage needs; rates of a group that the field does not have; or no
-            stages.
+        ValueError: as `fit`; no stages; windows shorter than a stage needs; or rates of a group that the field has not.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
     if not stages:
         raise ValueError("stages must be some Stage, got none")
     field, results = ready(field, train), []
-    rates = [rates_by_group(field, stage.rates) for stage in stages]
-    horizons = [cut(data, stage.steps) for stage in stages]
-    keys = jax.random.split(key, len(stages))
-    for stage, rate, windows, stage_key in zip(stages, rates, horizons, keys, strict=True):
-        plan = make_run_config(rate, jnp.arange(len(data)), len(data), 0, stage.patience, stage.epochs, weight)
-        state = _validated(start(field, stage_key, shared[-1]), *shared[:2])
+    steps = [(rates_by_group(field, stage.rates), cut(data, stage.steps), stage) for stage in stages]
+    for (rates, windows, stage), stage_key in zip(steps, jax.random.split(key, len(stages)), strict=True):
+        plan = make_run_config(rates, jnp.arange(len(data)), len(data), 0, stage.patience, stage.epochs, weight)
+        state = eqx.filter_jit(judged)(start(field, stage_key, shared[-1]), *shared[:2])
         results.append(drive(state, plan, windows, shared, progress))
         field = results[-1].best
     return results
-
-
-_validated = eqx.filter_jit(judged)
-
-
-def _is_in(path: str, group: str) -> bool:
-    return group == "" or path == group or path.startswith(group + "/")

@@ -10,9 +10,8 @@ import pytest
 from test_least_squares import Push, pushes
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.disturbance_selection import left_out, select_disturbance
 from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import normal_equations
+from hybrid_jax.adaptation.uncertainty import left_out, normal_equations, select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
@@ -67,12 +66,6 @@ def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
     np.testing.assert_allclose(jax.vmap(field)(x, u), one, rtol=1e-6)
     for many in (train_batch, infer_batch):
         np.testing.assert_allclose(many(field, x.T, u.T).T, one, rtol=1e-5, atol=1e-5)
-
-
-def test_a_model_with_one_is_kept(tmp_path):
-    field = hj.Hybrid(disturbed(body(), PUSH), network())
-    hj.save(tmp_path / "model.npz", field)
-    assert eqx.tree_equal(hj.load(tmp_path / "model.npz").field, field)
 
 
 class Drag(AbstractVectorField):

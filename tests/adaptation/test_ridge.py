@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax import Hybrid, load, residual_network, rollout_batch, save
+from hybrid_jax import Hybrid, residual_network, rollout_batch
 from hybrid_jax.adaptation.ridge import (
     PENALTIES,
     defects,
@@ -190,9 +190,3 @@ def test_a_channel_that_never_varied_is_no_feature():
     scaled = (z - mean) / scale
     np.testing.assert_allclose(scaled[:, 0].std(), 1, rtol=1e-5)
     assert jnp.abs(scaled[:, 1:]).max() < 1e-2  # float32's round-off of the mean over 1e-3
-
-
-def test_a_linear_residual_survives_a_file(tmp_path):
-    field = with_linear(source())
-    save(tmp_path / "model.npz", field)
-    assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)

@@ -10,7 +10,7 @@ from pendulum import pendulum
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.integrate import RK4, along, rollout_batch, rollout_minibatch
 from hybrid_jax.networks.mlp import residual_network, zero_output
-from hybrid_jax.training.loss import REGULARISERS, cosine, minibatch
+from hybrid_jax.training.loss import REGULARISERS, cosine
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories
 
@@ -46,7 +46,7 @@ def windows():
 
 @pytest.fixture(scope="module")
 def batch(double_precision):
-    return minibatch(windows(), RK4())
+    return TrajectoryLoss().batch(windows(), Settings())
 
 
 @eqx.filter_jit

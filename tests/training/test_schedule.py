@@ -8,14 +8,11 @@ import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
 
 from hybrid_jax import Hybrid, Settings, residual_network
-from hybrid_jax.dynamics.base import Frozen
-from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import zero_output
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.training.fitting import make_run_config
 from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
-from hybrid_jax.vehicle import IRIS
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
@@ -71,28 +68,3 @@ def test_short_windows_are_the_beginning_of_long_ones():
     assert cut(TRAIN, None) is TRAIN
     with pytest.raises(ValueError, match="steps must be at most the 8 intervals"):
         cut(TRAIN, 9)
-
-
-@pytest.mark.parametrize(
-    ("stages", "said"), [([], "stages"), ([Stage({"": 0.1}, steps=9)], "steps"), ([Stage({"wing": 0.1})], "'wing'")]
-)
-def test_stages_that_make_no_sense_are_refused(stages, said):
-    with pytest.raises(ValueError, match=said):
-        trained(stages)
-    with pytest.raises(ValueError, match="rates"):
-        Stage({"": -1.0})
-
-
-@pytest.mark.parametrize(
-    ("field", "size", "said"),
-    [
-        (rigid_body(IRIS), 20, "train: field: RigidBody does not take a state"),
-        (FIELD, 2.5, "settings.batch_size must be an integer of at least 1, got 2.5"),
-        (FIELD, 61, "train has 60 windows, fewer than batch_size=61"),
-        (Frozen(FIELD), 20, "field: Frozen has nothing to learn"),
-    ],
-    ids=["other field", "no count", "few windows", "frozen"],
-)
-def test_what_a_fit_refuses_stages_refuse(field, size, said):
-    with pytest.raises(ValueError, match=f"^{said}"):
-        fit_in_stages(field, TRAIN, VALIDATION, KEY, [Stage({"": 0.1})], settings=Settings(size))

@@ -10,7 +10,7 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 from systems import SYSTEMS, Dense
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import rollout_mse
@@ -28,6 +28,7 @@ BATCH = 20
 SETTINGS = Settings(batch_size=BATCH)
 TRAIN, VALIDATION = swings(60), swings(40, seed=1)
 KEY = jax.random.key(0)
+NETWORK = residual_network(2, 1, KEY, hidden=4)
 _run = eqx.filter_jit(run)
 
 
@@ -38,7 +39,7 @@ def trained(field, rates=0.03, key=KEY, train=TRAIN, validation=VALIDATION, sett
 
 def planned(field, subset, n_train, train=TRAIN, epochs=4):
     plan = make_run_config(0.03, subset, n_train, 100, 100, epochs, 0.0)
-    return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)
+    return _run(start(field, KEY), plan, train, VALIDATION, SETTINGS, epochs)[0]
 
 
 def validated(field):
@@ -132,7 +133,7 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
     errors, fields = [], []
     for until in range(1, 16):
-        state = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
+        state, _ = _run(state, plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(until))
         errors.append(validated(state.field))
         fields.append(state.field)
     best = int(np.argmin(errors))
@@ -151,15 +152,9 @@ def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
         assert state.epochs == max(minimum, state.best_epoch + patience)
     # With a rate of zero the first epoch is the best for ever; no later one is better.
     assert state.best_epoch == 1
-
-
-@pytest.mark.parametrize(
-    ("rules", "ended"),
-    [({"min_epochs": 0, "patience": 7}, ("ok", 8)), ({"min_epochs": 20, "max_epochs": 7}, ("capped", 7))],
-)
-def test_patience_or_the_cap_ends_a_run_that_gets_no_better(rules, ended):
-    state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
-    assert (state.status, state.epochs) == ended
+    for rules, ended in (({"min_epochs": 0, "patience": 7}, ("ok", 8)), ({"max_epochs": 7}, ("capped", 7))):
+        state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
+        assert (state.status, state.epochs) == ended
 
 
 def test_the_key_decides_the_order_of_minibatches(damped):
@@ -220,81 +215,22 @@ def test_double_precision_trains_alone_and_in_a_sweep():
 
 def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
-    good = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
+    good, _ = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
     spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x * jnp.nan)
-    bad = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
+    bad, _ = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
     assert (int(bad.status), int(bad.epoch)) == (DIVERGED, 4)
     assert eqx.tree_equal(bad.best, good.best)
     assert bad.best_mse == good.best_mse
 
 
-@pytest.mark.parametrize("name", ["train", "validation"])
-def test_bad_data_are_refused_by_name(name):
-    spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[2, 3, 1].set(jnp.inf))
-    with pytest.raises(ValueError, match=rf"^{name}: x\[2, 3, 1\] is not finite"):
-        trained(pendulum(), **{name: spoiled})
-
-
-def test_a_weight_is_that_of_a_regulariser_or_is_refused():
-    with pytest.raises(ValueError, match=r"^regulariser_weight is 1.0 but settings.regulariser is None; leave it out"):
-        trained(pendulum(), regulariser_weight=1.0)
-    field, settings = Hybrid(pendulum(0.6), residual_network(2, 1, KEY, hidden=4)), Settings(BATCH, residual_norm)
+def test_a_weight_is_that_of_a_regulariser():
+    field, settings = Hybrid(pendulum(0.6), NETWORK), Settings(BATCH, residual_norm)
     usual, same, other = (
         trained(field, settings=settings, max_epochs=1, **given)
         for given in ({}, {"regulariser_weight": 1e-3}, {"regulariser_weight": 1.0})
     )
     assert eqx.tree_equal(usual, same)
     assert usual.history.train[0] < other.history.train[0]
-
-
-class Stopped(AbstractVectorField):
-    """A wrapper that hides its field from differentiation."""
-
-    gain: jax.Array
-    field: AbstractVectorField
-
-    def __call__(self, x, u):
-        return self.gain * jax.lax.stop_gradient(self.field(x, u))
-
-
-def test_a_batch_norm_whose_statistics_cannot_be_recorded_is_refused():
-    with pytest.raises(ValueError, match=r"field: Stopped holds a BatchNorm whose minibatch statistics"):
-        trained(Stopped(jnp.ones(()), residual_network(2, 1, KEY, hidden=4)))
-
-
-class Stiff(AbstractVectorField):
-    """A pendulum whose length is a Python float."""
-
-    length: float
-
-    def __call__(self, x, u):
-        return jnp.stack([x[1], u[0] - jnp.sin(x[0]) / self.length])
-
-
-NOTHING = {"float": Stiff(1.0), "frozen": Frozen(pendulum()), "function": lambda x, u: x, "number": 1.0}
-
-
-@pytest.mark.parametrize("field", NOTHING.values(), ids=NOTHING)
-def test_a_field_with_nothing_to_learn_is_refused(field):
-    said = rf"^field: {type(field).__name__} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
-    with pytest.raises(ValueError, match=said):
-        trained(field)
-
-
-@pytest.mark.parametrize("alone", [True, False], ids=["fit", "sweep"])
-def test_one_window_is_not_normalised_by_itself(alone):
-    def train(norm, wrap=lambda network: network):
-        field = Hybrid(pendulum(), wrap(residual_network(2, 1, KEY, hidden=4, norm=norm)))
-        if alone:
-            return trained(field, settings=Settings(1), max_epochs=1)
-        plan = make_run_config(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
-        return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
-
-    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
-        train("batch")
-    for trains in (lambda: train("layer"), lambda: train("batch", Frozen)):
-        trained_once = trains()
-        assert np.all((trained_once.state if alone else trained_once).epoch == 1)
 
 
 def test_an_optax_optimiser_moves_a_field_as_adam_does():
@@ -306,8 +242,6 @@ def test_an_optax_optimiser_moves_a_field_as_adam_does():
     )
     for other in (inside, outside):
         np.testing.assert_allclose(other.field.log_length, usual.field.log_length, rtol=1e-5)
-    with pytest.raises(ValueError, match=r"^optimiser must be an optax\.GradientTransformation"):
-        trained(field, optimiser="adam")
 
 
 def test_ctrl_c_between_blocks_keeps_the_run_so_far():

@@ -1,0 +1,101 @@
+"""What training refuses, in one line that says what is wrong."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum, swings
+
+from hybrid_jax import IRIS, Hybrid, Settings, fit, residual_network
+from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.sweep.lanes import stack
+from hybrid_jax.sweep.training import sweep
+from hybrid_jax.training.fitting import make_run_config, start
+from hybrid_jax.training.stages import Stage, fit_in_stages
+
+TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
+NETWORK = residual_network(2, 1, KEY, hidden=4)
+FIELD = Hybrid(pendulum(), NETWORK)
+
+
+class Stopped(AbstractVectorField):
+    """A wrapper that hides its field from differentiation."""
+
+    gain: jax.Array
+    field: AbstractVectorField
+
+    def __call__(self, x, u):
+        return self.gain * jax.lax.stop_gradient(self.field(x, u))
+
+
+class Stiff(AbstractVectorField):
+    """A pendulum whose length is a Python float."""
+
+    length: float
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - jnp.sin(x[0]) / self.length])
+
+
+SPOILED = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[2, 3, 1].set(jnp.inf))
+NOTHING = "{} has nothing to learn, no array .* a Python float is none, use jnp.asarray$"
+REFUSED = {
+    "train": (pendulum(), {"train": SPOILED}, r"train: x\[2, 3, 1\] is not finite"),
+    "validation": (pendulum(), {"validation": SPOILED}, r"validation: x\[2, 3, 1\] is not finite"),
+    "weight": (pendulum(), {"regulariser_weight": 1.0}, "regulariser_weight is 1.0 but settings.regulariser is None;"),
+    "optimiser": (pendulum(), {"optimiser": "adam"}, r"optimiser must be an optax\.GradientTransformation"),
+    "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped holds a BatchNorm whose minibatch statistics"),
+    "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
+    "frozen": (Frozen(pendulum()), {}, f"field: {NOTHING.format('Frozen')}"),
+    "function": (lambda x, u: x, {}, f"field: {NOTHING.format('function')}"),
+    "number": (1.0, {}, f"field: {NOTHING.format('float')}"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_trained_is_refused_by_name(name):
+    field, options, said = REFUSED[name]
+    with pytest.raises(ValueError, match=f"^{said}"):
+        fit(field, **{"train": TRAIN, "validation": VALIDATION, "key": KEY, "settings": Settings(20)} | options)
+
+
+@pytest.mark.parametrize("alone", [True, False], ids=["fit", "sweep"])
+def test_one_window_is_not_normalised_by_itself(alone):
+    def train(norm, wrap=lambda network: network):
+        field = Hybrid(pendulum(), wrap(residual_network(2, 1, KEY, hidden=4, norm=norm)))
+        if alone:
+            return fit(field, TRAIN, VALIDATION, KEY, settings=Settings(1), max_epochs=1)
+        plan = make_run_config(0.03, jnp.arange(60), 60, 0, 1, 1, 0.0)
+        return sweep(stack([start(field, KEY)]), stack([plan]), TRAIN, VALIDATION, Settings(1))
+
+    with pytest.raises(ValueError, match=r"^settings.batch_size must be at least 2 where the field holds a BatchNorm"):
+        train("batch")
+    for state in (train("layer"), train("batch", Frozen)):
+        assert np.all((state.epochs if alone else state.epoch) == 1)
+
+
+@pytest.mark.parametrize(
+    ("stages", "said"), [([], "stages"), ([Stage({"": 0.1}, steps=9)], "steps"), ([Stage({"wing": 0.1})], "'wing'")]
+)
+def test_stages_that_make_no_sense_are_refused(stages, said):
+    with pytest.raises(ValueError, match=said):
+        fit_in_stages(FIELD, TRAIN, VALIDATION, KEY, stages, settings=Settings(20))
+    with pytest.raises(ValueError, match="rates"):
+        Stage({"": -1.0})
+
+
+@pytest.mark.parametrize(
+    ("field", "size", "said"),
+    [
+        (rigid_body(IRIS), 20, "train: field: RigidBody does not take a state"),
+        (FIELD, 2.5, "settings.batch_size must be an integer of at least 1, got 2.5"),
+        (FIELD, 61, "train has 60 windows, fewer than batch_size=61"),
+        (Frozen(FIELD), 20, "field: Frozen has nothing to learn"),
+    ],
+    ids=["other field", "no count", "few windows", "frozen"],
+)
+def test_what_a_fit_refuses_stages_refuse(field, size, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        fit_in_stages(field, TRAIN, VALIDATION, KEY, [Stage({"": 0.1})], settings=Settings(size))
