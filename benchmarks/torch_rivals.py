@@ -19,8 +19,7 @@ from hybrid_jax.dynamics.base import Hybrid as OurHybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.dynamics.rigid_body import RigidBody as OurRigidBody
 from hybrid_jax.networks.mlp import ResidualNetwork
-from hybrid_jax.networks.normalisation import BatchNorm
-from hybrid_jax.networks.scaling import InputScaling
+from hybrid_jax.networks.normalisation import BatchNorm, InputScaling
 from hybrid_jax.trajectories import Trajectories
 
 

@@ -4,18 +4,9 @@
     result = hj.adapt(source.best, windows)
     hj.save("model.npz", result.field)
 
-Packages, each importing only those before it:
-
-- dynamics: vector fields ẋ = f(x, u), the physics of multirotors, disturbances, baselines.
-- networks: residual networks, their scaling and normalisation, and what they read and return.
-- io: models, datasets and archives as files.
-- training: `fit`, losses, learning-rate groups and stages.
-- adaptation: `adapt` and its methods, least squares, confidence intervals.
-- sweep: many training runs as one compiled program, on all devices of all hosts.
-- sim: a MuJoCo MJX quadrotor with drag, ground effect and wind.
-- flights: recorded flights, read, checked and cut into windows.
-- control: closed-loop flight with any field as the prediction model.
-- export: fields and their steps as StableHLO and as CasADi functions.
+The packages from the bottom up: `dynamics` (vector fields, physics), `networks` (residuals), `io` (models and data as
+files), `training` (`fit`), `adaptation` (`adapt`), `sweep` (many runs as one program), `sim` (a MuJoCo quadrotor),
+`flights` (recorded logs), `control` (closed-loop flight), `export` (StableHLO, CasADi).
 """
 
 from importlib.metadata import PackageNotFoundError, version
@@ -59,49 +50,11 @@ try:
 except PackageNotFoundError:  # a checkout that is not installed
     __version__ = "0+unknown"
 
-__all__ = [
-    "IRIS",
-    "METHODS",
-    "RK4",
-    "SOLVERS",
-    "AbstractVectorField",
-    "Adaptation",
-    "FineTune",
-    "Frozen",
-    "Hybrid",
-    "LeastSquares",
-    "Method",
-    "Model",
-    "Multirotor",
-    "Ridge",
-    "RigidBody",
-    "Settings",
-    "Solution",
-    "Source",
-    "Stage",
-    "Trajectories",
-    "Vehicle",
-    "__version__",
-    "adapt",
-    "check_savable",
-    "covariance_of",
-    "fit",
-    "fit_in_stages",
-    "fit_least_squares",
-    "intervals",
-    "load",
-    "load_log",
-    "load_vehicle",
-    "load_windows",
-    "multirotor",
-    "portable",
-    "rates_by_group",
-    "residual_network",
-    "rigid_body",
-    "rollout",
-    "rollout_batch",
-    "runtime",
-    "save",
-    "with_disturbance",
-    "with_scaling",
-]
+__all__ = ["Trajectories", "__version__", "runtime"]
+__all__ += ["AbstractVectorField", "Frozen", "Hybrid", "with_disturbance"]
+__all__ += ["IRIS", "Multirotor", "RigidBody", "Vehicle", "load_vehicle", "multirotor", "rigid_body"]
+__all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "with_scaling"]
+__all__ += ["Model", "check_savable", "load", "portable", "save"]
+__all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
+__all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
+__all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows"]

@@ -1,7 +1,6 @@
 """Checks of arguments. Each raises a ValueError of one line: the argument's name, what was expected, and the value.
 
-In a compiled or mapped program an array is traced: it has a shape and a type but no numbers yet. There the numbers are
-not checked.
+In a compiled or mapped program an array is traced: it has no numbers yet, and they are not checked.
 """
 
 import math
@@ -18,10 +17,7 @@ Numbers = jax.Array | np.ndarray
 
 UNIT = 1e-2  # |q| may be off 1 by this: rounding and noise are far below, and it is 2 % of the thrust
 MOST = np.iinfo(np.int32).max  # what a count may be in a compiled program
-SMALLEST, LARGEST = (
-    float(np.finfo(np.float32).tiny),
-    float(np.finfo(np.float32).max),
-)  # of positive numbers
+SMALLEST, LARGEST = float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)  # of positive numbers
 
 
 def is_traced(value: Any) -> bool:
@@ -84,18 +80,16 @@ def real(value: Any) -> float | None:
     return math.inf if too_long else float(value)
 
 
-def number(name: str, value: Any) -> None:
+def number(name: str, value: Any, what: str = "a finite number", least: float = -LARGEST) -> None:
     """Require a number that is finite in single precision."""
     found = real(value)
-    if not is_traced(value) and (found is None or not abs(found) <= LARGEST):
-        raise ValueError(f"{name} must be a finite number, got {short_repr(value)}")
+    if not is_traced(value) and (found is None or not least <= found <= LARGEST):
+        raise ValueError(f"{name} must be {what}, got {short_repr(value)}")
 
 
 def positive(name: str, value: Any, what: str = "a positive finite number") -> None:
     """Require a positive number that is finite in single precision."""
-    found = real(value)
-    if not is_traced(value) and (found is None or not SMALLEST <= found <= LARGEST):
-        raise ValueError(f"{name} must be {what}, got {short_repr(value)}")
+    number(name, value, what, SMALLEST)
 
 
 def not_negative(name: str, value: Any) -> None:

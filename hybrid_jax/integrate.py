@@ -1,7 +1,7 @@
 """Trajectories of a vector field under inputs held over each interval, by any one-step solver of diffrax for ODEs.
 
-A single solve that looks up its input by time would be wrong: a stage at the end of a step reads the next input. So
-each interval is a solver step of its own, with its input as `args`, and a `scan` goes over the intervals.
+Each interval is a solver step of its own, with its input as `args`: in a single solve that looks up its input by time,
+a stage at the end of a step would read the next input.
 """
 
 import dataclasses
@@ -183,12 +183,7 @@ def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.
 
 
 def rollout_minibatch(
-    field: AbstractVectorField,
-    x0: Float[Array, "d b"],
-    u: Float[Array, "t m b"],
-    dt: float,
-    solver: Solver,
-    substeps: int = 1,
+    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
 ) -> Float[Array, "t d b"]:
     """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
 

@@ -15,11 +15,7 @@ CHUNK = 1000  # windows predicted at once
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window.
-
-    Raises:
-        ValueError: arrays of different shapes, or without a state.
-    """
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError for arrays of different shapes, or without a state."""
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
     return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
@@ -30,8 +26,7 @@ def rollout_mse(
 ) -> Float[Array, ""]:
     """L_MSE of a field in inference mode, mean over windows, at the end of every `every`-th interval.
 
-    Windows are predicted `chunk` at a time, which bounds memory and keeps the work in cache. The result is not finite
-    if the field diverges.
+    It is not finite if the field diverges. To predict `chunk` windows at a time bounds memory.
 
     Raises:
         ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.

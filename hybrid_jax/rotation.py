@@ -33,19 +33,13 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 def rotate(q: Quaternion, v: Vector) -> Vector:
     """The vector part of q ⊗ [0, v] ⊗ q̄: a body vector in the world frame (scaled by |q|² if q is not unit)."""
-    return multiply(multiply(q, pure(v)), conjugate(q))[1:]
+    return multiply(multiply(q, jnp.stack([jnp.zeros_like(v[0]), *v])), conjugate(q))[1:]
 
 
 def body_z(q: Quaternion | Rows) -> Vector:
     """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
     w, x, y, z = q
     return jnp.stack([2 * (x * z + w * y), 2 * (y * z - w * x), w * w - x * x - y * y + z * z])
-
-
-def pure(v: Vector) -> Quaternion:
-    """[0, v]."""
-    x, y, z = v
-    return jnp.stack([jnp.zeros_like(x), x, y, z])
 
 
 def derivative(q: Quaternion | Rows, body_rates: Vector | Rows) -> Quaternion:
@@ -65,3 +59,35 @@ def from_axis_angle(axis: Vector, angle: Float[Array, ""]) -> Quaternion:
     """The rotation by angle [rad] about a unit axis."""
     half = jnp.asarray(angle) / 2
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * jnp.asarray(axis)])
+
+
+def rotation_vector(q: Quaternion) -> Vector:
+    """Rotation vector [rad] of q, at most π long and equal for q and −q; q need not have length 1.
+
+    The sine of the angle would be simpler, but it is 0 at half a turn, where a controller that minimises it stays.
+    """
+    w, v = jnp.where(q[0] < 0, -q[0], q[0]), jnp.where(q[0] < 0, -q[1:], q[1:])
+    square = v @ v
+    small = square < 1e-8 * w * w  # there the next term of the series is below single precision
+    sine = jnp.sqrt(jnp.where(small, 1.0, square))
+    factor = jnp.where(small, 2 / jnp.where(small, w, 1.0), 2 * jnp.arctan2(sine, w) / sine)
+    return factor * v
+
+
+def attitude_error(reference: Quaternion, q: Quaternion) -> Vector:
+    """Rotation vector [rad, body frame] from the reference attitude to q."""
+    return rotation_vector(multiply(conjugate(reference), q))
+
+
+def canonicalize_quaternion(q: Quaternion) -> Quaternion:
+    """Whichever of q and −q has a positive first nonzero entry.
+
+    Both are the same rotation, but different inputs to a network, which was trained near w > 0.
+    """
+    return q * jnp.sign(q[jnp.argmax(q != 0)])
+
+
+def heading(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:
+    """Yaw [rad], the first of the Euler angles z, y, x."""
+    w, x, y, z = jnp.moveaxis(q, -1, 0)
+    return jnp.arctan2(2 * (w * z + x * y), w * w + x * x - y * y - z * z)

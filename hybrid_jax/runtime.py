@@ -12,8 +12,7 @@ from typing import Any
 import jax
 
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
-PROGRAM = "*-cache"
-VERIFIED = ".verified"
+CPUS = Path("/proc/cpuinfo")
 FLAGS = "XLA_FLAGS"
 EXTRA = "--xla_backend_extra_options"
 # XLA compiles a loop without matrix products into one kernel if it touches at most this many bytes, by default 1024.
@@ -31,9 +30,6 @@ FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
 
 def configure(cache: Path) -> None:
     """Configure JAX. Call it before the first array is made, which fixes JAX's devices.
-
-    Truncated programs in the compilation cache, left by a kill, are deleted: JAX would warn of each in every run,
-    recompile it and never replace it.
 
     Args:
         cache: compiled programs are kept in its subfolder `programs`, unless JAX_COMPILATION_CACHE_DIR is set.
@@ -77,10 +73,7 @@ def hardware() -> dict[str, Any]:
 
 
 def _processor() -> str:
-    try:
-        lines = Path("/proc/cpuinfo").read_text().splitlines()
-    except OSError:  # not Linux
-        lines = []
+    lines = CPUS.read_text().splitlines() if CPUS.exists() else []  # Linux alone has them
     names = [line.partition(":")[2].strip() for line in lines if line.startswith("model name")]
     return names[0] if names else platform.processor() or platform.machine()
 
@@ -93,10 +86,11 @@ def _memory() -> float | None:
 
 
 def _delete_truncated(programs: Path) -> None:
-    verified = programs / VERIFIED
+    """Delete what a kill left half written, since JAX would warn of it in every run and never replace it."""
+    verified = programs / ".verified"
     since = verified.stat().st_mtime_ns if verified.exists() else 0
     verified.touch()  # first, so that programs written meanwhile are verified next time
-    for path in programs.glob(PROGRAM):
+    for path in programs.glob("*-cache"):
         with contextlib.suppress(FileNotFoundError):  # deleted by another process
             if path.stat().st_mtime_ns >= since and _is_truncated(path.read_bytes()):
                 path.unlink()

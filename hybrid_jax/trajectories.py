@@ -10,19 +10,12 @@ from hybrid_jax.state import STATE_SIZE
 
 
 class Trajectories(eqx.Module):
-    """n windows of t equal intervals.
+    """n windows of t equal intervals."""
 
-    Attributes:
-        x0: initial state of each window.
-        u: input held over each interval.
-        x: state at the end of each interval; x[:, i] is the state (i + 1) dt after x0.
-        dt: length of an interval [s].
-    """
-
-    x0: Float[Array | np.ndarray, "*n d"]
-    u: Float[Array | np.ndarray, "*n t m"]
-    x: Float[Array | np.ndarray, "*n t d"]
-    dt: float = eqx.field(static=True)
+    x0: Float[Array | np.ndarray, "*n d"]  # initial state of each window
+    u: Float[Array | np.ndarray, "*n t m"]  # input held over each interval
+    x: Float[Array | np.ndarray, "*n t d"]  # state at the end of each interval: x[:, i] is (i + 1) dt after x0
+    dt: float = eqx.field(static=True)  # length of an interval [s]
 
     def __len__(self) -> int:
         return self.x0.shape[0]
@@ -33,11 +26,7 @@ class Trajectories(eqx.Module):
         return self.x.shape[-2]
 
     def __getitem__(self, index) -> "Trajectories":
-        """The windows at a number, a slice or an array of indices, which may be traced.
-
-        Raises:
-            IndexError: a number out of range.
-        """
+        """The windows at a number, a slice or an array of indices, which may be traced; IndexError out of range."""
         # JAX would clamp the index, and a loop over the windows would not end.
         if isinstance(index, int | np.integer) and not -len(self) <= index < len(self):
             raise IndexError(f"window {index} of {len(self)}")
@@ -45,11 +34,7 @@ class Trajectories(eqx.Module):
 
 
 def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectories:
-    """The trajectories unchanged, after checks of shapes, dt and, unless traced, that every number is finite.
-
-    Raises:
-        ValueError: says which array of `name` is wrong, where, and what was expected.
-    """
+    """The trajectories unchanged; ValueError for shapes, a dt or, unless traced, a number that is not finite."""
     if not isinstance(trajectories, Trajectories):
         raise ValueError(f"{name}: must be Trajectories, got {type(trajectories).__name__}")
     x0, u, x = trajectories.x0, trajectories.u, trajectories.x
@@ -58,10 +43,8 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
         found = getattr(array, "dtype", type(array).__name__)
         if not isinstance(array, checks.Numbers) or found not in (np.float32, np.float64):
             raise ValueError(f"{name}: {part} must be an array of float32 or float64, got {found}")
-    if x0.ndim != 2 or u.ndim != 3 or x.ndim != 3:
-        raise ValueError(
-            f"{name}: x0, u, x must have 2, 3, 3 axes (n, d), (n, t, m), (n, t, d), got {x0.ndim}, {u.ndim}, {x.ndim}"
-        )
+    if (axes := (x0.ndim, u.ndim, x.ndim)) != (2, 3, 3):
+        raise ValueError(f"{name}: x0, u, x must have 2, 3, 3 axes (n, d), (n, t, m), (n, t, d), got {axes}")
     n, d = x0.shape
     if x.shape != (n, u.shape[1], d) or u.shape[0] != n:
         raise ValueError(f"{name}: shapes of x0 {x0.shape}, u {u.shape} and x {x.shape} do not agree")
@@ -76,22 +59,14 @@ def check(trajectories: Trajectories, name: str = "trajectories") -> Trajectorie
 
 
 def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> None:
-    """Refuse states of 13 numbers (state.py) whose quaternions are not of norm 1.
-
-    Raises:
-        ValueError: the index of the first such quaternion and its norm.
-    """
+    """Raise ValueError for states of 13 numbers (state.py) whose quaternions are not of norm 1."""
     if trajectories.x0.shape[-1] == STATE_SIZE:
         checks.unit_quaternions(f"{name}: x0", trajectories.x0)
         checks.unit_quaternions(f"{name}: x", trajectories.x)
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
-    """The first `at` intervals of each window, and the intervals after them.
-
-    Raises:
-        ValueError: a part would be empty.
-    """
+    """The first `at` intervals of each window, and the intervals after them; ValueError if a part would be empty."""
     checks.count("at", at)
     if not at < trajectories.horizon:
         raise ValueError(f"at must lie between 0 and the horizon {trajectories.horizon}, got {at}")
@@ -134,11 +109,7 @@ def windows_of(
 
 
 def concatenate(parts: list[Trajectories]) -> Trajectories:
-    """All windows of the parts, in order.
-
-    Raises:
-        ValueError: no parts, or parts that differ in dt, horizon, or size of state or input.
-    """
+    """All windows of the parts, in order; ValueError if they differ in dt, horizon, or size of state or input."""
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
         raise ValueError(f"parts must share dt and horizon, and sizes of state and input, got {sizes}")

@@ -14,32 +14,17 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The constants of a quadrotor, SI units, body frame x forward, y left, z up.
+    """The constants of a quadrotor, body frame x forward, y left, z up; ValueError unless positive and finite."""
 
-    Attributes:
-        mass: [kg].
-        inertia: principal moments (Ix, Iy, Iz) [kg m²].
-        thrust_coefficient: k, thrust of a rotor is k u² [N/(rad/s)²].
-        torque_coefficient: c_m, reaction torque of a rotor is c_m u² [N m/(rad/s)²].
-        rotor_positions: (x, y) of each rotor [m].
-        spin: sign of each rotor's reaction torque about body z, ±1.
-        rotor_radius: [m].
-        max_rotor_speed: [rad/s].
-        gravity: [m/s²].
-
-    Raises:
-        ValueError: a constant that is not finite and positive in single precision, or a list of the wrong length.
-    """
-
-    mass: float
-    inertia: tuple[float, float, float]
-    thrust_coefficient: float
-    torque_coefficient: float
-    rotor_positions: tuple[tuple[float, float], ...]
-    spin: tuple[float, ...]
-    max_rotor_speed: float
-    rotor_radius: float = 0.0
-    gravity: float = 9.81
+    mass: float  # kg
+    inertia: tuple[float, float, float]  # principal moments (Ix, Iy, Iz), kg m²
+    thrust_coefficient: float  # k, thrust of a rotor is k u², N/(rad/s)²
+    torque_coefficient: float  # c_m, reaction torque of a rotor is c_m u², N m/(rad/s)²
+    rotor_positions: tuple[tuple[float, float], ...]  # (x, y) of each rotor, m
+    spin: tuple[float, ...]  # sign of each rotor's reaction torque about body z, ±1
+    max_rotor_speed: float  # rad/s
+    rotor_radius: float = 0.0  # m
+    gravity: float = 9.81  # m/s²
     name: str = "vehicle"
 
     def __post_init__(self):
@@ -89,32 +74,28 @@ def vehicle_of(tables: Mapping[str, Any], path: str | Path, variant: str | None 
     table = tables.get("vehicle")
     if not isinstance(table, dict):
         raise ValueError(f"{path}: has no table [vehicle]")
-    changes = {key: table[key] for key in table.keys() - names_of(Vehicle) if isinstance(table[key], dict)}
+    own = Vehicle.__dataclass_fields__
+    changes = {key: value for key, value in table.items() if key not in own and isinstance(value, dict)}
     if variant is not None and variant not in changes:
         found = ", ".join(sorted(map(repr, changes))) or "none"
         raise ValueError(f"{path}: has no table [vehicle.{variant}]; its variants are {found}")
     common = {key: value for key, value in table.items() if key not in changes}
-    vehicle = from_table(Vehicle, common, f"{path}: [vehicle]")
-    variants = {
-        name: from_table(Vehicle, common | changes[name], f"{path}: [vehicle.{name}]") for name in sorted(changes)
-    }
-    return vehicle if variant is None else variants[variant]
+    vehicles: dict[str | None, Vehicle] = {None: from_table(Vehicle, common, f"{path}: [vehicle]")}
+    for name in sorted(changes):
+        vehicles[name] = from_table(Vehicle, common | changes[name], f"{path}: [vehicle.{name}]")
+    return vehicles[variant]
 
 
 def from_table(cls: type[T], table: Mapping[str, Any], where: str) -> T:
     """A dataclass from a table of TOML; ValueError, after `where`, for a wrong or missing key or a refused value."""
-    require_known(where, table, names_of(cls))
-    if missing := [name for name, required in names_of(cls).items() if required and name not in table]:
+    required = [each.name for each in fields(cls) if each.default is MISSING and each.default_factory is MISSING]  # type: ignore
+    require_known(where, table, [each.name for each in fields(cls)])  # type: ignore
+    if missing := [name for name in required if name not in table]:
         raise ValueError(f"{where}: {', '.join(missing)}: must be given")
     try:
         return cls(**{key: as_tuple(value) for key, value in table.items()})
     except ValueError as error:
         raise ValueError(f"{where}: {checks.first_line(error)}") from error
-
-
-def names_of(cls: Any) -> dict[str, bool]:
-    """The names of the fields of a dataclass, and whether they must be given."""
-    return {field.name: field.default is MISSING and field.default_factory is MISSING for field in fields(cls)}
 
 
 def require_known(where: str, table: Mapping[str, Any], known: Iterable[str]) -> None:

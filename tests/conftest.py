@@ -38,3 +38,11 @@ def heard():
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="module")
+def double_precision():
+    import jax
+
+    with jax.enable_x64(True):
+        yield

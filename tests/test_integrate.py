@@ -12,6 +12,8 @@ from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.integrate import RK4, SOLVERS, along, rollout, rollout_batch, rollout_minibatch
 from hybrid_jax.networks.mlp import residual_network
 
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+
 DT = 0.2
 START = np.array([0.5, -1.0])
 TORQUES = np.array([[3.0], [-40.0], [0.0], [25.0], [25.0]])  # jumps that a stage in the wrong interval would feel
@@ -24,12 +26,6 @@ ODE_SOLVERS = (
 )
 OTHER_SOLVERS = ("EulerHeun", "ItoMilstein", "SEA", "SemiImplicitEuler", "KenCarp3", "ALIGN", "LeapfrogMidpoint")
 STEPPERS = (RK4(), diffrax.Tsit5(), IMPLICIT)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 @pytest.fixture(scope="module")

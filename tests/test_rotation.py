@@ -9,6 +9,8 @@ from hypothesis import strategies as st
 
 from hybrid_jax import rotation
 
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+
 # Round-off of a few dozen float64 operations on numbers of at most 100.
 CLOSE = {"rtol": 0, "atol": 1e-12}
 number = st.floats(-3, 3, allow_subnormal=False)
@@ -21,12 +23,6 @@ def units(draw):
     q = np.array(draw(st.tuples(number, number, number, number)))
     assume(np.linalg.norm(q) > 0.1)
     return q / np.linalg.norm(q)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def matrix(q):
@@ -91,3 +87,53 @@ def test_derivative_is_the_limit_of_a_finite_rotation_about_a_body_axis(q, rates
 def test_normalise_gives_the_unit_quaternion_of_the_same_direction(q, length):
     rows = jnp.stack([jnp.asarray(q) * length, jnp.asarray(q)])
     np.testing.assert_allclose(rotation.normalise(rows), [q, q], **CLOSE)
+
+
+AXES = np.random.default_rng(0).normal(size=(20, 3))
+AXES = AXES / np.linalg.norm(AXES, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("angle", [0.0, 1e-6, 1e-4, 0.5, 2.0, 3.1])
+def test_rotation_vector_is_axis_times_angle(angle):
+    for axis in AXES:
+        q = rotation.from_axis_angle(jnp.array(axis), jnp.array(angle))
+        # sin and cos of half the angle are rounded to 6e-8.
+        for same in (q, -q, 3 * q):
+            np.testing.assert_allclose(rotation.rotation_vector(same), angle * axis, rtol=0, atol=1e-6)
+
+
+def test_rotation_vector_has_the_derivative_of_a_small_rotation():
+    for angle in (0.0, 1e-5, 1.0):
+        here = rotation.from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(angle))
+        slope = jax.jacfwd(
+            lambda turn, here=here: rotation.rotation_vector(
+                rotation.multiply(here, jnp.concatenate([jnp.ones(1), turn / 2]))
+            )
+        )(jnp.zeros(3))
+        np.testing.assert_allclose(slope[2], [0, 0, 1], rtol=0, atol=1e-5)  # about the axis of the turn
+    assert np.isfinite(slope).all()
+
+
+def test_half_a_turn_has_a_nonzero_derivative():
+    wanted, opposite = jnp.array([1.0, 0.0, 0.0, 0.0]), jnp.array([0.0, 0.0, 0.0, 1.0])
+    np.testing.assert_allclose(rotation.attitude_error(wanted, opposite), [0, 0, np.pi], rtol=1e-6)
+    slope = jax.grad(lambda w: rotation.attitude_error(wanted, jnp.array([0.0, 0.0, 0.0, 1.0]).at[0].set(w))[2])(0.0)
+    assert slope == pytest.approx(-2.0, rel=1e-5)  # angle = 2 arctan(1 / w)
+
+
+def test_q_and_minus_q_have_one_canonical_form():
+    quaternions = np.concatenate([np.random.default_rng(1).normal(size=(20, 4)), np.eye(4)]).astype(np.float32)
+    for q in quaternions:
+        one = rotation.canonicalize_quaternion(jnp.array(q))
+        np.testing.assert_array_equal(one, rotation.canonicalize_quaternion(jnp.array(-q)))
+        np.testing.assert_array_equal(np.abs(one), np.abs(q))
+        assert one[0] >= 0
+
+
+def test_heading_is_the_first_of_the_z_y_x_angles():
+    turns = [
+        rotation.from_axis_angle(jnp.array(axis), jnp.array(angle))
+        for axis, angle in zip(np.eye(3)[::-1], (2.5, 0.7, -0.4), strict=True)
+    ]
+    q = rotation.multiply(rotation.multiply(turns[0], turns[1]), turns[2])
+    np.testing.assert_allclose(rotation.heading(jnp.stack([q, -q])), 2.5, rtol=1e-6)

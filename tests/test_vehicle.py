@@ -1,10 +1,14 @@
-"""A vehicle file is read, or refused in one line that names what is wrong."""
+"""A vehicle file is read, with its terms and what is to be learned, or refused in one line that says what is wrong."""
 
 import math
 from dataclasses import replace
 
 import pytest
 
+from hybrid_jax import rigid_body
+from hybrid_jax.dynamics.multirotor import Multirotor
+from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.vehicle import IRIS, load_vehicle
 
 GOOD = {
@@ -23,18 +27,19 @@ GOOD = {
 
 @pytest.fixture
 def written(tmp_path):
-    def write(**changes):
+    def write(above="", below="", **changes):
         entries = {key: value for key, value in (GOOD | changes).items() if value is not None}
         path = tmp_path / "vehicle.toml"
-        path.write_text("[vehicle]\n" + "".join(f"{key} = {value}\n" for key, value in entries.items()))
+        lines = [above, "[vehicle]", *(f"{key} = {value}" for key, value in entries.items()), below]
+        path.write_text("\n".join(lines))
         return path
 
     return write
 
 
-def refusal(path):
+def refusal(path, read=load_vehicle):
     with pytest.raises(ValueError, match=r".") as error:
-        load_vehicle(path)
+        read(path)
     message = str(error.value)
     assert str(path) in message
     assert "\n" not in message
@@ -91,30 +96,23 @@ def test_malformed_constants_are_named(written, key, value):
     assert key in refusal(written(**{key: value}))
 
 
-@pytest.fixture
-def with_payload(written):
-    def write(text):
-        path = written()
-        path.write_text(path.read_text() + f"[vehicle.payload]\n{text}\n")
-        return path
-
-    return write
+PAYLOAD = "[vehicle.payload]\nmass = 2.0\n"
 
 
-def test_variant_overrides_constants(with_payload):
-    path = with_payload("mass = 2.0")
+def test_variant_overrides_constants(written):
+    path = written(below=PAYLOAD)
     assert load_vehicle(path).mass == 1.5
     assert load_vehicle(path, "payload") == replace(load_vehicle(path), mass=2.0)
 
 
 @pytest.mark.parametrize("text", ["mas = 2.0", "mass = -2.0", "[vehicle.payload.heavy]"])
-def test_all_variants_are_checked(with_payload, text):
-    assert "[vehicle.payload]" in refusal(with_payload(text))
+def test_all_variants_are_checked(written, text):
+    assert "[vehicle.payload]" in refusal(written(below=f"[vehicle.payload]\n{text}"))
 
 
-def test_unknown_variant_is_refused_with_the_known_ones(with_payload):
+def test_unknown_variant_is_refused_with_the_known_ones(written):
     with pytest.raises(ValueError, match=r"no table \[vehicle.load\]; its variants are 'payload'"):
-        load_vehicle(with_payload("mass = 2.0"), "load")
+        load_vehicle(written(below=PAYLOAD), "load")
 
 
 def test_unknown_key_is_refused_with_the_known_ones(written):
@@ -138,3 +136,45 @@ def test_hover_speed_carries_the_weight():
     lift = 4 * IRIS.thrust_coefficient * IRIS.hover_speed**2
     assert math.isclose(lift, IRIS.mass * IRIS.gravity, rel_tol=1e-12)
     assert 655 < IRIS.hover_speed < 657  # the paper's figure is about 656 rad/s
+
+
+def test_vehicle_without_terms_is_the_rigid_body_of_the_paper(written):
+    found = load_vehicle_model(written())
+    assert found == VehicleModel(load_vehicle(written()))
+    assert set(found.physics().deviations) == set(rigid_body(found.vehicle).log_ratios)
+
+
+def test_terms_and_learned_names_are_read(written):
+    terms = "[terms]\ndrag = [0.1, 0.2, 0]\nmotor_time_constant = 0.02\n"
+    found = load_vehicle_model(
+        written('learn = ["k_rotors", "drag", "motor_time_constant"]', PAYLOAD + terms), "payload"
+    )
+    assert found.terms == Terms(drag=(0.1, 0.2, 0.0), motor_time_constant=0.02)
+    physics = found.physics()
+    assert isinstance(physics, Multirotor)
+    assert set(physics.deviations) == {"k_rotors", "drag"}
+    assert physics.vehicle.mass == 2
+    assert LAG in found.learn
+    hash(found)
+
+
+@pytest.mark.parametrize(
+    ("above", "below", "message"),
+    [
+        ('learn = ["mass"]', "", "learn must be names of"),
+        ('learn = ["k", "k"]', "", "learn"),
+        ('learn = ["k", "k_rotors"]', "", "both k and k_rotors"),
+        ('learn = "k"', "", "learn must be a list"),
+        ("learn = [1]", "", "learn must be a list"),
+        ("[learn]\nk = true", "", "learn must be a list"),
+        ("", 'learn = ["k"]', "above all tables"),
+        ('lern = ["k"]', "", "'lern'"),
+        ("", "[terms]\ndarg = [1, 2, 3]", "'darg': must be one of torque_gain,"),
+        ("", "[terms]\ndrag = [1, 2]", "drag must be"),
+        ("", "[terms]\nmotor_time_constant = -1", "motor_time_constant"),
+        ("terms = 3", "", "table [terms]"),
+        ("vehicle", "", "readable TOML"),
+    ],
+)
+def test_what_cannot_be_learned_is_refused(written, above, below, message):
+    assert message in refusal(written(above, below), load_vehicle_model)

@@ -148,9 +148,7 @@ class Config(Run):
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         if self.pooled() + self.source_train + self.validation + self.test > MOST:
-            raise ValueError(
-                f"trajectories: --sizes, --pool, --source-train, --validation, --test: at most {MOST}"
-            )
+            raise ValueError(f"trajectories: --sizes, --pool, --source-train, --validation, --test: at most {MOST}")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
             raise ValueError(f"--sizes must each be more than the {FITTED} parameters of constant_disturbance")

@@ -10,8 +10,7 @@ from jaxtyping import PRNGKeyArray
 
 from experiments.real_flight.recipes import Recipe
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.dynamics.baselines import FrozenRates
-from hybrid_jax.dynamics.kinematics import Kinematics
+from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.networks.factory import make_residual

@@ -1,12 +1,8 @@
 """A model predictive controller for a multirotor: real-time Gauss–Newton on any vector field of the library.
 
-It follows the real-time iteration (Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in
-optimal feedback control", 2005): one Gauss–Newton step per call, from the last plan shifted by one period. Rotor speeds
-are a smooth function of unbounded decision variables and so stay within their limits. The states are eliminated
-(condensing: Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal control problems", 1984).
-
-The line search varies the damping (Levenberg–Marquardt), not the length of one step: after a large initial rate a long
-Gauss–Newton step is mostly no descent direction, at any length.
+The real-time iteration (Diehl, Bock, Schlöder, "A real-time iteration scheme for nonlinear optimization in optimal
+feedback control", 2005) with condensing (Bock and Plitt, "A multiple shooting algorithm for direct solution of optimal
+control problems", 1984). Rotor speeds are a smooth function of unbounded variables and so stay within their limits.
 """
 
 import math
@@ -16,21 +12,25 @@ from functools import partial
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.control.attitude import canonicalize_quaternion, recovery_speeds
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
-from hybrid_jax.control.sensitivities import advance, advance_with_jacobian
+from hybrid_jax.control.sensitivities import advance, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
-from hybrid_jax.rotation import normalise
-from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
+from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
+from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vehicle import Vehicle
 
 VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
-DAMPING_FACTORS = (0.1, 1.0, 10.0)  # tried by the line search
+# The line search varies the damping (Levenberg–Marquardt), not the length of a step: after a large initial rate a long
+# Gauss–Newton step is mostly no descent direction, at any length.
+DAMPING_FACTORS = (0.1, 1.0, 10.0)
 FAILURE_FACTOR = 100.0  # on the damping, when none of them lowered the cost
 INITIAL_DAMPING, MAX_DAMPING = 10.0, 1e8
+# 1/s² and 1/s: the largest gains of the recovery that are stable with inputs held for 0.05 s.
+ATTITUDE_GAIN, RATE_GAIN = 30.0, 10.0
 
 
 class Plan(eqx.Module):
@@ -44,8 +44,17 @@ class Plan(eqx.Module):
 _Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
 
 
-def promote(x: State, reference: Float[Array, "n 13"], plan: Plan) -> tuple[State, Float[Array, "n 13"], Plan]:
-    """All three in one dtype: the carry of a loop must not change its own."""
+def checked_states(
+    name: str, x: State, reference: Float[Array, "n 13"], plan: Plan, steps: int | None = None
+) -> tuple[State, Float[Array, "n 13"], Plan]:
+    """x, a reference (of that many steps) and the plan in one dtype, as the carry of a loop must keep its own."""
+    x, reference = checks.floating(name, x), checks.floating("reference", reference)
+    fits = reference.ndim == 2 and reference.shape[1] == STATE_SIZE and steps in (None, len(reference))
+    if x.shape != (STATE_SIZE,) or not fits:
+        expected = f"{name} (13,) and reference ({steps or 'n'}, 13)"
+        raise ValueError(f"{expected} expected, got {x.shape} and {reference.shape}")
+    checks.unit_quaternions(name, x)
+    checks.unit_quaternions("reference", reference)
     dtype = jnp.result_type(*jax.tree.leaves((x, reference, plan)))
     return jax.tree.map(lambda leaf: leaf.astype(dtype), (x, reference, plan))
 
@@ -122,26 +131,20 @@ class Controller:
         """Rotor speeds [rad/s] to hold for one period from state x, and the new plan.
 
         Args:
-            model: prediction model.
-            reference: reference state at the end of each interval (see `horizon`).
+            reference: the state to reach by the end of each interval (see `horizon`).
             plan: that of the last call, or `begin()`.
 
         Raises:
-            ValueError: `model` is not callable, or `plan` or a shape does not fit; for concrete values also if one is
-                not finite or a quaternion is not of length 1. A compiled call normalises that of x.
+            ValueError: something does not fit; for concrete values also if one is not finite or a quaternion is not of
+                length 1. A compiled call normalises that of x.
         """
         if not callable(model):
             raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
-        x, reference = checks.floating("x", x), checks.floating("reference", reference)
-        if x.shape != (STATE_SIZE,) or reference.shape != (self.steps, STATE_SIZE):
-            raise ValueError(f"x (13,) and reference ({self.steps}, 13) expected, got {x.shape} and {reference.shape}")
         if not isinstance(plan, Plan):
             raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
         if plan.variables.shape != (self.steps, INPUT_SIZE):
             raise ValueError(f"plan must have variables of shape ({self.steps}, 4), got {plan.variables.shape}")
-        checks.unit_quaternions("x", x)
-        checks.unit_quaternions("reference", reference)
-        x, reference, plan = promote(x, reference, plan)
+        x, reference, plan = checked_states("x", x, reference, plan, self.steps)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
         point = self._initial_guess(model, reference, x, plan)
@@ -178,9 +181,21 @@ class Controller:
         return Plan(best[0], best[1], plan.damping), best[2]
 
     def _recovery(self, wanted: State, x: State) -> Float[Array, "4"]:
-        """Decision variables that turn the vehicle to the reference attitude."""
-        middle, half = self._range()
-        share = (recovery_speeds(self.vehicle, wanted, x) - middle) / half
+        """Decision variables for hover thrust and −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error.
+
+        After a large initial rate the shifted plan may contain a full roll, at a hundred times the least cost, and
+        every small change of it costs more.
+        """
+        vehicle, (middle, half) = self.vehicle, self._range()
+        angle = attitude_error(wanted[QUATERNION], x[QUATERNION])
+        acceleration = -ATTITUDE_GAIN * angle - RATE_GAIN * (x[BODY_RATES] - wanted[BODY_RATES])
+        weight = jnp.asarray([vehicle.mass * vehicle.gravity], x.dtype)
+        wrench = jnp.concatenate([weight, jnp.asarray(vehicle.inertia, x.dtype) * acceleration])
+        px, py = np.array(vehicle.rotor_positions).T
+        k, c_m = vehicle.thrust_coefficient, vehicle.torque_coefficient
+        mixer = np.stack([k * np.ones(4), k * py, -k * px, c_m * np.array(vehicle.spin)])
+        squares = jnp.asarray(np.linalg.pinv(mixer), x.dtype) @ wrench
+        share = (jnp.sqrt(jnp.maximum(squares, 0.0)) - middle) / half
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 
     def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, "4"]) -> State:
@@ -223,34 +238,15 @@ class Controller:
         weighted = partial(deviations, self.weights)
         residual = jax.vmap(weighted)(reference, x[1:])
         jacobian = jax.vmap(jax.jacfwd(weighted, argnums=1))(reference, x[1:])
-        sensitivities = self._sensitivities(model, x[:-1], variables)
-        slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         share = jnp.tanh(variables)
         slope = 1 - jnp.square(share)  # of the tanh
+        speeds, to_speed = self._speeds(share), self._range()[1] * slope
+        sensitivities = condensed(model, x[:-1], speeds, to_speed, self.interval, self.unit_quaternion)
+        slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         changes = input_rate_penalty(self.weights, self.steps)
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)
         between = changes[:, None, :, None] * jnp.eye(INPUT_SIZE)[:, None, :] * slope[:, :, None, None] * slope
         return slopes.T @ slopes + between.reshape(variables.size, variables.size), gradient
-
-    def _sensitivities(self, model, x: Float[Array, "t 13"], variables: Float[Array, "t 4"]) -> Float[Array, "t 13 n"]:
-        """∂(state at the end of each interval) / ∂(all decision variables), n = 4 t."""
-        share = jnp.tanh(variables)
-        slope = self._range()[1] * (1 - jnp.square(share))  # d speed / d variable
-
-        def stage(x, u, slope):
-            jacobian = advance_with_jacobian(model, x, u, self.interval, self.unit_quaternion)[1]
-            return jnp.concatenate([jacobian[:, :STATE_SIZE], jacobian[:, STATE_SIZE:] * slope], axis=1)
-
-        stages = jax.vmap(stage)(x, self._speeds(share), slope)
-
-        def interval(carried, stage):
-            jacobian, i = stage
-            carried = jnp.tensordot(jacobian[:, :STATE_SIZE], carried, 1)
-            carried = jax.lax.dynamic_update_slice(carried, jacobian[:, None, STATE_SIZE:], (0, i, 0))
-            return carried, carried
-
-        none = jnp.zeros((STATE_SIZE, self.steps, INPUT_SIZE), x.dtype)
-        return jax.lax.scan(interval, none, (stages, jnp.arange(self.steps)))[1].reshape(self.steps, STATE_SIZE, -1)
 
 
 @jax.custom_batching.sequential_vmap

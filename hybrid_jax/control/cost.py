@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.control.attitude import attitude_error
+from hybrid_jax.rotation import attitude_error
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, State
 
 Scalar = Float[Array, ""]
@@ -42,15 +42,10 @@ class Weights:
 def deviations(weights: Weights, reference: State, x: State) -> Float[Array, "12"]:
     """Weighted deviations of a state from its reference: position, attitude, velocity, body rates."""
     difference = x - reference
-    return jnp.concatenate(
-        [
-            weights.position * difference[POSITION],
-            jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype)
-            * attitude_error(reference[QUATERNION], x[QUATERNION]),
-            weights.velocity * difference[VELOCITY],
-            weights.body_rates * difference[BODY_RATES],
-        ]
-    )
+    attitude = jnp.array([weights.tilt, weights.tilt, weights.yaw], x.dtype)
+    attitude = attitude * attitude_error(reference[QUATERNION], x[QUATERNION])
+    velocity, rates = weights.velocity * difference[VELOCITY], weights.body_rates * difference[BODY_RATES]
+    return jnp.concatenate([weights.position * difference[POSITION], attitude, velocity, rates])
 
 
 def stage_factors(weights: Weights, steps: int) -> Float[np.ndarray, " t"]:

@@ -1,6 +1,7 @@
-"""The closed loop: a plant, a controller with its prediction model, and the tracking performance of a flight."""
+"""The closed loop: a plant, a controller with its prediction model and disturbance observer, and how well it flew."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -8,18 +9,18 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.control import observer
-from hybrid_jax.control.attitude import heading
-from hybrid_jax.control.controller import Controller, Plan, promote
-from hybrid_jax.control.cost import Scalar
+from hybrid_jax.control.controller import Controller, Plan, checked_states
+from hybrid_jax.control.cost import Scalar, plan_cost
+from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.state import POSITION, QUATERNION, STATE_SIZE, Input, State
+from hybrid_jax.rotation import canonicalize_quaternion, heading
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
 
 Plant = Callable[[State, Input, Scalar], State]  # the state one period after time t [s], u held
 
-# Within this share of its range of a limit a rotor speed counts as saturated; tanh leaves 0.25 %.
-SATURATION_MARGIN = 0.01
+MOTION = slice(VELOCITY.start, BODY_RATES.stop)
+SATURATION_MARGIN = 0.01  # share of its range from a limit, within which a rotor speed counts as saturated
 
 
 class Flight(eqx.Module):
@@ -28,7 +29,7 @@ class Flight(eqx.Module):
     x: Float[Array, "*n t+1 13"]  # states, the initial one first
     u: Float[Array, "*n t 4"]  # rotor speeds held over each period, rad/s
     plans: Plan  # of the controller at each call
-    disturbance: Float[Array, "*n t 6"]  # of the observer at each call, see `observer.Estimate`
+    disturbance: Float[Array, "*n t 6"]  # of the observer at each call, see `Estimate`
 
 
 class Performance(eqx.Module):
@@ -41,6 +42,33 @@ class Performance(eqx.Module):
     saturation: Scalar  # share of the rotor speeds at a limit
 
 
+class Estimate(eqx.Module):
+    """State of the disturbance observer: a constant acceleration beyond the model, from one-step prediction errors.
+
+    The discrete-time form of Chen, Yang, Guo and Li, "Disturbance-observer-based control and related methods", 2016:
+    the prediction error divided by the period is the error of d, and a first-order filter of bandwidth β adds the share
+    1 − exp(−β period) of it to d.
+    """
+
+    disturbance: Float[Array, "6"]  # d: acceleration [m/s², world] and angular acceleration [rad/s², body]
+    expected: Float[Array, "6"]  # v [m/s] and ω [rad/s] predicted for the next sample
+
+    @classmethod
+    def begin(cls, x: State) -> "Estimate":
+        """Zero disturbance at state x."""
+        return cls(jnp.zeros_like(x, shape=6), x[MOTION])
+
+    def correct(self, x: State, bandwidth: Scalar | float, period: float) -> "Estimate":
+        """Update with the sample x; a bandwidth [rad/s] of 0 leaves the disturbance as it is."""
+        error = (x[MOTION] - self.expected) / period
+        return Estimate(self.disturbance - jnp.expm1(-bandwidth * period) * error, self.expected)
+
+    def predict(self, field: AbstractVectorField, x: State, u: Input, period: float) -> "Estimate":
+        """Predict the next sample with u held from x for one period [s]."""
+        x = x.at[QUATERNION].set(canonicalize_quaternion(x[QUATERNION]))
+        return Estimate(self.disturbance, advance(disturbed(field, self.disturbance), x, u, period)[MOTION])
+
+
 def fly(
     plant: Plant,
     model: AbstractVectorField,
@@ -51,9 +79,9 @@ def fly(
 ) -> Flight:
     """Fly a plant along a reference for n − 1 − horizon periods.
 
-    The function is pure: use it under `jit`, and under `vmap` over plants, models, references, initial states and
-    bandwidths. A crash does not stop a flight; one that diverges continues as infinity or NaN. `plans` is by far the
-    largest part of the result and costs nothing if a compiled function does not return it.
+    The function is pure: use it under `jit`, and under `vmap` over any argument. A crash does not stop a flight; one
+    that diverges continues as infinity or NaN. `plans`, the largest part of the result, costs nothing if a compiled
+    function does not return it.
 
     Args:
         plant: returns the state one period later.
@@ -66,26 +94,21 @@ def fly(
             is not finite, a quaternion is not of length 1, or the bandwidth is negative.
     """
     checks.not_negative("bandwidth", bandwidth)
-    x0, reference = checks.floating("x0", x0), checks.floating("reference", reference)
-    if x0.shape != (STATE_SIZE,) or reference.ndim != 2 or reference.shape[1] != STATE_SIZE:
-        raise ValueError(f"x0 (13,) and reference (n, 13) expected, got {x0.shape} and {reference.shape}")
+    x0, reference, plan = checked_states("x0", x0, reference, controller.begin())
     periods = len(reference) - 1 - controller.steps * controller.stride
     if periods < 1:
         raise ValueError(f"reference must be longer than the horizon, got {len(reference)} samples")
-    checks.unit_quaternions("x0", x0)
-    checks.unit_quaternions("reference", reference)
-    x0, reference, plan = promote(x0, reference, controller.begin())
 
     def tick(carry, i):
         x, plan, estimate = carry
-        estimate = observer.correct(estimate, x, bandwidth, controller.period)
+        estimate = estimate.correct(x, bandwidth, controller.period)
         corrected = disturbed(model, estimate.disturbance)
         u, plan = controller(corrected, controller.horizon(reference, i), x, plan)
-        estimate = observer.predict(estimate, model, x, u, controller.period)
+        estimate = estimate.predict(model, x, u, controller.period)
         x = plant(x, u, i * controller.period).astype(x.dtype)
         return (x, plan, estimate), (x, u, plan, estimate.disturbance)
 
-    start = (x0, plan, observer.begin(x0))
+    start = (x0, plan, Estimate.begin(x0))
     _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))
     return Flight(jnp.concatenate([x0[None], x]), u, plans, disturbance)
 
@@ -118,3 +141,43 @@ def performance(
         ~sound.all(),
         at_limit.mean(),
     )
+
+
+class OpenLoopCosts(NamedTuple):
+    """Costs of the plans of some calls of a flight. Plans that run to their end show the model's errors unhidden."""
+
+    predicted: Float[Array, " c"]  # by the controller's model
+    actual: Float[Array, " c"]  # of the same inputs in the plant
+
+
+def open_loop_costs(
+    plant: Plant, flight: Flight, reference: Float[Array, "n 13"], controller: Controller, calls: Sequence[int]
+) -> OpenLoopCosts:
+    """Predicted and actual open-loop cost of the plans of these calls."""
+
+    def advance(x, inputs):
+        x = plant(x, *inputs)
+        return x, x
+
+    def actual_cost(i: Scalar) -> Scalar:
+        plan = jax.tree.map(lambda leaf: leaf[i], flight.plans)
+        speeds = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
+        times = controller.period * (i + jnp.arange(len(speeds)))
+        states = jax.lax.scan(advance, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
+        return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))
+
+    chosen = jnp.asarray(calls)
+    return OpenLoopCosts(flight.plans.cost[chosen], jax.vmap(actual_cost)(chosen))
+
+
+def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: float = 0.005) -> Float[Array, ""]:
+    """(actual − predicted) / predicted, each summed over the calls.
+
+    The denominator is at least the cost of plans that stay `distance` [m] from the reference, because near zero the
+    ratio means nothing; ValueError if it is not positive.
+    """
+    checks.positive("distance", distance)
+    weights = controller.weights
+    floor = (controller.steps - 1 + weights.terminal**2) * (weights.position * distance) ** 2
+    error = jnp.sum(costs.actual) - jnp.sum(costs.predicted)
+    return error / jnp.maximum(jnp.sum(costs.predicted), floor * len(costs.predicted))

@@ -1,12 +1,13 @@
 """Reference paths, and their sampling as reference states.
 
-A path maps time [s] to position [m, world] and yaw [rad]. The rest of the state follows by differential flatness
-(Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011): thrust points along a + g,
-so acceleration and yaw give the attitude, and its derivative the body rates.
+A path maps time [s] to position [m, world] and yaw [rad]. Differential flatness gives the rest: thrust is along a + g
+(Mellinger and Kumar, "Minimum snap trajectory generation and control for quadrotors", 2011). All functions raise
+ValueError for numbers that are not finite, or not positive where they must be.
 """
 
 import math
 from collections.abc import Callable
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -15,21 +16,17 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller
+from hybrid_jax.control.cost import Scalar
 from hybrid_jax.rotation import Quaternion, conjugate, from_axis_angle, multiply
 from hybrid_jax.state import BODY_RATES, STATE_SIZE, State
 
-Scalar = Float[Array, ""]
 Path = Callable[[Scalar], tuple[Float[Array, "3"], Scalar]]
 
 X, Y, Z = np.eye(3).tolist()
 
 
 def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
-    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call.
-
-    Raises:
-        ValueError: `path` is not callable, or `duration` is not a positive number.
-    """
+    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call."""
     if not callable(path):
         raise ValueError(f"path must be a function of time, such as hover(), got {checks.short_repr(path)}")
     checks.positive("duration", duration, "a positive number of seconds")
@@ -59,27 +56,18 @@ def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
     left = jnp.cos(yaw) * thrust[1] - jnp.sin(yaw) * thrust[0]
     pitch = jnp.arctan2(ahead, thrust[2])
     roll = jnp.arctan2(-left, jnp.hypot(ahead, thrust[2]))
-    turns = [from_axis_angle(jnp.array(axis), angle) for axis, angle in ((Z, yaw), (Y, pitch), (X, roll))]
-    return multiply(multiply(turns[0], turns[1]), turns[2])
+    return reduce(multiply, [from_axis_angle(jnp.array(axis), by) for axis, by in ((Z, yaw), (Y, pitch), (X, roll))])
 
 
 def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0.0) -> Path:
-    """Stay at a position [m].
-
-    Raises:
-        ValueError: `position` is not three finite numbers, or `yaw` is not finite.
-    """
+    """Stay at a position [m] with a yaw [rad]."""
     _check_vector("position", position)
     checks.number("yaw", yaw)
     return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
 
 
 def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
-    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], with constant φ̇; fastest at its centre, √2 a φ̇ [m/s].
-
-    Raises:
-        ValueError: `top_speed` or `half_width` is not positive, or a number is not finite.
-    """
+    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s]."""
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
     checks.number("altitude", altitude)
@@ -95,11 +83,7 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
 
 
 def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, altitude: float = 1.5) -> Path:
-    """Hover over the origin; at time `at` [s] the position jumps by `to` [m] and the yaw to `yaw` [rad].
-
-    Raises:
-        ValueError: `to` is not three finite numbers, or another number is not finite.
-    """
+    """Hover over the origin; at time `at` [s] the position jumps by `to` [m] and the yaw to `yaw` [rad]."""
     _check_vector("to", to)
     for name, value in (("at", at), ("yaw", yaw), ("altitude", altitude)):
         checks.number(name, value)
@@ -115,9 +99,6 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
     """Fly along x at `speed` [m/s], down to the altitude `low` [m] and up to `high`, every `every` seconds.
 
     The altitude follows cos⁴, which is flat at the bottom: 40 % of the time is spent in the lowest tenth.
-
-    Raises:
-        ValueError: not 0 < low < high, `every` is not positive, or a number is not finite.
     """
     checks.number("speed", speed)
     checks.number("high", high)
@@ -134,11 +115,7 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
 
 
 def add_body_rates(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
-    """The state with body rates [rad/s] added: a large-rate initial condition.
-
-    Raises:
-        ValueError: `state` is not of shape (13,), or `rates` are not three finite numbers.
-    """
+    """The state with body rates [rad/s] added: a large-rate initial condition."""
     state = checks.floating("state", state)
     if state.shape != (STATE_SIZE,):
         raise ValueError(f"state (13,) expected, got {state.shape}")

@@ -1,18 +1,17 @@
 """One RK4 step of a model and its Jacobian, which condensing needs.
 
 The derivative of a Runge–Kutta step is a step of the same method on ẋ = f(x, u), Ṡ = ∂f/∂x S + ∂f/∂u: internal
-numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981). The
-field provides its own derivative at each stage (`linearize`), which for a network is one product of its matrices.
+numerical differentiation (Bock, "Numerical treatment of inverse problems in chemical reaction kinetics", 1981).
 """
 
-import diffrax
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns, linearize
-from hybrid_jax.integrate import RK4
+from hybrid_jax.integrate import rk4_step
 from hybrid_jax.rotation import normalise
-from hybrid_jax.state import QUATERNION, Input, State
+from hybrid_jax.state import QUATERNION, STATE_SIZE, Input, State
 
 
 def advance_with_jacobian(
@@ -22,23 +21,40 @@ def advance_with_jacobian(
     directions = jnp.eye(len(x) + len(u), dtype=x.dtype)
     dx, du = directions[: len(x)], directions[len(x) :]
 
-    def slopes(t, both, held):
+    def slopes(both, held):
         value, columns = linearize(model, both[:, 0], held, both[:, 1:], du)
         return jnp.concatenate([value[:, None], columns], axis=1)
 
     start = jnp.concatenate([x[:, None], dx], axis=1)
-    both = RK4().step(diffrax.ODETerm(slopes), 0.0, dt, start, u, None, made_jump=False)[0]
+    both = rk4_step(slopes, start, u, dt)
     x, columns = both[:, 0], both[:, 1:]
-    return jvp_columns(with_unit_quaternion, (x,), (columns,)) if unit_quaternion else (x, columns)
+    return jvp_columns(_with_unit_quaternion, (x,), (columns,)) if unit_quaternion else (x, columns)
+
+
+def condensed(
+    model, x: Float[Array, "t 13"], u: Float[Array, "t 4"], slope: Float[Array, "t 4"], dt: float, unit_quaternion: bool
+) -> Float[Array, "t 13 n"]:
+    """∂(state at the end of each interval) / ∂(all n = 4 t decision variables); `slope` is d u / d variable."""
+
+    def stage(x, u, slope):
+        jacobian = advance_with_jacobian(model, x, u, dt, unit_quaternion)[1]
+        return jnp.concatenate([jacobian[:, :STATE_SIZE], jacobian[:, STATE_SIZE:] * slope], axis=1)
+
+    def interval(carried, stage):
+        jacobian, i = stage
+        carried = jnp.tensordot(jacobian[:, :STATE_SIZE], carried, 1)
+        carried = jax.lax.dynamic_update_slice(carried, jacobian[:, None, STATE_SIZE:], (0, i, 0))
+        return carried, carried
+
+    none, stages = jnp.zeros((STATE_SIZE, *u.shape), x.dtype), jax.vmap(stage)(x, u, slope)
+    return jax.lax.scan(interval, none, (stages, jnp.arange(len(u))))[1].reshape(len(u), STATE_SIZE, -1)
 
 
 def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
     """The state after dt [s] with u held: one step of classical RK4."""
-    term = diffrax.ODETerm(lambda t, x, held: model(x, held))
-    x = RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
-    return with_unit_quaternion(x) if unit_quaternion else x
+    x = rk4_step(model, x, u, dt)
+    return _with_unit_quaternion(x) if unit_quaternion else x
 
 
-def with_unit_quaternion(x: State) -> State:
-    """The state with its quaternion normalised."""
+def _with_unit_quaternion(x: State) -> State:
     return x.at[QUATERNION].set(normalise(x[QUATERNION]))

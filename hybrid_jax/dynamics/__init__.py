@@ -13,25 +13,7 @@ from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, rig
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
-__all__ = [
-    "AbstractVectorField",
-    "ConstantDisturbance",
-    "ForcedBody",
-    "Frozen",
-    "FrozenRates",
-    "HoldState",
-    "Hybrid",
-    "Multirotor",
-    "RigidBody",
-    "Terms",
-    "VehicleModel",
-    "disturbed",
-    "load_vehicle_model",
-    "multirotor",
-    "perturbed",
-    "rigid_body",
-    "trainable",
-    "unfreeze",
-    "with_disturbance",
-    "with_vehicle",
-]
+__all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
+__all__ += ["ConstantDisturbance", "disturbed", "with_disturbance"]
+__all__ += ["ForcedBody", "Multirotor", "RigidBody", "Terms", "VehicleModel"]
+__all__ += ["load_vehicle_model", "multirotor", "perturbed", "rigid_body", "with_vehicle"]

@@ -83,10 +83,7 @@ def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "
 def apply_residual(
     field: AbstractVectorField, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]
 ) -> Float[Array, " d *b"]:
-    """Map a residual ẋ onto the state derivative of this physics. Identity by default.
-
-    `Multirotor` also propagates residual forces to the position when it models the lag of a velocity estimator.
-    """
+    """Map a residual ẋ onto the state derivative of this physics: identity, unless its state shows forces elsewhere."""
     return _methods_of(field).apply_residual(field, x, residual)
 
 
@@ -139,43 +136,60 @@ class Hybrid(AbstractVectorField):
         return Hybrid(fuse_for_inference(self.physics), fuse_for_inference(self.residual))
 
 
-class Frozen(AbstractVectorField, AbstractInferenceOnly):
-    """A field in inference mode that training does not change: neither parameters nor running statistics move."""
+class AbstractWrapper(AbstractVectorField):
+    """ẋ = write(x, f(read(x), u)) for the field f inside."""
+
+    accepts_batch: ClassVar[bool] = True
 
     field: AbstractVectorField
 
+    def read(self, x: Float[Array, " d *b"]) -> Float[Array, " n *b"]:
+        """The features of the state that the field inside reads; by default all."""
+        return x
+
+    def write(self, x: Float[Array, " d *b"], inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
+        """ẋ from what the field inside returned; by default the same."""
+        return inside
+
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.field(x, u)
+        return self.write(x, self.field(self.read(x), u))
 
     def train_batch(self, x, u):
-        return infer_batch(self.field, x, u)
+        return self.write(x, train_batch(self.field, self.read(x), u))
 
     def infer_batch(self, x, u):
-        return infer_batch(self.field, x, u)
+        return self.write(x, infer_batch(self.field, self.read(x), u))
 
     def update_running_stats(self, x, u):
-        return self
+        return eqx.tree_at(lambda wrapper: wrapper.field, self, update_running_stats(self.field, self.read(x), u))
 
     def apply_residual(self, x, residual):
         return apply_residual(self.field, x, residual)
 
     def linearize(self, x, u, dx, du):
-        return linearize(self.field, x, u, dx, du)
+        features, d_features = jvp_columns(self.read, (x,), (dx,))
+        inside, d_inside = linearize(self.field, features, u, d_features, du)
+        return jvp_columns(self.write, (x, inside), (dx, d_inside))
 
     def fuse_for_inference(self):
-        return fuse_for_inference(self.field)
+        return eqx.tree_at(lambda wrapper: wrapper.field, self, fuse_for_inference(self.field))
+
+
+class Frozen(AbstractWrapper, AbstractInferenceOnly):
+    """A field in inference mode that training does not change: neither parameters nor running statistics move."""
+
+    def train_batch(self, x, u):
+        return infer_batch(self.field, x, u)
+
+    def update_running_stats(self, x, u):
+        return self
 
 
 def features_first(field: AbstractVectorField) -> bool:
     """Whether some part of a sum has a batched form, so that the batch is best kept on the last axis."""
-    match field:
-        case Hybrid():
-            return features_first(field.physics) or features_first(field.residual)
-        case Frozen():
-            return features_first(field.field)
-        case AbstractVectorField():
-            return field.accepts_batch
-    return False
+    if isinstance(field, Hybrid):
+        return features_first(field.physics) or features_first(field.residual)
+    return features_first(field.field) if isinstance(field, Frozen) else getattr(field, "accepts_batch", False)
 
 
 def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
@@ -193,20 +207,14 @@ def trainable(field: AbstractVectorField) -> AbstractVectorField:
     def fixed(node) -> bool:
         return isinstance(node, RunningStats | Frozen)
 
-    def leaves(node):
-        return False if fixed(node) else eqx.is_inexact_array(node)
-
-    return jax.tree.map(leaves, field, is_leaf=fixed)
+    return jax.tree.map(lambda node: not fixed(node) and eqx.is_inexact_array(node), field, is_leaf=fixed)
 
 
 def check_batch_norm(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> None:
     """Refuse a field whose batch normalisation would be trained, but whose running statistics could not be.
 
-    Args:
-        x, u: any samples, such as the starts of two windows.
-
     Raises:
-        ValueError: the field does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
+        ValueError: at any x and u it does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
     """
     if _is_wrapped(field) and any(bool((seen[0] == 0).any()) for seen in moments_of(field, x, u)):
         raise ValueError(

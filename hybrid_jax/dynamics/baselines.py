@@ -8,8 +8,9 @@ from typing import ClassVar
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual, infer_batch, train_batch, update_running_stats
-from hybrid_jax.state import BODY_RATES
+from hybrid_jax import rotation
+from hybrid_jax.dynamics.base import AbstractVectorField, AbstractWrapper
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 
 
 class HoldState(AbstractVectorField):
@@ -21,28 +22,18 @@ class HoldState(AbstractVectorField):
         return jnp.zeros_like(x)
 
 
-class FrozenRates(AbstractVectorField):
-    """The field inside with ω̇ = 0: thrust accelerates the vehicle, which keeps its body rates."""
+class Kinematics(AbstractVectorField):
+    """ṗ = v and q̇ = ½ q ⊗ [0, ω], which hold without any knowledge of forces, with v̇ = ω̇ = 0."""
 
     accepts_batch: ClassVar[bool] = True
 
-    field: AbstractVectorField
-
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
-        return _frozen(self.field(x, u))
-
-    def train_batch(self, x, u):
-        return _frozen(train_batch(self.field, x, u))
-
-    def infer_batch(self, x, u):
-        return _frozen(infer_batch(self.field, x, u))
-
-    def update_running_stats(self, x, u):
-        return FrozenRates(update_running_stats(self.field, x, u))
-
-    def apply_residual(self, x, residual):
-        return apply_residual(self.field, x, residual)
+        accelerations = jnp.zeros((6, *x.shape[1:]), x.dtype)
+        return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), accelerations])
 
 
-def _frozen(derivative: Float[Array, " 13 *b"]) -> Float[Array, " 13 *b"]:
-    return derivative.at[BODY_RATES].set(0.0)
+class FrozenRates(AbstractWrapper):
+    """The field inside with ω̇ = 0: thrust accelerates the vehicle, which keeps its body rates."""
+
+    def write(self, x, inside):
+        return inside.at[BODY_RATES].set(0.0)

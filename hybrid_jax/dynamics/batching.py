@@ -1,7 +1,7 @@
 """Evaluate a field that is written for one sample on a minibatch, and train the batch normalisation inside it.
 
-`jax.vmap` alone would evaluate every `AbstractBatchNorm` in inference mode. So each is first replaced by its training
-mode, which takes mean and variance over the named axis of that `vmap`. This works for any module around a network.
+Under `jax.vmap` every `AbstractBatchNorm` is replaced by its training mode, which takes mean and variance over the
+named axis of that `vmap`. This works for any module around a network.
 """
 
 from abc import abstractmethod
@@ -85,14 +85,12 @@ def with_moved_stats(field, x: Batch, u: Float[Array, "m b"]):
 
     A layer that is evaluated more than once for a sample sees the mean of the moments; one that is not keeps its own.
     """
-    norms = batch_norms(field)
-    if not norms:
+    if not (norms := batch_norms(field)):
         return field
 
     def moved(norm: AbstractBatchNorm, seen: Moments) -> AbstractBatchNorm:
-        old = (norm.running.mean, norm.running.variance)
-        means = (jnp.where(seen[0] > 0, part / seen[0], before) for part, before in zip(seen[1:], old, strict=True))
-        return norm.moved(RunningStats(*means))
+        before = jnp.stack([norm.running.mean, norm.running.variance])
+        return norm.moved(RunningStats(*jnp.where(seen[0] > 0, seen[1:] / seen[0], before)))
 
     return _replaced(field, list(map(moved, norms, moments_of(field, x, u))))
 

@@ -1,8 +1,6 @@
 """A constant disturbance of the state derivative: steady wind, a load off centre, a biased actuator.
 
-Least squares finds it together with the physical parameters θ_p (see `hybrid_jax.adaptation`):
-
-    fit_least_squares(with_disturbance(hybrid), windows).field
+Least squares finds it together with θ_p: `fit_least_squares(with_disturbance(hybrid), windows).field`.
 """
 
 from typing import ClassVar
@@ -20,17 +18,12 @@ ACCELERATIONS = STATE_SIZE - VELOCITY.start  # v̇ and ω̇ of a rigid body; ṗ
 
 
 class ConstantDisturbance(AbstractVectorField):
-    """ẋ = d at the disturbed states and zero at the others, for all x and u.
-
-    Attributes:
-        value: one number for each disturbed state, in the unit of its derivative. A scalar holds for every state.
-        indices: the disturbed states; by default the last `len(value)` states.
-    """
+    """ẋ = d at the disturbed states and zero at the others, for all x and u."""
 
     accepts_batch: ClassVar[bool] = True
 
-    value: Float[Array, "*k"]
-    indices: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    value: Float[Array, "*k"]  # one number for each disturbed state, or a scalar for every state
+    indices: tuple[int, ...] | None = eqx.field(static=True, default=None)  # by default the last `len(value)` states
 
     def __check_init__(self):
         if self.indices is not None and jnp.shape(self.value)[-1:] != (len(self.indices),):
@@ -82,7 +75,7 @@ def sized(field: AbstractVectorField, d: int) -> AbstractVectorField:
     found = disturbance_of(field)
     if found is None or found.value.ndim > 0:
         return field
-    return with_physics(field, disturbed(physics_of(without_disturbance(field)), found.vector(d)))
+    return eqx.tree_at(disturbance_of, field, ConstantDisturbance(found.vector(d)))
 
 
 def physics_of(field: AbstractVectorField) -> AbstractVectorField:
@@ -94,14 +87,10 @@ def physics_of(field: AbstractVectorField) -> AbstractVectorField:
 
 def with_physics(field: AbstractVectorField, physics: AbstractVectorField) -> AbstractVectorField:
     """The field with other physics in the place of `physics_of(field)`."""
-    if isinstance(field, Hybrid) and not isinstance(field.residual, ConstantDisturbance):
-        return Hybrid(with_physics(field.physics, physics), field.residual)
-    return physics
+    return eqx.tree_at(physics_of, field, physics)
 
 
 def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
     """The constant disturbance of the field's physics, if it has one."""
-    match physics_of(field):
-        case Hybrid(residual=ConstantDisturbance() as found):
-            return found
-    return None
+    physics = physics_of(field)
+    return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]

@@ -1,4 +1,4 @@
-"""Equations of motion of a multirotor, for one sample or a minibatch; see `multirotor`.
+"""Equations of motion of a multirotor; see `multirotor`.
 
 They take the entries of θ_p, x and u as separate arrays, which spares stacking and unstacking them.
 """
@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.terms import SHAPES, Terms, nominal_values
+from hybrid_jax.dynamics.terms import Terms, nominal_values
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -19,15 +19,9 @@ from hybrid_jax.vehicle import Vehicle
 Constants = dict[str, Rows | tuple[float, ...]]  # name → entries: numbers if known, arrays if learned
 
 
-def constants_of(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows]) -> Constants:
-    """Everything in `SHAPES`: the learned value where there is one, else the nominal one."""
-    known = nominal_values(vehicle, terms)
-    return {name: theta.get(name, known[name]) for name in SHAPES}
-
-
 def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
     """ẋ of a multirotor with learned parameters θ_p. Terms that are neither learned nor present cost nothing."""
-    constants = constants_of(vehicle, terms, theta)
+    constants = nominal_values(vehicle, terms) | theta
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
@@ -39,18 +33,16 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     turning = rotation.derivative(q, omega)
     torque = _with_aerodynamic_moments(constants, velocity, omega, torque)
     inertia = [constants[name][0] for name in ("Ix", "Iy", "Iz")]
-    return jnp.concatenate(
-        [
-            jnp.stack(v) + in_world(attitude, faster) if is_present(faster) else jnp.stack(v),
-            turning,
-            acceleration + in_world(attitude, force) if is_present(force) else acceleration,
-            _euler(inertia, torque, omega),
-        ]
-    )
+    position = jnp.stack(v)
+    if is_present(faster):
+        position = position + in_world(attitude, faster)
+    if is_present(force):
+        acceleration = acceleration + in_world(attitude, force)
+    return jnp.concatenate([position, turning, acceleration, _euler(inertia, torque, omega)])
 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
-    """Total thrust [N] and torque [N m] of the rotors about the centre of mass: thrust × arm, and c_m u²."""
+    """Total thrust [N] and torque [N m] of the rotors about the centre of mass."""
     squares = [speed * speed for speed in u]
     (k,), of_rotors, gain = constants["k"], constants["k_rotors"], constants["torque_gain"]
     if isinstance(of_rotors[0], int | float):

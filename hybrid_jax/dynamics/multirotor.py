@@ -1,24 +1,4 @@
-"""f_p of a real multirotor: the rigid body with further terms, and with learned parameters chosen by name.
-
-    ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
-    m f = C (τ_y, −τ_x, 0) − D Rᵀv,   E = diag(1, 1, 0)
-
-T and τ are thrust and torque of the four rotors about a centre of mass that need not be the origin of their positions;
-a rotor's thrust is k_i u_i², with one k or four. Linear rotor drag D, the moment A that grows with the velocity in the
-body frame, and the damping B of the body rates: Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor
-dynamics subject to rotor drag for accurate tracking of high-speed trajectories", 2018 (A there has the other sign). The
-gain G scales the torque of the rotors, where it cannot be computed from their speeds. C models a cable that pulls at
-1/C below the centre of mass: the state does not contain the position of the load, but the rotors' torque balances the
-moment of the pull, and so reveals it.
-
-S and λ describe the state estimator. Many assume that all force but gravity is along the body's z axis, and correct
-their velocity v̂ for drag, wind or a cable by the position alone: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the
-thrust. Then v − v̂ is λ times the force in the log, which is f and what a residual adds to it (`apply_residual`). The
-gain S of each axis models the same for drag alone, and other errors of scale.
-
-The lag of the rotors is not part of the field but applied to the log: as four more states, the rotor speeds would be
-unknown at the start of each window, which is about as long as the lag. See `hybrid_jax.flights.cleaning`.
-"""
+"""f_p of a real multirotor: the rigid body with further terms, and with learned parameters chosen by name."""
 
 from functools import partial
 
@@ -38,13 +18,27 @@ from hybrid_jax.vehicle import Vehicle
 class Multirotor(AbstractRigidBody):
     """The rigid body with `Terms`; with the default ones and names it is `RigidBody`.
 
+        ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+        m f = C (τ_y, −τ_x, 0) − D Rᵀv,   E = diag(1, 1, 0)
+
+    T and τ are thrust and torque of the four rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k
+    or four, and G scales the torque where the speeds do not tell it. Rotor drag D, the moment A and the damping B:
+    Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for accurate
+    tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C below the
+    centre of mass: the state does not hold the load's position, but the torque that balances its moment reveals it.
+
+    S and λ describe a state estimator that takes all force but gravity to be along the body's z axis, and corrects its
+    velocity v̂ for other forces by the position alone: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
+    Then v − v̂ is λ times the force in the log: f and what a residual adds to it. S models the same for drag alone.
+
     Parameters are deviations from nominal, so that all start at zero and one learning rate fits them all: positive ones
-    as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s.
+    as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the
+    rotors is applied to the log (`hybrid_jax.flights.cleaning`): as four more states it would be unknown at the start
+    of each window.
 
     Attributes:
         deviations: of each learned parameter, by name; shapes as in `SHAPES`.
-        vehicle: the known constants and the nominal values.
-        terms: the nominal values of the further terms; those that are zero and not learned cost nothing.
+        terms: nominal values; those that are zero and not learned cost nothing.
 
     Raises:
         ValueError: an unknown parameter name, both k and k_rotors, or no vehicle or terms.
@@ -80,7 +74,7 @@ class Multirotor(AbstractRigidBody):
 
     def apply_residual(self, x, residual):
         """A residual force, too, changes the position before it shows in the estimated velocity."""
-        lag = equations.constants_of(self.vehicle, self.terms, self.entries())["velocity_lag"]
+        lag = self.entries().get("velocity_lag", (self.terms.velocity_lag,))
         if not equations.is_present(lag):
             return residual
         attitude = equations.attitude_matrix(tuple(x[QUATERNION]))

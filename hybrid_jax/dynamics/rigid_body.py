@@ -41,15 +41,11 @@ class RigidBody(AbstractRigidBody):
 
     θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
 
-    Attributes:
-        log_ratios: log(Ix / nominal), log(Iy / nominal), log(k / nominal).
-        vehicle: the known constants and the nominal values.
-
     Raises:
         ValueError: other parameters than Ix, Iy, k, or no vehicle.
     """
 
-    log_ratios: dict[str, Float[Array, ""]]
+    log_ratios: dict[str, Float[Array, ""]]  # log(Ix / nominal), log(Iy / nominal), log(k / nominal)
     vehicle: Vehicle = eqx.field(static=True)
 
     def __check_init__(self):
@@ -73,8 +69,8 @@ class RigidBody(AbstractRigidBody):
 class ForcedBody(RigidBody):
     """A rigid body for which a residual is a force and a torque, not an acceleration.
 
-    The residual's v̇ and ω̇ hold at the nominal inertia; at another one, its ω̇ is scaled by nominal / I. So a learned
-    aerodynamic torque remains valid when the inertia changes. The mass is known.
+    Its ω̇ holds at the nominal inertia and is scaled by nominal / I at another one, so that a learned aerodynamic torque
+    remains valid when the inertia changes.
     """
 
     def apply_residual(self, x, residual):
@@ -89,7 +85,7 @@ def rigid_body(vehicle: Vehicle) -> RigidBody:
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a random factor in [low, high], uniform in its logarithm."""
+    """The rigid body with each of θ_p at nominal times a factor in [low, high], uniform in its logarithm."""
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))

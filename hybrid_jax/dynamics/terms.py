@@ -3,68 +3,44 @@
 import math
 from dataclasses import dataclass
 
+import numpy as np
+
 from hybrid_jax import checks
-from hybrid_jax.vehicle import Vehicle, require_numbers
+from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
 SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
 POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
-SIGNED = {
-    "torque_gain": (3,),
-    "centre_of_mass": (2,),
-    "drag": (3,),
-    "cable_pull": (2,),
-    "aerodynamic_moment": (3, 3),
-    "rate_damping": (3,),
-    "velocity_gain": (3,),
-    "velocity_lag": (),
-}
+SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
+SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters
 Three = tuple[float, float, float]
+NONE = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
 class Terms:
-    """Nominal values of the terms beyond a rigid body, absent by default. Body frame, SI units.
+    """Nominal values of the terms beyond a rigid body, absent by default; body frame. ValueError for another shape."""
 
-    Attributes:
-        torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
-        centre_of_mass: (x, y) in the frame of the rotors' positions [m].
-        drag: D [N s/m].
-        cable_pull: C, one over how far below the centre of mass a cable pulls, along x and along y [1/m].
-        aerodynamic_moment: A, one row for each of the three moments [N s].
-        rate_damping: B [N m s].
-        velocity_gain: S, of the position's derivative over the velocity in a log.
-        velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
-        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
-
-    Raises:
-        ValueError: a term of another shape, or that is not finite.
-    """
-
-    torque_gain: Three = (1.0, 1.0, 1.0)
-    centre_of_mass: tuple[float, float] = (0.0, 0.0)
-    drag: Three = (0.0, 0.0, 0.0)
-    cable_pull: tuple[float, float] = (0.0, 0.0)
-    aerodynamic_moment: tuple[Three, Three, Three] = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    rate_damping: Three = (0.0, 0.0, 0.0)
-    velocity_gain: Three = (1.0, 1.0, 1.0)
-    velocity_lag: float = 0.0
-    motor_time_constant: float = 0.0
+    torque_gain: Three = (1.0, 1.0, 1.0)  # factors G of the rotors' torque about x, y and z; 0 turns it off
+    centre_of_mass: tuple[float, float] = (0.0, 0.0)  # (x, y) in the frame of the rotors' positions, m
+    drag: Three = NONE  # D, N s/m
+    cable_pull: tuple[float, float] = (0.0, 0.0)  # C, one over how far below the centre of mass a cable pulls, 1/m
+    aerodynamic_moment: tuple[Three, Three, Three] = (NONE, NONE, NONE)  # A, one row for each of the moments, N s
+    rate_damping: Three = NONE  # B, N m s
+    velocity_gain: Three = (1.0, 1.0, 1.0)  # S, of the position's derivative over the velocity in a log
+    velocity_lag: float = 0.0  # λ, time constant of the estimated velocity for forces across the thrust, s
+    motor_time_constant: float = 0.0  # of the rotors behind a log's motor values, s; applied to logs, not by the field
 
     def __post_init__(self):
         for name, shape in SIGNED.items():
             what = f"a tuple of {shape[0]}{' of 3' if shape[1:] else ''}" if shape else "a finite number"
             require_numbers(name, getattr(self, name), shape, what)
-            object.__setattr__(self, name, _floats(getattr(self, name)))
+            object.__setattr__(self, name, as_tuple(np.asarray(getattr(self, name), float).tolist()))
         checks.not_negative("motor_time_constant", self.motor_time_constant)
 
 
 def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
-    """Check the names of learned parameters, which are those of `SHAPES` and `also`.
-
-    Raises:
-        ValueError: an unknown name, one given twice, or two that are not identifiable together.
-    """
+    """Raise ValueError for names not in `SHAPES` or `also`, given twice, or not identifiable together."""
     if not isinstance(learn, tuple) or not all(isinstance(name, str) for name in learn):
         raise ValueError(f"learn must be a list of names, got {checks.short_repr(learn)}")
     known = (*SHAPES, *also)
@@ -79,32 +55,16 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
 
 def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
     """The nominal value of everything in `SHAPES`, number by number; SI units."""
-    ix, iy, iz = ((moment,) for moment in vehicle.inertia)
-    k = vehicle.thrust_coefficient
-    own = {"Ix": ix, "Iy": iy, "Iz": iz, "k": (k,), "k_rotors": (k,) * 4}
+    k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
+    own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * 4}
     own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
-    return own | {name: _flat(getattr(terms, name)) for name in SIGNED}
+    return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 
 def units_of(vehicle: Vehicle) -> dict[str, float]:
     """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
     weight = vehicle.mass * vehicle.gravity
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / 4
-    return {
-        "torque_gain": 1.0,
-        "centre_of_mass": arm,
-        "drag": weight / SPEED,
-        "cable_pull": 1 / arm,
-        "aerodynamic_moment": weight * arm / SPEED,
-        "rate_damping": weight * arm / RATE,
-        "velocity_gain": 1.0,
-        "velocity_lag": 1.0,
-    }
-
-
-def _flat(value) -> tuple[float, ...]:
-    return tuple(number for row in value for number in _flat(row)) if isinstance(value, tuple) else (value,)
-
-
-def _floats(value):
-    return tuple(map(_floats, value)) if isinstance(value, tuple) else float(value)
+    forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
+    places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
+    return forces | places | dict.fromkeys(("torque_gain", "velocity_gain", "velocity_lag"), 1.0)

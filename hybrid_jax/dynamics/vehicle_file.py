@@ -1,16 +1,7 @@
 """A whole vehicle file: constants of the vehicle, nominal values of further terms, and what is to be learned.
 
-learn = ["Ix", "Iy", "k_rotors", "drag", "aerodynamic_moment"]    # names of `multirotor.SHAPES`; above all tables
-
-[vehicle]            # the constants of `Vehicle`
-mass = 0.037
-…
-
-[vehicle.payload]    # a variant: constants that differ
-mass = 0.0444
-
-[terms]              # nominal values of `Terms`, known or initial; the defaults where not given
-drag = [0.01, 0.01, 0.0]
+Above all tables `learn = ["Ix", "drag", …]`, names of `terms.SHAPES`; then `[vehicle]` with the constants of `Vehicle`,
+`[vehicle.NAME]` with those that differ in a variant, and `[terms]` with nominal values of `Terms`.
 """
 
 from collections.abc import Mapping
@@ -30,20 +21,11 @@ TABLES = ("vehicle", "learn", "terms")
 
 @dataclass(frozen=True)
 class VehicleModel:
-    """A vehicle, and what is to be learned of it.
-
-    Attributes:
-        vehicle: known constants and nominal values.
-        terms: nominal values of effects beyond a rigid body.
-        learn: names of `multirotor.SHAPES`, and "motor_time_constant" to choose the rotors' lag from logs.
-
-    Raises:
-        ValueError: as `check_learned`.
-    """
+    """A vehicle, and what is to be learned of it; ValueError as of `check_learned`."""
 
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
-    learn: tuple[str, ...] = LEARNED
+    learn: tuple[str, ...] = LEARNED  # names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs
 
     def __post_init__(self):
         check_learned(self.learn)
@@ -64,15 +46,9 @@ def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
 
 
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
-    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`.
+    """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; by default a rigid body that learns Ix, Iy and k.
 
-    Without the last two it is a rigid body that learns Ix, Iy and k.
-
-    Args:
-        variant: as for `load_vehicle`.
-
-    Raises:
-        ValueError: the file, the key and what was expected, in one line.
+    Args and errors as of `load_vehicle`.
     """
     return vehicle_model_of(read_tables(path), path, variant)
 
@@ -85,7 +61,5 @@ def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str |
         raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
     if not isinstance(terms, dict):
         raise ValueError(f"{path}: terms must be a table [terms], got {checks.short_repr(terms)}")
-    vehicle, terms = vehicle_of(tables, path, variant), from_table(Terms, terms, f"{path}: [terms]")
-    return from_table(
-        VehicleModel, {"vehicle": vehicle, "terms": terms, "learn": tables.get("learn", LEARNED)}, str(path)
-    )
+    parts = {"vehicle": vehicle_of(tables, path, variant), "terms": from_table(Terms, terms, f"{path}: [terms]")}
+    return from_table(VehicleModel, parts | {"learn": tables.get("learn", LEARNED)}, str(path))

@@ -6,19 +6,18 @@ import jax
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.export.program import program_of, sizes_of
+from hybrid_jax.export.program import Size, program_of, sizes_of
 
 if TYPE_CHECKING:
     import casadi
 
 
 def casadi_function(
-    field: AbstractVectorField, *, state_size: int | None = None, input_size: int | None = None, name: str = "f"
+    field: AbstractVectorField, *, state_size: Size = None, input_size: Size = None, name: str = "f"
 ) -> "casadi.Function":
     """ẋ = f(x, u) of a field in inference mode, from x (d × 1) and u (m × 1) to xdot (d × 1), in double precision.
 
-    The field's program is translated operation by operation into symbolic expressions, which CasADi differentiates,
-    saves (`.save`) and translates to C (`.generate`).
+    CasADi differentiates it, saves it (`.save`) and translates it to C (`.generate`).
 
     Args:
         state_size: d; by default what the field knows (see `sizes_of`).
@@ -33,24 +32,14 @@ def casadi_function(
 
 
 def casadi_step(
-    field: AbstractVectorField,
-    dt: float,
-    *,
-    state_size: int | None = None,
-    input_size: int | None = None,
-    name: str = "F",
+    field: AbstractVectorField, dt: float, *, state_size: Size = None, input_size: Size = None, name: str = "F"
 ) -> "casadi.Function":
-    """x⁺ = F(x, u), one step of RK4 over dt [s] with u held; its output is xnext. Otherwise as `casadi_function`.
-
-    Raises:
-        ValueError: dt is not positive; and as `casadi_function`.
-        ImportError: casadi is not installed.
-    """
+    """x⁺ = F(x, u), one step of RK4 over dt [s] with u held; its output is xnext. Otherwise as `casadi_function`."""
     checks.positive("dt", dt, "a positive number of seconds")
     return _function(field, float(dt), state_size, input_size, name, "xnext")
 
 
-def _function(field, dt: float | None, state_size, input_size, name: str, output: str) -> "casadi.Function":
+def _function(field, dt: float | None, state_size: Size, input_size: Size, name: str, output: str) -> "casadi.Function":
     try:
         import casadi as ca
 

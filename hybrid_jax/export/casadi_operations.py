@@ -28,11 +28,7 @@ Column = ca.SX | ca.DM
 
 
 def evaluate(program: ClosedJaxpr, symbols: Sequence[ca.SX]) -> ca.SX:
-    """The result of a program from vectors to one vector, as a dense column.
-
-    Raises:
-        ValueError: an operation has no counterpart in CasADi.
-    """
+    """The result of a program from vectors to one vector, as a dense column; ValueError for an unknown operation."""
     (result,) = _run(program.jaxpr, program.consts, [Entries(one, (one.numel(),)) for one in symbols])
     return ca.densify(ca.SX(_column(result)))
 
@@ -58,7 +54,7 @@ def _results(equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
     if not any(isinstance(value, Entries) for value in inputs):
         return _known(equation, inputs)
     if name in ENTRYWISE:
-        return [Entries(ENTRYWISE[name](equation, *(_spread(value, shape) for value in inputs)), shape)]
+        return [Entries(_entrywise(equation, [_spread(value, shape) for value in inputs]), shape)]
     if name in MOVES:
         return _moved(equation, inputs)
     if name in LINEAR:
@@ -163,29 +159,16 @@ def _matrices(value: Value, contracted: Sequence[int], common: Sequence[int]) ->
     return [ca.reshape(_taken(column, one), sizes[2], sizes[1]).T for one in places.reshape(sizes)]
 
 
-def _select(equation: JaxprEqn, which, *cases):
-    if len(cases) != 2:
-        raise _refusal(equation, f" of {len(cases)} cases")
-    return ca.if_else(which, cases[1], cases[0])
-
-
-def _convert(equation: JaxprEqn, a):
-    if not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
+def _entrywise(equation: JaxprEqn, inputs: Sequence[Column]) -> Column:
+    name, (first, *_) = equation.primitive.name, equation.invars
+    if name in ("and", "or", "not") and first.aval.dtype != bool:  # type: ignore
+        raise _refusal(equation, " of integers")
+    if name == "select_n" and len(inputs) != 3:
+        raise _refusal(equation, f" of {len(inputs) - 1} cases")
+    if name == "convert_element_type" and not jnp.issubdtype(equation.params["new_dtype"], jnp.floating):
         raise _refusal(equation, f" to {equation.params['new_dtype']}")
-    return a
-
-
-def _logical(operation: Callable) -> Callable:
-    def of(equation: JaxprEqn, *inputs):
-        if equation.invars[0].aval.dtype != bool:  # type: ignore
-            raise _refusal(equation, " of integers")
-        return operation(*inputs)
-
-    return of
-
-
-def _plain(operation: Callable) -> Callable:
-    return lambda equation, *inputs: operation(*inputs)
+    exponent = (equation.params["y"],) if name == "integer_pow" else ()
+    return ENTRYWISE[name](*inputs, *exponent)
 
 
 # Operations that call another program. Custom derivatives are replaced by CasADi's.
@@ -207,11 +190,12 @@ _SAME_NAME = (
     *("sign", "floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "atan2"),
     *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
 )
-_PLAIN: dict[str, Callable] = {
+ENTRYWISE: dict[str, Callable] = {
     **{name: getattr(ca, name) for name in _SAME_NAME},
-    **dict.fromkeys(("copy", "copy_p", "stop_gradient"), lambda a: a),
+    **dict.fromkeys(("copy", "copy_p", "stop_gradient", "convert_element_type"), lambda a: a),
     **{operation.__name__: operation for operation in (add, sub, mul, pow, neg, lt, le, gt, ge, eq, ne)},
     "add_any": add,
+    "integer_pow": pow,
     "div": truediv,
     "rem": ca.fmod,
     "max": ca.fmax,
@@ -223,13 +207,8 @@ _PLAIN: dict[str, Callable] = {
     "exp2": lambda a: 2**a,
     "logistic": lambda a: 1 / (1 + ca.exp(-a)),
     "erfc": lambda a: 1 - ca.erf(a),
-}
-ENTRYWISE: dict[str, Callable] = {
-    **{name: _plain(operation) for name, operation in _PLAIN.items()},
-    "select_n": _select,
-    "convert_element_type": _convert,
-    "integer_pow": lambda equation, a: a ** equation.params["y"],
-    "and": _logical(ca.logic_and),
-    "or": _logical(ca.logic_or),
-    "not": _logical(ca.logic_not),
+    "select_n": lambda which, otherwise, a: ca.if_else(which, a, otherwise),
+    "and": ca.logic_and,
+    "or": ca.logic_or,
+    "not": ca.logic_not,
 }

@@ -1,8 +1,7 @@
 """Fields and steps as StableHLO programs in files, through `jax.export`: JAX runs them without this library.
 
-A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`: a list
-of operations on arrays, the parameters included. Loading a file runs no Python of it. Programs with external calls are
-neither written nor loaded.
+A file is an archive (see archive.py) whose array "exported" holds the bytes of `jax.export.Exported.serialize`.
+Programs with external calls are neither written nor loaded.
 """
 
 import importlib.util
@@ -44,11 +43,7 @@ class Program:
     def __call__(
         self, x: Float[Array | np.ndarray, "*b d"], u: Float[Array | np.ndarray, "*b m"]
     ) -> Float[Array, "*b d"]:
-        """ẋ, or the state dt later with the input held; in single precision.
-
-        Raises:
-            ValueError: other shapes, or a number that is not finite.
-        """
+        """ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays."""
         x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
         batch = x.shape[:1] if self.batched else ()
         if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
@@ -97,12 +92,7 @@ def export_step(
     platforms: tuple[str, ...] = ("cpu",),
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write x⁺ = F(x, u), one step of RK4 over dt [s] with the input held. Otherwise as `export_field`.
-
-    Raises:
-        ValueError: dt is not positive; and as `export_field`.
-        ImportError, OSError: as `export_field`.
-    """
+    """Write x⁺ = F(x, u), one step of RK4 over dt [s] with the input held. Otherwise as `export_field`."""
     checks.positive("dt", dt, "a positive number of seconds")
     _export(path, field, float(dt), state_size, input_size, batched, platforms, about)
 
@@ -132,9 +122,8 @@ def _export(path, field, dt: float | None, state_size, input_size, batched, plat
     _need_flatbuffers()
     sizes = sizes_of(field, state_size, input_size)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
-        raise ValueError(
-            f"platforms must be a tuple of some of {', '.join(PLATFORMS)}, got {checks.short_repr(platforms)}"
-        )
+        known = ", ".join(PLATFORMS)
+        raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
     with jax.enable_x64(False), _without_source_locations():
         program = program_of(field, [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes], dt, batched)
         batch = jax.export.symbolic_shape(BATCH) if batched else ()
@@ -148,13 +137,12 @@ def _export(path, field, dt: float | None, state_size, input_size, batched, plat
 @contextmanager
 def _without_source_locations() -> Iterator[None]:
     """Leave out the paths and lines of the source that a program is traced from."""
-    name = "jax_traceback_in_locations_limit"
-    before = getattr(jax.config, name)
-    jax.config.update(name, 0)
+    before = jax.config.jax_traceback_in_locations_limit  # pyright: ignore[reportAttributeAccessIssue]
+    jax.config.update("jax_traceback_in_locations_limit", 0)
     try:
         yield
     finally:
-        jax.config.update(name, before)
+        jax.config.update("jax_traceback_in_locations_limit", before)
 
 
 def _check_calls(exported: jax.export.Exported) -> None:
@@ -166,18 +154,16 @@ def _check_calls(exported: jax.export.Exported) -> None:
 
 def _sizes(exported: jax.export.Exported) -> tuple[bool, int, int]:
     """(batched, d, m) of a program (x, u) → ẋ or x⁺."""
-    x, u = exported.in_avals
-    (result,) = exported.out_avals
-    arguments = jax.tree.structure(((0, 0), {}))
-    batched = len(x.shape) == 2
-    batch = (str(x.shape[0]),) if batched else ()
-    sizes = [x.shape[-1], u.shape[-1]]
+    (x, u), (result,) = exported.in_avals, exported.out_avals
+    batched, d, m = len(x.shape) == 2, x.shape[-1], u.shape[-1]
+    batch = (BATCH,) if batched else ()
     shapes = [tuple(map(str, value.shape)) for value in (x, u, result)]
-    fits = shapes == [(*batch, str(size)) for size in (*sizes, sizes[0])] and batch in ((), (BATCH,))
+    fits = shapes == [(*batch, str(size)) for size in (d, m, d)]
     single = all(value.dtype == np.float32 for value in (x, u, result))
-    if not fits or not single or exported.in_tree != arguments or exported.out_tree != jax.tree.structure(0):
+    trees = (exported.in_tree, exported.out_tree) == tuple(map(jax.tree.structure, (((0, 0), {}), 0)))
+    if not (fits and single and trees):
         raise ValueError(f"it maps {exported.in_avals} to {exported.out_avals}")
-    return batched, int(sizes[0]), int(sizes[1])
+    return batched, int(d), int(m)
 
 
 def _need_flatbuffers() -> None:

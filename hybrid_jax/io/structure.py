@@ -23,10 +23,11 @@ import numpy as np
 from hybrid_jax import dynamics, networks
 from hybrid_jax.checks import short_repr
 from hybrid_jax.dynamics.base import RunningStats
-from hybrid_jax.dynamics.kinematics import Kinematics
+from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.io.archive import Arrays, array_type, from_numpy
 from hybrid_jax.networks import views
-from hybrid_jax.networks.fused import FusedNetwork
+from hybrid_jax.networks.mlp import FusedNetwork
+from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
 from hybrid_jax.vehicle import Vehicle
 
 _ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid
@@ -54,6 +55,11 @@ _FORMAT_1 = (Kinematics, Vehicle, views.Accelerations, views.BodyFrame, views.Bo
 _RENAMED: dict[str, type | Callable[[dict[str, Any]], Any]] = {
     **{name: item for name, item in (vars(dynamics) | vars(networks)).items() if isinstance(item, type)},
     **{item.__name__: item for item in _FORMAT_1},
+    "hybrid_jax.dynamics.kinematics:Kinematics": Kinematics,
+    "hybrid_jax.networks.fused:FusedNetwork": FusedNetwork,
+    "hybrid_jax.networks.rotor_thrust:RotorThrust": views.RotorThrust,
+    "hybrid_jax.networks.scaling:ChannelScaling": ChannelScaling,
+    "hybrid_jax.networks.scaling:InputScaling": InputScaling,
     "ConstantDisturbance": lambda fields: dynamics.ConstantDisturbance(fields["acceleration"]),
     "DeployedNetwork": FusedNetwork,
     "LinearPath": networks.LinearSkip,

@@ -1,8 +1,8 @@
 """Residual networks f_d.
 
-`mlp` defines the network of the paper and linear maps, `normalisation` what its hidden layer may be normalised by,
-`views` and `rotor_thrust` restrict what a multirotor's network reads and returns, `factory` builds these by name, and
-`fused` is the form that a controller evaluates.
+`mlp` defines the network of the paper and linear maps, `normalisation` its scaling and what its hidden layer may be
+normalised by, `standardise` sets the scaling from windows, `views` restrict what a multirotor's network reads and
+returns, and `factory` builds these by name.
 """
 
 from hybrid_jax.networks.factory import make_residual
@@ -15,18 +15,7 @@ from hybrid_jax.networks.mlp import (
     zero_output,
 )
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
-from hybrid_jax.networks.rotor_thrust import RotorThrust
+from hybrid_jax.networks.views import RotorThrust
 
-__all__ = [
-    "BatchNorm",
-    "Bias",
-    "InputScaling",
-    "LayerNorm",
-    "LinearResidual",
-    "LinearSkip",
-    "ResidualNetwork",
-    "RotorThrust",
-    "make_residual",
-    "residual_network",
-    "zero_output",
-]
+__all__ = ["BatchNorm", "Bias", "InputScaling", "LayerNorm", "LinearResidual", "LinearSkip", "ResidualNetwork"]
+__all__ += ["RotorThrust", "make_residual", "residual_network", "zero_output"]

@@ -7,10 +7,9 @@ import jax.numpy as jnp
 from jaxtyping import PRNGKeyArray
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.networks import views
 from hybrid_jax.networks.mlp import LinearSkip, residual_network, zero_output
-from hybrid_jax.networks.rotor_thrust import RotorThrust
-from hybrid_jax.networks.scaling import AbstractScaling
-from hybrid_jax.networks.views import Accelerations, BodyFrame, BodyMotion, DropXY, DropXYYaw, GroundDistance, Motion
+from hybrid_jax.networks.normalisation import AbstractScaling
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
@@ -19,18 +18,18 @@ Wrapper = Callable[..., AbstractVectorField]
 # Name → number of features that the network reads besides u, or of outputs, and the view around it if any.
 INPUTS: dict[str, tuple[int, Wrapper | None]] = {
     "all": (STATE_SIZE, None),
-    "no_xy": (STATE_SIZE - 2, DropXY),
-    "no_xy_yaw": (10, DropXYYaw),
-    "near_ground": (14, GroundDistance),
-    "body": (10, BodyFrame),
-    "body_motion": (9, BodyMotion),
+    "no_xy": (STATE_SIZE - 2, views.DropXY),
+    "no_xy_yaw": (10, views.DropXYYaw),
+    "near_ground": (14, views.GroundDistance),
+    "body": (10, views.BodyFrame),
+    "body_motion": (9, views.BodyMotion),
 }
 OUTPUTS: dict[str, tuple[int, Wrapper | None]] = {
     "all": (STATE_SIZE, None),
-    "accelerations": (6, Accelerations),
-    "rotors": (6, Accelerations),
-    "angular_acceleration": (3, Accelerations),
-    "motion": (12, Motion),
+    "accelerations": (6, views.Accelerations),
+    "rotors": (6, views.Accelerations),
+    "angular_acceleration": (3, views.Accelerations),
+    "motion": (12, views.Motion),
 }
 FROM_THE_BODY = ("body", "body_motion")
 OF_ROTORS = ("near_ground", "rotors")
@@ -79,8 +78,8 @@ def make_residual(
     field = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
     field = field if written is None else written(field)
     if seen is not None:
-        field = seen(field, vehicle) if seen is GroundDistance else seen(field)
+        field = seen(field, vehicle) if seen is views.GroundDistance else seen(field)
     if vehicle is None or outputs != "rotors":
         return field
     thrust = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
-    return Hybrid(zero_output(RotorThrust(thrust, vehicle)), field)
+    return Hybrid(zero_output(views.RotorThrust(thrust, vehicle)), field)

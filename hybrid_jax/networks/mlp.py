@@ -1,7 +1,4 @@
-"""f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1).
-
-Also a linear map: beside the network (`LinearSkip`), or instead of it where there are too few data for one.
-"""
+"""f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and linear maps."""
 
 from collections.abc import Callable
 from typing import ClassVar
@@ -12,11 +9,54 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.batching import RunningStats
-from hybrid_jax.networks.fused import FusedNetwork
-from hybrid_jax.networks.normalisation import AbstractAffineNorm, AbstractNorm, BatchNorm, Bias, LayerNorm, affine
-from hybrid_jax.networks.scaling import AbstractScaling, ChannelScaling, InputScaling
+from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns
+from hybrid_jax.dynamics.batching import RunningStats, expand_trailing
+from hybrid_jax.networks.normalisation import (
+    UNROLLED_INPUTS,
+    AbstractAffineNorm,
+    AbstractNorm,
+    AbstractScaling,
+    BatchNorm,
+    Bias,
+    ChannelScaling,
+    InputScaling,
+    LayerNorm,
+    affine,
+    product,
+)
+
+
+class FusedNetwork(AbstractVectorField):
+    """ẋ = W₂ relu(W₁ z + c) + A z + b, z = [x, scaled u]: a network with its normalisation folded in, and a linear map.
+
+    The same map as `ResidualNetwork`, or `LinearSkip` around one, laid out for few samples at a time, as a controller
+    evaluates it: one product serves W₁ and A, and the weights of an input are contiguous.
+    """
+
+    accepts_batch: ClassVar[bool] = True
+
+    weight_in: Float[Array, "m h+d"]  # [W₁; A]ᵀ
+    bias: Float[Array, " h+d"]  # [c; b]
+    weight_out: Float[Array, "h d"]  # W₂ᵀ
+    scaling: AbstractScaling
+
+    def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        hidden, linear = self.layer(self.scaling.concatenate(x, u))
+        return (jax.nn.relu(hidden).T @ self.weight_out).T + linear
+
+    def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
+        """W₁ z + c and A z + b."""
+        both = product(self.weight_in.T, z) if len(z) <= UNROLLED_INPUTS else (z.T @ self.weight_in).T
+        both = both + expand_trailing(self.bias, both)
+        return both[: len(self.weight_out)], both[len(self.weight_out) :]
+
+    def linearize(self, x, u, dx, du):
+        """The Jacobian with respect to z is one product over the hidden units, whatever the number of directions."""
+        z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
+        hidden, linear = self.layer(z)
+        weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
+        jacobian = jnp.where(hidden > 0, self.weight_out.T, 0) @ weight.T + skip.T
+        return jax.nn.relu(hidden) @ self.weight_out + linear, jacobian @ dz
 
 
 class ResidualNetwork(AbstractVectorField):
@@ -33,15 +73,9 @@ class ResidualNetwork(AbstractVectorField):
     bias_out: Float[Array, " d"]
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
 
-    @property
-    def state_size(self) -> int:
-        """d, where the network is a field by itself."""
-        return len(self.bias_out)
-
-    @property
-    def input_size(self) -> int:
-        """m, where the network is a field by itself."""
-        return self.weight_in.shape[1] - len(self.bias_out)
+    # d and m, where the network is a field by itself.
+    state_size = property(lambda self: len(self.bias_out))
+    input_size = property(lambda self: self.weight_in.shape[1] - len(self.bias_out))
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
@@ -62,7 +96,7 @@ class ResidualNetwork(AbstractVectorField):
         norm = self.norm.observed(self.weight_in @ self.inputs(x, u))
         return eqx.tree_at(lambda network: network.norm, self, norm)
 
-    def fuse_for_inference(self) -> "ResidualNetwork | FusedNetwork":
+    def fuse_for_inference(self):
         return self.fused_with(jnp.zeros((len(self.weight_out), self.weight_in.shape[1]), self.weight_in.dtype)) or self
 
     def fused_with(self, linear: Float[Array, "d m"]) -> FusedNetwork | None:
@@ -107,7 +141,7 @@ class LinearSkip(AbstractVectorField):
     def update_running_stats(self, x, u):
         return LinearSkip(self.weight, self.field.update_running_stats(x, u))
 
-    def fuse_for_inference(self) -> "LinearSkip | FusedNetwork":
+    def fuse_for_inference(self):
         return self.field.fused_with(self.weight) or self
 
 
@@ -131,7 +165,7 @@ def residual_network(
     Raises:
         ValueError: another norm, sizes that are no positive integers, or no random key.
     """
-    if norm not in tuple(NORMS):
+    if norm not in tuple(NORMS):  # it may not be hashable
         raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {checks.short_repr(norm)}")
     outputs = state_size if outputs is None else outputs
     for name, size in {"state_size": state_size, "hidden": hidden, "outputs": outputs}.items():
@@ -142,22 +176,20 @@ def residual_network(
     fan_in = state_size + input_size
     return ResidualNetwork(
         weight_in=_uniform(key_in, (hidden, fan_in), fan_in),
-        norm=NORMS[norm](hidden, fan_in, jax.random.fold_in(key, 3)),
+        norm=NORMS[norm](hidden, _uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
         weight_out=_uniform(key_out, (outputs, hidden), hidden),
         bias_out=_uniform(key_bias, (outputs,), hidden),
         scaling=ChannelScaling() if scaling is None else scaling,
     )
 
 
-def _batch_norm(hidden: int, fan_in: int, key: PRNGKeyArray) -> BatchNorm:
-    running = RunningStats(jnp.zeros(hidden), jnp.ones(hidden))
-    return BatchNorm(gain=jnp.ones(hidden), shift=jnp.zeros(hidden), running=running)
-
-
-NORMS: dict[str, Callable[[int, int, PRNGKeyArray], AbstractNorm]] = {
-    "batch": _batch_norm,
-    "layer": lambda hidden, fan_in, key: LayerNorm(jnp.ones(hidden), jnp.zeros(hidden)),
-    "none": lambda hidden, fan_in, key: Bias(_uniform(key, (hidden,), fan_in)),
+# Name → the normalisation of some hidden units, from the bias of a plain linear layer.
+NORMS: dict[str, Callable[[int, Array], AbstractNorm]] = {
+    "batch": lambda h, bias: BatchNorm(
+        gain=jnp.ones(h), shift=jnp.zeros(h), running=RunningStats(jnp.zeros(h), jnp.ones(h))
+    ),
+    "layer": lambda h, bias: LayerNorm(jnp.ones(h), jnp.zeros(h)),
+    "none": lambda h, bias: Bias(bias),
 }
 
 
@@ -166,24 +198,20 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
 
 
 def zero_output(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with every output layer and linear skip connection at zero, so that training starts at the physics.
+    """The field with all output layers and linear skip connections at zero; ValueError if it contains no network."""
 
-    Raises:
-        ValueError: the field contains no network.
-    """
+    def has_outputs(node) -> bool:
+        return isinstance(node, ResidualNetwork | LinearSkip)
 
-    def is_network(node) -> bool:
-        return isinstance(node, ResidualNetwork)
-
-    if not any(map(is_network, jax.tree.leaves(field, is_leaf=is_network))):
+    if not any(map(has_outputs, jax.tree.leaves(field, is_leaf=has_outputs))):
         raise ValueError(f"field: there is no ResidualNetwork in {checks.short_repr(field)}")
 
-    def outputs(network):
-        return network.weight_out, network.bias_out
-
     def zeroed(node):
-        if isinstance(node, LinearSkip):
-            return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
-        return eqx.tree_at(outputs, node, replace_fn=jnp.zeros_like) if is_network(node) else node
+        match node:
+            case LinearSkip():
+                return LinearSkip(jnp.zeros_like(node.weight), zeroed(node.field))
+            case ResidualNetwork():
+                return eqx.tree_at(lambda n: (n.weight_out, n.bias_out), node, replace_fn=jnp.zeros_like)
+        return node
 
-    return jax.tree.map(zeroed, field, is_leaf=lambda node: is_network(node) or isinstance(node, LinearSkip))
+    return jax.tree.map(zeroed, field, is_leaf=has_outputs)

@@ -4,14 +4,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Float
 
 from hybrid_jax.dynamics import batching
 from hybrid_jax.dynamics.base import AbstractVectorField, unfreeze
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.mlp import ResidualNetwork
-from hybrid_jax.networks.scaling import AbstractScaling, Channels, ChannelScaling
+from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
 from hybrid_jax.trajectories import Trajectories
 
 SAMPLES = 10_000  # intervals that are looked at, at most
@@ -48,12 +48,14 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     Args:
         windows: those that the field is to be trained on.
     """
-    networks = [node for node in jax.tree.leaves(field, is_leaf=_is_unset) if _is_unset(node)]
-    if not networks:
+    if not (networks := _unset(field)):
         return field
-    x, u, after = _intervals(windows)
+    x0, u, after = (jnp.asarray(part) for part in (windows.x0, windows.u, windows.x))
+    before = jnp.concatenate([x0[:, None], after[:, :-1]], axis=1)
+    every = -(-before.shape[0] * before.shape[1] // SAMPLES)
+    x, u, after = (rows.reshape(-1, rows.shape[-1])[::every] for rows in (before, u, after))
     zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
-    probed = unfreeze(_rescaled(field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
+    probed = unfreeze(eqx.tree_at(_scalings, field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
 
     predicted = rollout_batch(probed, x, u[:, None], windows.dt)[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
@@ -67,30 +69,17 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
         scale = _positive(np.sqrt(variance), FLOOR * np.abs(mean))
         whole = len(network.bias_out) == x.shape[1]
         scalings.append(ChannelScaling(tuple(mean.tolist()), scale, output if whole else None))
-    return _rescaled(field, scalings)
+    return eqx.tree_at(_scalings, field, scalings)
 
 
-def _is_unset(node) -> bool:
-    return isinstance(node, ResidualNetwork) and isinstance(node.scaling, ChannelScaling) and not node.scaling.is_set
+def _unset(field: AbstractVectorField) -> list[ResidualNetwork]:
+    """The networks whose `ChannelScaling` is not set yet."""
+    nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, ResidualNetwork))
+    return [n for n in nodes if isinstance(n, ResidualNetwork) and eqx.tree_equal(n.scaling, ChannelScaling())]
 
 
-def _rescaled(field: AbstractVectorField, scalings: list) -> AbstractVectorField:
-    """The field with these scalings in place of those that are not set."""
-    left = iter(scalings)
-
-    def rescaled(node):
-        return eqx.tree_at(lambda network: network.scaling, node, next(left)) if _is_unset(node) else node
-
-    return jax.tree.map(rescaled, field, is_leaf=_is_unset)
-
-
-def _intervals(windows: Trajectories) -> tuple[Array, Array, Array]:
-    """x, u and the next x of at most `SAMPLES` intervals."""
-    x0, u, after = (jnp.asarray(part) for part in (windows.x0, windows.u, windows.x))
-    before = jnp.concatenate([x0[:, None], after[:, :-1]], axis=1)
-    every = -(-before.shape[0] * before.shape[1] // SAMPLES)
-    x, u, after = (rows.reshape(-1, rows.shape[-1])[::every] for rows in (before, u, after))
-    return x, u, after
+def _scalings(field: AbstractVectorField) -> list[AbstractScaling]:
+    return [network.scaling for network in _unset(field)]
 
 
 def _positive(scale: Float[np.ndarray, " d"], floor: Float[np.ndarray, " d"]) -> Channels:

@@ -1,70 +1,28 @@
 """Views restrict what a multirotor's residual reads of the state and which derivatives it returns.
 
-A view is a vector field around another one: it passes features of x to it and maps its output to ẋ. Views nest: the
-outer one selects the inputs, the inner one the outputs. Derivatives that a network does not return remain those of the
-physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for the estimates in a log (see `Motion`).
+Views nest: the outer one selects the inputs, the inner one the outputs. Derivatives that a network does not return are
+those of the physics: ṗ = v and q̇ = ½ q ⊗ [0, ω] are exact for a true state, but not for estimates (see `Motion`).
 """
 
 from typing import ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.dynamics.base import (
-    AbstractVectorField,
-    fuse_for_inference,
-    infer_batch,
-    jvp_columns,
-    linearize,
-    train_batch,
-    update_running_stats,
-)
-from hybrid_jax.networks.rotor_thrust import nearness
+from hybrid_jax.dynamics.base import AbstractVectorField, AbstractWrapper, fuse_for_inference, jvp_columns
+from hybrid_jax.dynamics.equations import dot
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
-Features = Float[Array, " n *b"]
 
-
-class AbstractView(AbstractVectorField):
-    """ẋ = write(x, f(read(x), u)) for the field f inside."""
-
-    accepts_batch: ClassVar[bool] = True
+class AbstractView(AbstractWrapper):
+    """A wrapper whose state and input are a multirotor's (state.py)."""
 
     state_size: ClassVar[int] = STATE_SIZE
     input_size: ClassVar[int] = INPUT_SIZE
-
-    field: AbstractVectorField
-
-    def read(self, x: Float[Array, " 13 *b"]) -> Features:
-        """The features of the state that the field inside reads; by default all."""
-        return x
-
-    def write(self, x: Float[Array, " 13 *b"], inside: Features) -> Features:
-        """ẋ from what the field inside returned; by default the same."""
-        return inside
-
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " 13"]:
-        return self.write(x, self.field(self.read(x), u))
-
-    def train_batch(self, x, u):
-        return self.write(x, train_batch(self.field, self.read(x), u))
-
-    def infer_batch(self, x, u):
-        return self.write(x, infer_batch(self.field, self.read(x), u))
-
-    def update_running_stats(self, x, u):
-        return eqx.tree_at(lambda view: view.field, self, update_running_stats(self.field, self.read(x), u))
-
-    def linearize(self, x, u, dx, du):
-        features, d_features = jvp_columns(self.read, (x,), (dx,))
-        inside, d_inside = linearize(self.field, features, u, d_features, du)
-        return jvp_columns(self.write, (x, inside), (dx, d_inside))
-
-    def fuse_for_inference(self):
-        return eqx.tree_at(lambda view: view.field, self, fuse_for_inference(self.field))
 
 
 class DropXY(AbstractView):
@@ -82,8 +40,7 @@ class DropXYYaw(AbstractView):
     """
 
     def read(self, x):
-        up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
-        return jnp.concatenate([x[2:3], up, x[VELOCITY], x[BODY_RATES]])
+        return jnp.concatenate([x[2:3], _up(x), x[VELOCITY], x[BODY_RATES]])
 
 
 class GroundDistance(AbstractView):
@@ -92,11 +49,8 @@ class GroundDistance(AbstractView):
     The ground effect on a rotor is nearly linear in its radius R over its altitude h (Cheeseman and Bennett 1955). As a
     function of p_z it is steep and depends on the tilt.
 
-    Attributes:
-        vehicle: provides rotor positions and radius.
-
     Raises:
-        ValueError: the vehicle's rotor radius is unknown.
+        ValueError: the rotor radius of `vehicle` is unknown.
     """
 
     vehicle: Vehicle = eqx.field(static=True)
@@ -105,8 +59,8 @@ class GroundDistance(AbstractView):
         checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
     def read(self, x):
-        up = rotation.body_z(rotation.conjugate(x[QUATERNION]))
-        return jnp.concatenate([x[2:3], nearness(x[2], up, self.vehicle), up, x[VELOCITY], x[BODY_RATES]])
+        up = _up(x)
+        return jnp.concatenate([x[2:3], _nearness(x, up, self.vehicle), up, x[VELOCITY], x[BODY_RATES]])
 
 
 class AbstractBodyView(AbstractView):
@@ -160,3 +114,72 @@ class Motion(AbstractView):
     def write(self, x, inside):
         turning = jnp.concatenate([jnp.zeros((1, *inside.shape[1:]), inside.dtype), inside[3:6] / 2])
         return jnp.concatenate([inside[:3], turning, inside[6:]])
+
+
+class RotorThrust(AbstractVectorField):
+    """v̇ and ω̇ of a thrust k uᵢ² f(R / hᵢ, uᵢ) of each rotor along the body's z axis, k and inertia the nominal ones.
+
+    By dimensional analysis, the ground effect on a rotor in hover is a function of its radius R over its altitude h
+    (Cheeseman and Bennett 1955). One network learns it from the data of every rotor: the vehicle's geometry says where
+    each thrust acts, so that force and torque follow. The other derivatives are exactly zero.
+
+    Attributes:
+        field: f, from one state and one input to one number, without batch normalisation.
+        vehicle: provides rotor positions, radius, and nominal constants.
+
+    Raises:
+        ValueError: the vehicle's rotor radius is unknown.
+    """
+
+    accepts_batch: ClassVar[bool] = True
+
+    field: AbstractVectorField
+    vehicle: Vehicle = eqx.field(static=True)
+
+    def __check_init__(self):
+        checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
+
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+        return self.write(x, u, self.share(self.read(x), u))
+
+    def fuse_for_inference(self):
+        return RotorThrust(fuse_for_inference(self.field), self.vehicle)
+
+    def linearize(self, x, u, dx, du):
+        """Two derivatives of the network for each rotor, whatever the number of directions."""
+        near, d_near = jvp_columns(self.read, (x,), (dx,))
+        share, pullback = jax.vjp(self.share, near, u)
+        by_near, by_u = pullback(jnp.ones_like(share))
+        d_share = by_near[:, None] * d_near + by_u[:, None] * du
+        return jvp_columns(self.write, (x, u, share), (dx, du, d_share))
+
+    def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " 4 *b"]:
+        """R / h of each rotor."""
+        return _nearness(x, _up(x), self.vehicle)
+
+    def share(self, near: Float[Array, " 4 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 4 *b"]:
+        """f of each rotor."""
+        return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
+
+    def write(self, x, u, share: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+        """ẋ from the additional thrust of each rotor, as a share of k u²."""
+        vehicle = self.vehicle
+        thrust = vehicle.thrust_coefficient * u * u * share
+        x_moment, y_moment = (dot(arms, thrust) for arms in zip(*vehicle.rotor_positions, strict=True))
+        acceleration = sum(thrust) / vehicle.mass * rotation.body_z(x[QUATERNION])
+        torque = y_moment, -x_moment, jnp.zeros_like(x_moment)
+        turning = jnp.stack([part / moment for part, moment in zip(torque, vehicle.inertia, strict=True)])
+        still = jnp.zeros((VELOCITY.start, *turning.shape[1:]), turning.dtype)
+        return jnp.concatenate([still, acceleration, turning])
+
+
+def _up(x: Float[Array, " 13 *b"]) -> Float[Array, " 3 *b"]:
+    """The world's up in the body frame, Rᵀe_z."""
+    return rotation.body_z(rotation.conjugate(x[QUATERNION]))
+
+
+def _nearness(x: Float[Array, " 13 *b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
+    """R / h of each rotor, its altitude h at least R / 2."""
+    altitude = x[2]
+    heights = jnp.stack([altitude + along * up[0] + across * up[1] for along, across in vehicle.rotor_positions])
+    return vehicle.rotor_radius / jnp.maximum(heights, vehicle.rotor_radius / 2)

@@ -1,6 +1,7 @@
 """Laws of the closed loop, with a rigid body as the plant."""
 
 from functools import cache
+from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -27,6 +28,7 @@ from hybrid_jax.control import (
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.dynamics.disturbance import disturbed
 
+ROOT = Path(__file__).parents[2]
 CONTROLLER = Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
 WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
@@ -189,13 +191,8 @@ def test_mixed_precision_is_promoted(start, wanted):
     np.testing.assert_allclose(flight.u[0], u, rtol=1e-5)
 
 
-def test_docstring_example_runs(capsys):
-    import hybrid_jax.control as package
-
-    lines = package.__doc__.split("\n\n")
-    example = "\n\n".join(block for block in lines if block.startswith("    "))
-    code = "\n".join(line[4:] for line in example.splitlines())
-    assert len([line for line in code.splitlines() if line.strip()]) <= 20
+def test_the_guide_s_example_runs(capsys):
+    code = (ROOT / "docs" / "control.md").read_text().split("```python\n")[1].partition("```")[0]
     exec(compile(code, "example", "exec"), {})
     away = float(capsys.readouterr().out.split()[3])
     assert away < 0.01

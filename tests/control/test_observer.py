@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import advance, observer
+from hybrid_jax.control import advance
+from hybrid_jax.control.loop import Estimate
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.networks.mlp import InputScaling
 
@@ -23,11 +24,10 @@ def watch(field, plant, bandwidth, periods=100, sign=1.0):
     def tick(carry, u):
         x, estimate = carry
         seen = x.at[3:7].multiply(sign)
-        estimate = observer.correct(estimate, seen, bandwidth, DT)
-        estimate = observer.predict(estimate, field, seen, u, DT)
+        estimate = estimate.correct(seen, bandwidth, DT).predict(field, seen, u, DT)
         return (advance(plant, x, u, DT), estimate), estimate.disturbance
 
-    return np.asarray(jax.lax.scan(tick, (START, observer.begin(START)), speeds)[1])
+    return np.asarray(jax.lax.scan(tick, (START, Estimate.begin(START)), speeds)[1])
 
 
 @pytest.fixture(scope="module")

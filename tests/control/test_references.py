@@ -7,8 +7,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import Controller, add_body_rates, figure_eight, hover, low_pass, sample, step
-from hybrid_jax.control.attitude import heading
-from hybrid_jax.rotation import body_z, normalise
+from hybrid_jax.rotation import body_z, heading, normalise
 
 CONTROLLER = Controller(hj.IRIS)
 DT = CONTROLLER.period

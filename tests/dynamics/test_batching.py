@@ -20,6 +20,8 @@ from hybrid_jax.dynamics.base import (
 from hybrid_jax.integrate import RK4, rollout_minibatch
 from hybrid_jax.networks.mlp import residual_network
 
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+
 STATES, INPUTS, WINDOWS, STEPS = 5, 2, 11, 3
 CALLS = {
     "call": lambda network, x, u: network(x, u),
@@ -51,12 +53,6 @@ class Sum(eqx.Module):
 
     def __call__(self, x, u):
         return sum(part(x, u) for part in self.parts)
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def network(seed=0):

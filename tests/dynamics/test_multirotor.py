@@ -21,6 +21,8 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+
 ALL = tuple(name for name in SHAPES if name != "k")
 KNOWN = Terms(
     torque_gain=(0.9, 1.1, 0.8),
@@ -32,12 +34,6 @@ KNOWN = Terms(
     velocity_gain=(0.95, 0.9, 1.02),
     velocity_lag=0.2,
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def samples(count=6, seed=1):

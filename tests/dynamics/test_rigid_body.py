@@ -16,6 +16,8 @@ from hybrid_jax.integrate import rollout
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+
 ODD = replace(
     IRIS,
     mass=2.1,
@@ -26,12 +28,6 @@ ODD = replace(
     spin=(1.0, 1.0, -1.0, -1.0),
     gravity=9.7,
 )
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    with jax.enable_x64(True):
-        yield
 
 
 def level(**parts):

@@ -14,7 +14,7 @@ from experiments.real_flight.models import move_to_vehicle, objective_of, physic
 from experiments.real_flight.recipes import RECIPES, equivalent_recipe, stage_of
 from experiments.real_flight.scoring import body_of
 from experiments.real_flight.train import rates_of
-from hybrid_jax.dynamics.kinematics import Kinematics
+from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.state import POSITION

@@ -27,7 +27,7 @@ from experiments.real_flight.tables import choice_tables, parameter_tables
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
-from hybrid_jax.dynamics.kinematics import Kinematics
+from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, longest_segment, require_common_interval
 from hybrid_jax.integrate import rollout

@@ -11,7 +11,7 @@ from pendulum import pendulum
 from systems import Dense
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.kinematics import Kinematics
+from hybrid_jax.dynamics.baselines import Kinematics
 
 
 class Convolution(hj.AbstractVectorField):

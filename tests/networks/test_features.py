@@ -1,6 +1,7 @@
 """Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
 
 import itertools
+import json
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,18 +15,26 @@ from hybrid_jax.dynamics.base import (
     AbstractVectorField,
     Frozen,
     RunningStats,
+    fuse_for_inference,
     infer_batch,
     train_batch,
     trainable,
     update_running_stats,
 )
+from hybrid_jax.dynamics.baselines import Kinematics
+from hybrid_jax.io.archive import load_archive, save_archive
+from hybrid_jax.io.models import FORMAT
+from hybrid_jax.io.structure import _RENAMED
 from hybrid_jax.networks import factory, views
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
+from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.networks.views import BodyFrame, BodyMotion
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
+
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 
 KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
@@ -35,13 +44,6 @@ VIEWS = [
     if inputs in factory.GO_WITH.get(outputs, factory.INPUTS) and outputs != "rotors"  # see test_rotors
 ]
 FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in factory.FROM_THE_BODY]
-
-
-@pytest.fixture(autouse=True, scope="module")
-def double_precision():
-    """So that every law here holds to round-off, 1e-12."""
-    with jax.enable_x64(True):
-        yield
 
 
 def view(inputs="all", outputs="all", **options):
@@ -228,7 +230,7 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
         return seen(node.field, node.read(x)) if isinstance(node, views.AbstractView) else x
 
     network = network_of(field)
-    hidden = network.weight_in @ jnp.concatenate([seen(field, x), network.scaling(u)])
+    hidden = network.weight_in @ network.inputs(seen(field, x), u)
     here = RunningStats(hidden.mean(1), hidden.var(1))
     exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
     np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
@@ -255,3 +257,19 @@ def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
     np.testing.assert_array_equal(deployed(loaded, x, u), deployed(field, x, u))
     # θ_p (3), the network's weights, gain, shift and bias (5); not its running statistics.
     assert sum(jax.tree.leaves(trainable(field))) == 8
+
+
+def test_files_that_name_the_former_modules_are_loaded(tmp_path):
+    """Of all the classes that moved between modules."""
+    path, moved = tmp_path / "model.npz", {name: cls for name, cls in _RENAMED.items() if ":" in name}
+    residual = view("near_ground", "rotors", scaling=ChannelScaling())
+    field = Hybrid(Hybrid(Kinematics(), fuse_for_inference(view(norm="none"))), residual)
+    save(path, field)
+    metadata, arrays = load_archive(path, FORMAT)
+    text = json.dumps(metadata)
+    for name, cls in moved.items():
+        today = f"{cls.__module__}:{cls.__qualname__}"
+        assert today in text
+        text = text.replace(today, name)
+    save_archive(path, FORMAT, json.loads(text), arrays)
+    assert eqx.tree_equal(load(path).field, field)

@@ -16,8 +16,14 @@ from hybrid_jax.dynamics.base import (
     trainable,
     update_running_stats,
 )
-from hybrid_jax.networks.fused import FusedNetwork
-from hybrid_jax.networks.mlp import InputScaling, LinearResidual, LinearSkip, ResidualNetwork, residual_network
+from hybrid_jax.networks.mlp import (
+    FusedNetwork,
+    InputScaling,
+    LinearResidual,
+    LinearSkip,
+    ResidualNetwork,
+    residual_network,
+)
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
@@ -84,7 +90,7 @@ def test_in_training_hidden_units_have_mean_zero_and_variance_one():
 def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
     with jax.enable_x64(True):
         field, (x, u) = network(), batch()
-        hidden = field.weight_in @ jnp.concatenate([x, field.scaling(u)])
+        hidden = field.weight_in @ field.inputs(x, u)
         target = RunningStats(hidden.mean(1), hidden.var(1))
         before, observed = field.norm.running, field
         for _ in range(20):

@@ -10,7 +10,7 @@ from systems import SYSTEMS, Gain
 import hybrid_jax as hj
 from hybrid_jax.dynamics.base import fuse_for_inference, infer_batch, linearize
 from hybrid_jax.networks.mlp import LinearSkip
-from hybrid_jax.networks.scaling import ChannelScaling, InputScaling
+from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
 from hybrid_jax.networks.standardise import with_scaling
 
 KEY = jax.random.key(0)
