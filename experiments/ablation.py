@@ -11,7 +11,7 @@ from rich.console import Console
 from experiments.external_force import FLOOR
 from experiments.paper import figures
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
-from experiments.paper.lanes import rows_of, with_rho
+from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, flown, pretrained, source_splits, target_splits, tested
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY
@@ -127,9 +127,8 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     rows = Results()
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.best, config, stages, target)}
-        lanes = [tested(HYBRID, mode, states, config, stages, target) for mode, states in found.items()]
-        rows += with_rho(rows_of(lanes, domain.name))
+        found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.fields, config, stages, target)}
+        rows += rows_of([tested(HYBRID, mode, fit, config, stages, target) for mode, fit in found.items()])
     return rows
 
 

@@ -12,8 +12,7 @@ from experiments.closed_loop.rows import SOURCES, Agent
 from experiments.closed_loop.scenarios import DOMAINS, ModelSet
 from experiments.closed_loop.true_model import true_field
 from experiments.paper.config import Config
-from experiments.paper.solved import solved
-from experiments.paper.study import adapted, flown, places, pretrained, source_splits, target_splits
+from experiments.paper.study import adapted, flown, places, pretrained, solved, source_splits, target_splits
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import Method
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
@@ -34,12 +33,12 @@ class Trained:
 
 def train(model: str, config: Config, stages: Stages) -> Trained:
     """Pre-train a model (an id in `experiments.paper.conditions`) and adapt it to each domain."""
-    start = pretrained(model, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages)).best
+    start = pretrained(model, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages)).fields
     sizes, _ = places(config.sizes, config)
     found = {}
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        final = adapted(model, "fine_tuned", start, config, stages, target).best
+        final = adapted(model, "fine_tuned", start, config, stages, target).fields
         for size in config.sizes:
             found[domain.name, size] = lane(final, np.flatnonzero(np.equal(sizes, size)))
     return Trained(start, found)

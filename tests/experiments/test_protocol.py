@@ -103,7 +103,7 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
 
     found = pretrained("hybrid", IRIS, config, Trained(), None)
     fields, rates = zip(*begun, strict=True)
-    for field, before in zip((*fields[1:], found.best), fields, strict=True):
+    for field, before in zip((*fields[1:], found.fields), fields, strict=True):
         assert eqx.tree_equal(field, jax.tree.map(lambda leaf: leaf + 1, before))
     for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
         np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)
