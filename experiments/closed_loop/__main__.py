@@ -8,13 +8,12 @@ from functools import partial
 
 from rich.console import Console
 
-from experiments.closed_loop.ablation import train_networks, unnormalised, variants
+from experiments.closed_loop import models
 from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
-from experiments.closed_loop.flown import Flown, flown
-from experiments.closed_loop.models import Trained, disturbance_counts, least_squares, model_set, train
+from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, flown
+from experiments.closed_loop.models import Trained
 from experiments.closed_loop.report import Outcome, write
-from experiments.closed_loop.rows import Agent
-from experiments.closed_loop.scenarios import DOMAINS, ModelSet, Scenario
+from experiments.closed_loop.results import Agent
 from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.runner import command
@@ -36,10 +35,10 @@ DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=Tru
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
     """Train, fly and write the report."""
     outcome = Outcome()
-    trained = models(config, console, outcome)
-    fly_models(config, trained, console, outcome)
+    trained = train_all(config, console, outcome)
+    outcome.flown = fly_models(config, trained, console)
     if config.ablation:
-        fly_ablation(config, console, outcome)
+        outcome.ablation = fly_ablation(config, console, outcome)
     if hosts.is_main_process():
         outcome.speeds = speeds(config, trained)
         write(NAME, config, outcome, Console())
@@ -49,43 +48,44 @@ def train_one(console: Console, outcome: Outcome, name: str, model: str, config:
     """Train a model and record its stages."""
     console.print(name, style="bold", highlight=False)
     stages = stages_of(config, console)
-    found = train(model, config, stages)
+    found = models.train(model, config, stages)
     outcome.record(name, stages)
     return found
 
 
-def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:
-    """All trained models by their id in `rows.LEARNED`."""
+def train_all(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:
+    """All trained models by their id in `results.LEARNED`."""
     trained = {name: train_one(console, outcome, name, model, config) for name, model in MODELS.items()}
     own = config.invariant()
     trained["invariant"] = train_one(console, outcome, "invariant", "hybrid", own)
     stages, solve = stages_of(own, console), DISTURBANCES[config.invariant_disturbance]
-    trained["least_squares"] = least_squares(trained["invariant"].source, solve, own, stages)
+    trained["least_squares"] = models.least_squares(trained["invariant"].source, solve, own, stages)
     outcome.record("least squares", stages)
-    outcome.notes += [f"least squares: {note}" for note in disturbance_counts(trained["least_squares"])]
+    outcome.notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     return trained
 
 
-def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console, outcome: Outcome) -> None:
+def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console) -> list[Flown]:
     """Fly every model along every reference, before and after the changes; after them also away from home."""
-    changed = {domain.name: model_set(domain, trained, config.ends) for domain in DOMAINS}
-    sets = {SOURCE.name: model_set(SOURCE, trained, ()), **changed}
+    changed = {domain.name: models.model_set(domain, trained, config.ends) for domain in DOMAINS}
+    sets = {SOURCE.name: models.model_set(SOURCE, trained, ()), **changed}
     home = scenarios(config, sets, [(name, 0.0) for name in config.references])
     away = scenarios(config, changed, [(name, config.away) for name in config.flown_away])
-    outcome.flown = fly_all(config, Controller(IRIS), [*home, *away], console)
+    return fly_all(config, Controller(IRIS), [*home, *away], console)
 
 
-def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> None:
+def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> list[Flown]:
     """Train and fly the networks of the ablation."""
     own = config.ablated()
-    trained = train_networks(config.ablation, own, partial(train_one, console, outcome))
+    trained = models.train_networks(config.ablation, own, partial(train_one, console, outcome))
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    sets = {domain.name: variants(config.ablation, domain, trained, own) for domain in DOMAINS}
-    outcome.ablation = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
+    sets = {domain.name: models.variants(config.ablation, domain, trained, own) for domain in DOMAINS}
+    found = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
     if "quaternion" in config.ablation:
-        sets = {domain.name: unnormalised(domain, trained, own) for domain in DOMAINS}
+        sets = {domain.name: models.unnormalised(domain, trained, own) for domain in DOMAINS}
         controller = Controller(IRIS, unit_quaternion=False)
-        outcome.ablation += fly_all(config, controller, scenarios(config, sets, places), console)
+        found += fly_all(config, controller, scenarios(config, sets, places), console)
+    return found
 
 
 def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:

@@ -1,36 +1,34 @@
 """Write what the closed-loop experiment leaves in its folder: report.json, rows.csv, report.md and the figures."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-import jax.numpy as jnp
-import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.closed_loop import figures
-from experiments.closed_loop.claims import THREE, Evidence, Speed, claims
-from experiments.closed_loop.flown import Flown, results_of
-from experiments.closed_loop.path_figures import paths, strip
-from experiments.closed_loop.rows import DOMAINS, ORACLE, SOURCES, Agent
-from experiments.closed_loop.runner import DRAW_EVERY
-from experiments.closed_loop.scenarios import PATHS
-from experiments.closed_loop.tables import ablation_tables, gap_tables, speed_table, tables
+from experiments.closed_loop.claims import Evidence, Speed, claims
+from experiments.closed_loop.flights import Flown, results_of
+from experiments.closed_loop.path_figures import flown_paths, rendered
+from experiments.closed_loop.results import (
+    DOMAINS,
+    ORACLE,
+    SOURCES,
+    Agent,
+    ablation_tables,
+    gap_tables,
+    speed_table,
+    tables,
+)
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner.environment import environment
 from experiments.runner.stages import Stages
-from hybrid_jax.control import Controller, sample
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
-from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
-from hybrid_jax.state import POSITION
-from hybrid_jax.vehicle import IRIS
 
-DRAWN_TIMES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # s, of the strip
 HEAD = """# closed_loop
 
 A model predictive controller flies the simulated quadrotor after a change: other moments of inertia (parameter shift),
@@ -80,14 +78,16 @@ class Outcome:
 
 def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
     """Write the report and its figures, and print the tables."""
-    out, few = config.out / name, min(config.sizes)
+    out, few, flown = config.out / name, min(config.sizes), [*outcome.flown, *outcome.ablation]
     rows, ablated = results_of(outcome.flown), results_of(outcome.ablation)
-    verdicts = evaluate(claims(few), Evidence(rows, few, speed_of(outcome, config.seconds, few)))
-    drawn, missing = draw(rows, ablated, outcome, few)
+    speed = speed_of(outcome.speeds[Agent("hybrid", few).name], flown, config.seconds)
+    verdicts = evaluate(claims(few), Evidence(rows, speed))
+    drawn, missing = draw(rows, ablated, outcome.flown, few)
     seconds = dict(outcome.seconds)
-    for each in [*outcome.flown, *outcome.ablation]:  # the ablation repeats some
+    for each in flown:  # the ablation repeats some
         stage = f"flights {each.scenario.name}"
         seconds[stage] = seconds.get(stage, 0.0) + each.seconds
+    titled = [verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), *ablation_tables(ablated)]
     report = Report(
         experiment=name,
         config=config.described(),
@@ -98,52 +98,40 @@ def write(name: str, config: Any, outcome: Outcome, console: Console) -> None:
         notes=[*missing, *outcome.notes],
         extra={"ablation": ablated.rows, "speed": outcome.speeds},
         head=HEAD.strip(),
-        tables=[
-            verdict_table(verdicts, "Hypotheses"),
-            *tables(rows),
-            *gap_tables(rows),
-            *ablation_tables(ablated),
-            speed_table(outcome.speeds),
-        ],
+        tables=[*titled, speed_table(outcome.speeds)],
         more_rows=ablated,
     )
     write_report(out, report, console)
 
 
-def speed_of(outcome: Outcome, seconds: float, few: int) -> Speed:
+def speed_of(call: Mapping[str, float], flown: Sequence[Flown], seconds: float) -> Speed:
     """Speed of one call, and of all flights of so many seconds."""
-    call, flown = outcome.speeds[Agent("hybrid", few).name], [*outcome.flown, *outcome.ablation]
-    return Speed(
-        call_ms=call["processor_ms"],
-        median_ms=call["median_ms"],
-        flown_seconds=seconds * sum(len(each.scenario.keys()) for each in flown),
-        seconds=sum(each.seconds for each in flown),
-        processor_seconds=sum(each.processor_seconds for each in flown),
-        devices=flown[0].devices,
-    )
+    flights = sum(len(each.scenario.keys()) for each in flown)
+    spent, worked = sum(each.seconds for each in flown), sum(each.processor_seconds for each in flown)
+    return Speed(call["processor_ms"], call["median_ms"], seconds * flights, spent, worked, flown[0].devices)
 
 
 def draw(
-    rows: Results, ablated: Results, outcome: Outcome, few: int
+    rows: Results, ablated: Results, flown: Sequence[Flown], few: int
 ) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
     """Figures with their captions by file, and notes on those that could not be drawn."""
-    sources, adapted = [Agent("hybrid"), Agent("invariant")], [Agent(model, few) for model in SOURCES]
-    followed = (Agent("nominal"), sources[0], *adapted, ORACLE)
+    nominal, sources = Agent("nominal"), [Agent("hybrid"), Agent("invariant")]
+    adapted = [Agent(model, few) for model in SOURCES]
+    followed = (nominal, sources[0], *adapted, ORACLE)
     wanted: dict[str, tuple[str, Callable[[], Figure]]] = {}
-    for domain in (PARAMETER_SHIFT.name, EXTERNAL_FORCE.name):
+    for domain, label in list(DOMAINS.items())[1:]:  # after the change
         for file, caption, drawing in (
             ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
             ("gap", "Share of the gap to the true vehicle", partial(figures.shares, rows, domain)),
-            ("paths", "Flights of seed 0", partial(flown_paths, outcome.flown, domain, followed)),
-            ("ablation", "Ablation of the invariant residual", partial(figures.ablation, ablated, domain)),
+            ("paths", "Flights of seed 0", partial(flown_paths, flown, domain, followed)),
+            ("ablation", "Ablation of the invariant residual", partial(figures.errors, ablated, domain, True)),
         ):
             if file != "ablation" or len(ablated):
-                wanted[f"{file}_{domain}"] = f"{caption}, {DOMAINS[domain]}", drawing
-    costs = partial(figures.open_loop_costs, rows, (Agent("nominal"), *sources, *adapted, ORACLE))
+                wanted[f"{file}_{domain}"] = f"{caption}, {label}", drawing
+    costs = partial(figures.open_loop_costs, rows, (nominal, *sources, *adapted, ORACLE))
     wanted["open_loop_costs"] = "Predicted and actual open-loop cost of plans", costs
     wanted["away"] = "The same flights away from home", partial(figures.away_from_home, rows)
-    hover = partial(rendered, outcome.flown, few)
-    wanted["strip"] = "Hover in the wind; the red mark is the reference", hover
+    wanted["strip"] = "Hover in the wind; the red mark is the reference", partial(rendered, flown, few)
     made, missing = {}, []
     for file, (caption, drawing) in wanted.items():
         try:
@@ -151,37 +139,3 @@ def draw(
         except ValueError as error:  # nothing of it was flown, or there is no renderer
             missing.append(f"{file}.png is missing: {error}.")
     return made, missing
-
-
-def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) -> Figure:
-    """Flights of seed 0 and their references."""
-    own = {each.scenario.name: each for each in flown}
-    at_home = {name: own[f"{domain} {name}"] for name in THREE if f"{domain} {name}" in own}
-    flights = {name: {agent: each.states(agent) for agent in agents} for name, each in at_home.items()}
-    controller = Controller(IRIS)
-    dt = DRAW_EVERY * controller.period
-    wanted = {}
-    for name, states in flights.items():
-        length = len(states[agents[0]])
-        reference = sample(PATHS[name], controller, dt * (length - 1))
-        wanted[name] = np.asarray(reference[: DRAW_EVERY * length : DRAW_EVERY])
-    return paths(flights, wanted, dt, f"{DOMAINS[domain].capitalize()}: flights of one seed")
-
-
-def rendered(flown: Sequence[Flown], few: int) -> Figure:
-    """Rendered images of hover in the wind, before and after adaptation."""
-    found = [each for each in flown if each.scenario.name == f"{EXTERNAL_FORCE.name} hover"]
-    if not found:
-        raise ValueError("nothing hovered in the wind")
-    dt = DRAW_EVERY * Controller(IRIS).period
-    mark = np.asarray(PATHS["hover"](jnp.zeros(()))[0])
-    agents = (Agent("hybrid"), Agent("hybrid", few), Agent("invariant", few))
-    states = np.stack([found[0].states(agent) for agent in agents])
-    times = [t for t in DRAWN_TIMES if t < dt * states.shape[1]]
-    shown = states[:, [round(t / dt) for t in times]]
-    if not np.isfinite(shown).all():
-        raise ValueError("a flight is not finite")
-    images = frames(shown[..., :7].reshape(-1, 7), mark).reshape(*shown.shape[:2], FRAME_HEIGHT, FRAME_WIDTH, 3)
-    errors = np.linalg.norm(shown[..., POSITION] - mark, axis=-1)
-    pictures = {agent.name: (images[i], errors[i]) for i, agent in enumerate(agents)}
-    return strip(pictures, times, "Hover in the wind: the red mark is the reference")

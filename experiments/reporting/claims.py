@@ -37,16 +37,23 @@ class Verdict:
     measured: str
 
 
+def all_of(parts: Iterable[tuple[bool, str]]) -> tuple[bool, str]:
+    """Whether all parts of a hypothesis hold, and their numbers."""
+    holds, measured = zip(*parts, strict=True)
+    return all(holds), "; ".join(measured)
+
+
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
     """The verdict on each claim."""
-    verdicts = []
-    for claim in claims:
+
+    def verdict(claim: Claim[Evidence]) -> Verdict:
         try:
             holds, measured = claim.predicate(evidence)
-            verdicts.append(Verdict(claim.id, claim.text, bool(holds), measured))
+            return Verdict(claim.id, claim.text, bool(holds), measured)
         except Inconclusive as why:
-            verdicts.append(Verdict(claim.id, claim.text, None, str(why)))
-    return verdicts
+            return Verdict(claim.id, claim.text, None, str(why))
+
+    return [verdict(claim) for claim in claims]
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
