@@ -4,6 +4,7 @@ python -m experiments.ablation --help
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, get_args
 
 from rich.console import Console
@@ -78,11 +79,7 @@ PRESETS = {
 
 
 def varied(choice: str, config: Kind) -> dict[str, Kind]:
-    """Name of each value of a choice → the configuration with it; the default's is the configuration itself.
-
-    Raises:
-        ValueError: a value that does not go with the other options.
-    """
+    """Name of each value of a choice → the configuration with it; the default's is the configuration itself."""
     seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
     added = {"all": "all 13", "accelerations": "v̇, ω̇"}
     low, high = config.guess
@@ -152,11 +149,8 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
     write_report(out, report)
 
 
-def main() -> None:
-    """The command line."""
-    about = "Which choices of the method matter, and where it breaks."
-    command.run(NAME, about, experiment, presets=PRESETS)
-
+ABOUT = "Which choices of the method matter, and where it breaks."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -4,6 +4,7 @@ python -m experiments.comparison --help
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -127,11 +128,8 @@ def past_splits(**windows: int) -> dict[str, SplitSpec]:
     return {f"{name}_with_past": SplitSpec(count, 2 * PAST) for name, count in windows.items()}
 
 
-def main() -> None:
-    """The command line."""
-    about = "Ten ways to adapt to ten seconds of flight, in both experiments (Table 2)."
-    command.run(NAME, about, experiment, presets=PRESETS)
-
+ABOUT = "Ten ways to adapt to ten seconds of flight, in both experiments (Table 2)."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

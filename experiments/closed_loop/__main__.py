@@ -108,11 +108,8 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     return on_one_core(fields, Controller(IRIS), config.calls, config.cache)
 
 
-def main() -> None:
-    """The command line."""
-    about = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."
-    command.run(NAME, about, experiment, presets=PRESETS)
-
+ABOUT = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -149,9 +149,6 @@ def flown(
 
     Args:
         fresh: move results of other versions aside and fly again.
-
-    Raises:
-        ValueError: a cached file is damaged; names the file.
     """
     references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
     starts = references[:, 0].copy()

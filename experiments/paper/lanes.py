@@ -113,11 +113,7 @@ def rows_of(groups: Sequence[Lanes]) -> Results:
 
 
 def with_rho(rows: Results) -> Results:
-    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`.
-
-    Raises:
-        ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.
-    """
+    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`."""
     source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=SOURCE_ONLY)}
 
     def rho(row: Row) -> float | None:
@@ -144,11 +140,7 @@ def gain(row: Row) -> float:
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """The rows of each model, mode and N, in the order of MODELS, MODES and N.
-
-    Raises:
-        ValueError: rows of several domains, which have no mean together.
-    """
+    """The rows of each model, mode and N, in the order of MODELS, MODES and N."""
     if len(domains := sorted(rows.unique("domain"))) > 1:
         raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
     return rows.sort(model=MODELS, mode=MODES, n_train=None).group(*CELL)

@@ -1,6 +1,8 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
 from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,16 +22,17 @@ from experiments.paper.sensors import measured
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
-from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, cores
 from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import evaluate, sweep
@@ -66,14 +69,21 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     lanes: list[Lanes] = []
     learned: dict[str, Fit] = {}
     sources = dict.fromkeys(source_of(model) for model in config.models)
-    unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
-    with PrecompilePool({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
+    programs: dict[str, Future] = {}
+    with ExitStack() as stack:
+        # Compiled on other threads, while flights are simulated or another model is trained; not by several processes,
+        # which must compile in the same order.
+        pool = ThreadPoolExecutor(cores())
+        stack.callback(pool.shutdown, cancel_futures=True)
+        for model in sources if jax.process_count() == 1 else ():
+            if not stages.knows(f"pre-training {model}"):
+                programs[model] = pool.submit(_compile, model, vehicle, config)
         source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
         target = flown(domain, target_splits(config), config, stages, config.target_flights)
         for model in config.models:
             start = source_of(model)
             if start not in learned:
-                programs.wait_for(start)
+                wait([programs[start]] if start in programs else [])  # an error is met again below
                 learned[start] = pretrained(start, vehicle, config, stages, source)
                 lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
             fields = learned[start].fields
@@ -196,6 +206,13 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
+
+
+def placeholder(spec: SplitSpec) -> Trajectories:
+    """Windows at rest with the shapes of a split that is not yet simulated."""
+    x = np.zeros((spec.windows, spec.steps, STATE_SIZE), np.float32)
+    x[..., QUATERNION] = [1, 0, 0, 0]
+    return Trajectories(x[:, 0], np.zeros((*x.shape[:2], INPUT_SIZE), np.float32), x, dt=DT)
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

@@ -71,11 +71,7 @@ def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:
 
 
 def from_json(record: Mapping[str, Any]) -> list[Verdict]:
-    """Read the keys of `to_json`, in the order of the claims' numbers.
-
-    Raises:
-        ValueError: an entry is malformed; names it.
-    """
+    """Read the keys of `to_json`, in the order of the claims' numbers."""
     decided, undecided = ("id", "text", "holds", "measured"), ("id", "text", "why")
     found = []
     for key, names in (("claims", decided), ("not_judged", undecided)):

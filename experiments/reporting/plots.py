@@ -60,11 +60,7 @@ def colour(model: str) -> str:
 
 
 def save_figure(figure: Figure, path: str | Path) -> list[Path]:
-    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths."""
     paths = []
     for suffix, metadata in (("png", {}), ("svg", {"Date": None})):
         content = io.BytesIO()

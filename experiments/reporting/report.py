@@ -76,10 +76,6 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
 
     Args:
         console: where to print the tables and the notes, if anywhere.
-
-    Raises:
-        ValueError: `extra` takes a key of the report's own; then nothing was written.
-        OSError: the folder cannot be written.
     """
     record = json_text(to_json(report))
     contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report), JSON_NAME: record}
@@ -92,11 +88,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
 
 
 def to_json(report: Report) -> dict[str, Any]:
-    """The content of report.json.
-
-    Raises:
-        ValueError: as `write_report`.
-    """
+    """The content of report.json."""
     if taken := sorted(set(report.extra) & _KINDS.keys()):
         raise ValueError(f"extra must not take the report's own keys, got {', '.join(taken)}")
     own = {"format": FORMAT, "experiment": report.experiment, "config": report.config}

@@ -45,9 +45,6 @@ def mean_difference(first: Values, second: Values, level: float = LEVEL) -> Inte
     """The mean of first − second over the seeds where both are finite, with Student's t interval of the paired test.
 
     What the seeds of a pair share, such as the model from which both started, cancels.
-
-    Raises:
-        ValueError: different numbers of seeds.
     """
     one, other = _finite(first, second)
     value = float(np.mean(one - other)) if len(one) else math.nan
@@ -65,9 +62,6 @@ def share_of_gap(before: Values, after: Values, reachable: Values, level: float 
     1 closes the gap between before and what is reachable, 0 none of it. The interval is Fieller's ("Some problems in
     interval estimation", 1954): all shares s for which a paired t test does not reject (before − after) =
     s (before − reachable). It has no ends if the gap is not significant, and no value if there is no gap.
-
-    Raises:
-        ValueError: different numbers of seeds.
     """
     start, end, best = _finite(before, after, reachable)
     closed, gap = start - end, start - best

@@ -75,11 +75,7 @@ def call(
 
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
-    """The configuration given by a command line: a preset, changed by the other options.
-
-    Raises:
-        ValueError: an unknown preset, or options that do not fit together.
-    """
+    """The configuration given by a command line: a preset, changed by the other options."""
     arguments = [_renamed(argument) for argument in arguments]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", nargs="?", default=Run.preset, const="")
@@ -99,11 +95,7 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
 
 
 def locked(folder: Path) -> AbstractContextManager:
-    """Hold the lock of an output folder, which is created. It is released with the process, however that ends.
-
-    Raises:
-        ValueError: another run holds it.
-    """
+    """Hold the lock of an output folder, which is created. It is released with the process, however that ends."""
     folder.mkdir(parents=True, exist_ok=True)
     try:
         return FileLock(folder / ".lock", timeout=0).acquire()
@@ -112,11 +104,7 @@ def locked(folder: Path) -> AbstractContextManager:
 
 
 def check_folder(option: str, folder: Path) -> None:
-    """Create a folder and check that it can be written, before work begins.
-
-    Raises:
-        ValueError: it cannot be created or written.
-    """
+    """Create a folder and check that it can be written, before work begins."""
     probe = folder / f".writable.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

@@ -21,9 +21,8 @@ from experiments.external_force import sine_floor
 from experiments.paper.config import SMOKE
 from experiments.paper.lanes import physics_in, source_of
 from experiments.paper.outcome import draw
-from experiments.paper.study import study
+from experiments.paper.study import placeholder, study
 from experiments.reporting.report import load_report
-from experiments.runner.precompile import placeholder
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 from hybrid_jax.sim.record import SplitSpec

@@ -10,8 +10,7 @@ import pytest
 
 from experiments.paper.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
-from experiments.paper.study import pretrained
-from experiments.runner.precompile import placeholder
+from experiments.paper.study import placeholder, pretrained
 from experiments.runner.stages import _identity
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
