@@ -65,8 +65,7 @@ ABOUT = {
 def adapt_and_report(experiment: str, domain: Domain, floor: float, config: AdaptationConfig, console: Console) -> None:
     """Run the protocol on a target domain; write models, figures and, last, the report; print its tables.
 
-    Args:
-        floor: the share of the test error that no model ẋ = f(x, u) can remove.
+    `floor` is the share of the test error that no model ẋ = f(x, u) can remove.
     """
     found = study(domain, IRIS, config, console)
     if not hosts.is_main_process():
@@ -90,12 +89,7 @@ def paper_report(
     floor: float = 0.0,
     extra: Mapping[str, Any] | None = None,
 ) -> Report:
-    """The report of an experiment of the paper.
-
-    Args:
-        truth: the true θ_p, by domain where there are several.
-        figures: caption by file.
-    """
+    """The report of an experiment of the paper; `truth`: the true θ_p, by domain where there are several."""
     verdicts = claims(rows, experiment, truth)
     headline = ranking if experiment == COMPARISON else by_size
     sine = f"About {floor:.2e} of a test error in the wind is due to its sine, which no model without a clock can see."
