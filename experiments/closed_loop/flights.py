@@ -147,8 +147,7 @@ def flown(
 ) -> list[Flown]:
     """The results of all scenarios in flights of so many seconds, found in the cache `folder` or flown now.
 
-    Args:
-        fresh: move results of other versions aside and fly again.
+    With `fresh`, results of other versions are moved aside and flown again.
     """
     references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
     starts = references[:, 0].copy()

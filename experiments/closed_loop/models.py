@@ -89,9 +89,7 @@ def disturbance_counts(fitted: Trained) -> list[str]:
 def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int]) -> ModelSet:
     """All models that fly in a domain, by agent: with each model its observed version, and last the true vehicle.
 
-    Args:
-        trained: by id in `results.LEARNED`.
-        sizes: numbers of target trajectories, the smallest first; none for the vehicle before the change.
+    `trained` is by id in `results.LEARNED`; `sizes` begins with the smallest N, or is empty for the unchanged vehicle.
     """
     fields: dict[Agent, Any] = {Agent("nominal"): as_stack(rigid_body(IRIS))}
     for model, found in trained.items():

@@ -68,13 +68,10 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
     return eqx.filter_vmap(build)(seeds)
 
 
-def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, RunConfig]:
-    """One run per seed, on all source trajectories."""
-    return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
-
-
-def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, RunConfig]:
-    """Pre-training from the seeds' fields, with all rates times a factor."""
+def pretraining(
+    model: str, fields: AbstractVectorField, config: Config, factor: float = 1.0
+) -> tuple[FitState, RunConfig]:
+    """One run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
     patience = config.patience
     rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
     plan = _plan(model, config, config.rates.pretraining, rule, np.arange(config.source_train), config.source_train)

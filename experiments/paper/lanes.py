@@ -64,11 +64,9 @@ def lanes_of(
     theta: Mapping[str, np.ndarray] | None = None,
     intervals: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Models tested in a domain.
+    """Models tested in a domain: their sizes and seeds (see `study.places`), and L^T_MSE on the test flights.
 
     Args:
-        where: the size and the seed of each; see `study.places`.
-        errors: L^T_MSE of each on the test flights.
         theta: name → the value of each, instead of that in the models.
         intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
     """

@@ -36,19 +36,13 @@ Method = Literal[
 
 @dataclass(frozen=True)
 class Case:
-    """The data and models that a method may use in one target domain.
-
-    Attributes:
-        pretrained: by model, one per seed.
-        experts: the `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
-        target: splits train (the pool), validation and test_with_past.
-    """
+    """The data and models that a method may use in one target domain."""
 
     config: Config
     stages: Stages
-    pretrained: Mapping[str, Fit]
-    experts: Fit | None
-    target: Dataset
+    pretrained: Mapping[str, Fit]  # by model, one per seed
+    experts: Fit | None  # the `ExpertAugmented` of all seeds, if Expert Augmentation is compared
+    target: Dataset  # splits train (the pool), validation and test_with_past
 
     @property
     def name(self) -> str:

@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
-from experiments.paper.conditions import adaptation, annealing, fresh_fields, pretraining, sampled_indices, settings
+from experiments.paper.conditions import adaptation, fresh_fields, pretraining, sampled_indices, settings
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, rows_of, source_of
 from experiments.paper.sensors import measured
@@ -99,11 +99,11 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
     """A model after pre-training on source flight, one run per seed."""
-    shared = settings(config), source, capacity(config)
-    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
+    shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
+    found = stages.run(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
     for factor in config.rates.decay:
-        lanes = annealing(model, found.best, factor, config)
-        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, *shared)
+        lanes = pretraining(model, found.best, config, factor)
+        found = stages.run(f"{name}, rates times {factor:g}", *lanes, *shared)
     return fit_of(found)
 
 
@@ -200,7 +200,7 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
-    before = pretraining(model, vehicle, config)
+    before = pretraining(model, fresh, config)
     after = adaptation(model, TARGET_ONLY, fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
         stopped = replace(states, status=np.full_like(states.status, STOPPED))

@@ -23,14 +23,6 @@ JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
 class Report:
     """One experiment's outcome; mappings and notes are stored as JSON values.
 
-    Attributes:
-        figures: path of a picture relative to the report → its caption.
-        notes: sentences for the end of the page.
-        extra: further keys of report.json.
-        head: title and introduction of the page, Markdown.
-        tables: of the page and the terminal.
-        more_rows: further rows of rows.csv, which report.json holds in `extra`.
-
     Raises:
         ValueError: a value has no JSON form.
     """
@@ -40,12 +32,12 @@ class Report:
     environment: Mapping[str, Any]
     rows: Results
     claims: Sequence[Verdict] = ()
-    figures: Mapping[str, str] = field(default_factory=dict)
-    notes: Sequence[str] = ()
-    extra: Mapping[str, Any] = field(default_factory=dict)
-    head: str = ""
-    tables: Sequence[Table] = ()
-    more_rows: Results = field(default_factory=Results)
+    figures: Mapping[str, str] = field(default_factory=dict)  # path relative to the report → caption
+    notes: Sequence[str] = ()  # sentences for the end of the page
+    extra: Mapping[str, Any] = field(default_factory=dict)  # further keys of report.json
+    head: str = ""  # title and introduction of the page, Markdown
+    tables: Sequence[Table] = ()  # of the page and the terminal
+    more_rows: Results = field(default_factory=Results)  # of rows.csv; report.json holds them in `extra`
 
     def __post_init__(self):
         for name in ("config", "environment", "figures", "notes", "extra"):
@@ -55,8 +47,7 @@ class Report:
 def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
     """Write report.json, rows.csv and report.md into the folder `out`, each atomically, report.json last.
 
-    Args:
-        console: where to print the tables and the notes, if anywhere.
+    The tables and the notes are printed to the console, if any.
     """
     record = json_text(to_json(report))
     contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report), JSON_NAME: record}

@@ -21,16 +21,12 @@ Column = str | Callable[[Row], float]
 class Results:
     """Rows of JSON values. A number that is not finite is stored as None, as in JSON.
 
-    Attributes:
-        rows: one mapping per run: column → value.
-        tags: columns that identify a row.
-
     Raises:
         ValueError: a row lacks a tag, two rows have the same tags, or a value has no JSON form.
     """
 
-    rows: Sequence[Row] = ()
-    tags: Sequence[str] = ()
+    rows: Sequence[Row] = ()  # one per run
+    tags: Sequence[str] = ()  # columns that identify a row
 
     def __post_init__(self):
         object.__setattr__(self, "rows", tuple(json_value(row) for row in self.rows))
@@ -62,11 +58,7 @@ class Results:
         return Results((*self.rows, *other.rows), self.tags or other.tags)
 
     def where(self, keep: Callable[[Row], bool] | None = None, **tags: Any) -> "Results":
-        """The rows with these values; a tuple, list or set allows any of its values.
-
-        Args:
-            keep: a further condition on a row.
-        """
+        """The rows with these values, for which `keep` holds; a tuple, list or set allows any of its values."""
 
         def kept(row: Row) -> bool:
             same = (row.get(t) in v if isinstance(v, tuple | list | set) else row.get(t) == v for t, v in tags.items())
@@ -100,11 +92,9 @@ class Results:
         return Results(rows, (*tags, *(tag for tag in self.tags if tag not in tags)))
 
     def numbers(self, column: Column, missing: float = math.inf) -> np.ndarray:
-        """The numbers of a column, or of a function of a row.
+        """The numbers of a column or of a function of a row; what was not finite counts as `missing`.
 
-        Args:
-            column: a name, a dotted path into nested columns ("theta.Ix"), or a function.
-            missing: what a number that was not finite counts as.
+        A nested column has a dotted path: "theta.Ix".
         """
         read = column if callable(column) else lambda row: _at(row, column)
         return np.array([missing if (value := read(row)) is None else value for row in self.rows], float)

@@ -40,8 +40,7 @@ def run(
     Args:
         name: of the module in `experiments`, and of the subfolder of --out.
         about: first paragraph of --help.
-        arguments: of the command line; by default the process's own.
-        presets: the choices of --preset by name, all of the class that `experiment` takes; "paper" is the default.
+        presets: the choices of --preset by name, all of the class that `experiment` takes.
     """
     given = sys.argv[1:] if arguments is None else arguments
     fresh = " without --fresh" if "--fresh" in given else ""
@@ -65,11 +64,7 @@ def run(
 def call(
     name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
 ) -> None:
-    """Read the command line of a command without presets and run it. Errors as in `run`.
-
-    Args:
-        kind: a dataclass of the options; its docstring is the description.
-    """
+    """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     with _exit_codes(name, "interrupted, nothing was written"):
         command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
 

@@ -72,7 +72,7 @@ def test_other_input_scaling_is_another_pretraining():
     windows = placeholder(SplitSpec(2, 10))
     data = Dataset({"train": windows, "validation": windows}, {})
     identities = {
-        _identity(*pretraining("no_physics", IRIS, config), settings(config), data)
+        _identity(*pretraining("no_physics", fresh_fields("no_physics", IRIS, config), config), settings(config), data)
         for config in (SMOKE, replace(SMOKE), replace(SMOKE, inputs="raw"))
     }
     assert len(identities) == 2
@@ -82,7 +82,7 @@ def test_other_input_scaling_is_another_pretraining():
     ("model", "minimum", "patience"), [("hybrid", 100, 20), ("no_physics", 300, 50), ("physics_only", 100, 20)]
 )
 def test_pretraining_lanes_use_all_source_flights(model, minimum, patience):
-    _, plans = pretraining(model, IRIS, SMALL)
+    _, plans = pretraining(model, fresh_fields(model, IRIS, SMALL), SMALL)
     for seed in range(SMALL.seeds):
         plan = lane(plans, seed)
         assert numbers(plan) == (10_000, minimum, patience, 2000)
