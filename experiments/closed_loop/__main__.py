@@ -79,12 +79,10 @@ def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -
     own = config.ablated()
     trained = models.train_networks(config.ablation, own, partial(train_one, console, outcome))
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    sets = {domain.name: models.variants(config.ablation, domain, trained, own) for domain in DOMAINS}
-    found = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
-    if "quaternion" in config.ablation:
-        sets = {domain.name: models.unnormalised(domain, trained, own) for domain in DOMAINS}
-        controller = Controller(IRIS, unit_quaternion=False)
-        found += fly_all(config, controller, scenarios(config, sets, places), console)
+    found = []
+    for unit in (True, False) if "quaternion" in config.ablation else (True,):
+        sets = {domain.name: models.variants(config.ablation, domain, trained, own, unit) for domain in DOMAINS}
+        found += fly_all(config, Controller(IRIS, unit_quaternion=unit), scenarios(config, sets, places), console)
     return found
 
 

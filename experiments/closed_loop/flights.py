@@ -157,8 +157,10 @@ def flown(
     most: Counter[tuple] = Counter()  # programs have places for the largest scenario
     for scenario in scenarios:
         most |= Counter(flight.structure() for flight in scenario.flights())
-    function = partial(_simulate, controller)
-    programs = {key: LaneMap(function, _width(n), min_capacity=n) for key, n in most.items()}
+    programs = {}
+    for key, n in most.items():
+        width = min(WIDTH.get(jax.default_backend(), -(-n // jax.device_count())), n)
+        programs[key] = LaneMap(partial(_simulate, controller), width, min_capacity=n)
     found = []
     for scenario in scenarios:
         path = folder / f"{scenario.name.replace(' ', '-')}-{_identity(scenario, controller, shared)[:16]}.npz"
@@ -191,10 +193,6 @@ def _cached(path: Path, console: Console, fresh: bool) -> tuple[dict[str, Any] |
         console.print(f"{path}: moved aside to {backup.name}", highlight=False)
         return None, {}
     return about, arrays
-
-
-def _width(flights: int) -> int:
-    return min(WIDTH.get(jax.default_backend(), -(-flights // jax.device_count())), flights)
 
 
 def _fly(scenario: Scenario, programs: Mapping[tuple, LaneMap], shared: tuple) -> tuple[Arrays, dict[str, Any]]:

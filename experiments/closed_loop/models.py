@@ -141,12 +141,17 @@ def train_networks(
     return trained
 
 
-def variants(options: Sequence[str], domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:
+def variants(
+    options: Sequence[str], domain: Domain, trained: dict[str, Trained], config: Config, normalised: bool = True
+) -> ModelSet:
     """Models for the usual controller: each network adapted, with the statistics of the source, and unadapted with an
-    observer.
+    observer; or for one that does not renormalise the quaternion in its predictions.
     """
     (few,) = config.sizes
     adapted = {name: found.adapted[domain.name, few] for name, found in trained.items()}
+    if not normalised:
+        models = {_variant(name, few, ", |q| not renormalised"): adapted[name] for name in COMPARED}
+        return {agent: fused(field) for agent, field in models.items()}
     models = {_variant(name, few): field for name, field in adapted.items()}
     if "statistics" in options and config.norm == "batch":
         for name in COMPARED:
@@ -155,13 +160,6 @@ def variants(options: Sequence[str], domain: Domain, trained: dict[str, Trained]
     for name in COMPARED:
         models[replace(_variant(name, 0, ", not adapted, + observer"), observer=True)] = trained[name].source
     return {agent: fused(field) for agent, field in models.items()}
-
-
-def unnormalised(domain: Domain, trained: dict[str, Trained], config: Config) -> ModelSet:
-    """Models for a controller that does not renormalise the quaternion in its predictions."""
-    (few,) = config.sizes
-    fields = {name: trained[name].adapted[domain.name, few] for name in COMPARED}
-    return {_variant(name, few, ", |q| not renormalised"): fused(field) for name, field in fields.items()}
 
 
 def _variant(network: str, n_train: int, what: str = "") -> Agent:

@@ -1,6 +1,7 @@
 """Figures of the paper's experiments: scores and θ_p against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
 
 import math
+from collections import defaultdict
 from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -115,16 +116,13 @@ def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapp
 
 
 def _curves(rows: Results, value: Column) -> _Curves:
-    points: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    points = defaultdict(list)
     for (model, mode, n), group in cells(rows).items():
         values = group.numbers(value)
         finite = values[np.abs(values) < DRAWABLE]
-        mean, low, high, smallest = (math.nan,) * 4
-        if len(finite):
-            mean, std = finite.mean(), finite.std(ddof=1) if len(finite) > 1 else 0.0
-            low, high, smallest = mean - std, mean + std, finite.min()
-        point = (n, mean, low, high, smallest, len(values) - len(finite), len(values))
-        points.setdefault((model, mode), []).append(point)
+        mean, std = finite.mean() if len(finite) else math.nan, finite.std(ddof=1) if len(finite) > 1 else 0.0
+        failed, smallest = len(values) - len(finite), min(finite, default=math.nan)
+        points[model, mode].append((n, mean, mean - std, mean + std, smallest, failed, len(values)))
     return {key: _Curve(*np.array(found, float).T) for key, found in points.items()}
 
 

@@ -186,7 +186,7 @@ def target_splits(config: Config) -> dict[str, SplitSpec]:
 
 def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
     """The splits of the target for adaptation."""
-    return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
+    return source_splits(config) | {"train": SplitSpec(config.pooled(), 10)}
 
 
 def capacity(config: Config) -> tuple[int, int]:

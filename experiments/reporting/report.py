@@ -1,6 +1,5 @@
 """What an experiment leaves in its folder: report.json, rows.csv and report.md, and the same in a terminal."""
 
-import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,11 +20,7 @@ JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
 
 @dataclass(frozen=True)
 class Report:
-    """One experiment's outcome; mappings and notes are stored as JSON values.
-
-    Raises:
-        ValueError: a value has no JSON form.
-    """
+    """One experiment's outcome."""
 
     experiment: str
     config: Mapping[str, Any]
@@ -38,10 +33,6 @@ class Report:
     head: str = ""  # title and introduction of the page, Markdown
     tables: Sequence[Table] = ()  # of the page and the terminal
     more_rows: Results = field(default_factory=Results)  # of rows.csv; report.json holds them in `extra`
-
-    def __post_init__(self):
-        for name in ("config", "environment", "figures", "notes", "extra"):
-            object.__setattr__(self, name, json_value(getattr(self, name)))
 
 
 def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
@@ -82,6 +73,6 @@ def page(report: Report) -> str:
     for name, value in leaves(report.environment, ", "):
         shown = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
         lines.append((name + (" [s]" if name.startswith("seconds, ") else ""), shown))
-    config = json.dumps(report.config, indent=1, ensure_ascii=False)
-    parts += ["## Environment", markdown(Table("", ("", ""), lines)), "## Configuration", f"```json\n{config}\n```"]
+    config = f"```json\n{json_text(report.config)}```"
+    parts += ["## Environment", markdown(Table("", ("", ""), lines)), "## Configuration", config]
     return "\n\n".join(parts) + "\n"
