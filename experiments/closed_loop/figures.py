@@ -50,22 +50,24 @@ XLABEL = "position RMSE [cm]  (log scale)"
 @mpl.rc_context(STYLE)
 def errors(rows: Results, domain: str, ablation: bool = False) -> Figure:
     """A panel per reference at home, a line per agent, a dot per seed; of an ablation also away, a line per variant."""
-    own = rows.where(domain=domain)
+    rows = rows.where(domain=domain)
     if not ablation:
-        own = own.where(distance=0.0).sort(reference=list(REFERENCES))
+        rows = rows.where(distance=0.0).sort(reference=list(REFERENCES))
     what = "ablation of the invariant residual" if ablation else "position error of each model"
     label = attrgetter("variant" if ablation else "name")
-    groups = {place: by_agent(group) for place, group in own.group("reference", "distance").items()}
+    groups = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
     if not groups:
         raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
     figure, grid = _grid(len(groups), [label(agent) for group in groups.values() for agent in group])
     for axes, ((reference, distance), group) in zip(grid, groups.items(), strict=False):
-        lines = [_line(label(agent), agent, flights) for agent, flights in group.items()]
+        drawn = {agent: np.maximum(100 * own.numbers(ERROR), SMALLEST_ERROR) for agent, own in group.items()}
+        marks = {ORACLE: "the true vehicle as its own model"}
+        lines = [Line(label(a), values, COLOURS_OF[a.model], marks.get(a, "")) for a, values in drawn.items()]
         error_panel(axes, lines, REFERENCES[reference] + away(distance))
         axes.set_xlabel(XLABEL)
-    note = floor_note(100 * own.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
+    note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
     title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
-    return error_legend(figure, title, any(own["crashed"]))
+    return error_legend(figure, title, any(rows["crashed"]))
 
 
 @mpl.rc_context(STYLE)
@@ -140,11 +142,6 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
 def floor_note(smallest: float, floor: float, before: str, after: str = "") -> str:
     """A remark for a title, if any error [cm] is below the floor at which it is drawn."""
     return f"{before}below {floor:g} cm drawn there{after}" if smallest < floor else ""
-
-
-def _line(label: str, agent: Agent, rows: Results) -> Line:
-    marked = "the true vehicle as its own model" if agent == ORACLE else ""
-    return Line(label, np.maximum(100 * rows.numbers(ERROR), SMALLEST_ERROR), COLOURS_OF[agent.model], marked)
 
 
 def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure, list[Axes]]:

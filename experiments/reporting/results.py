@@ -96,7 +96,12 @@ class Results:
 
         A nested column has a dotted path: "theta.Ix".
         """
-        read = column if callable(column) else lambda row: _at(row, column)
+
+        def read(row: Any) -> Any:
+            for name in column.split(".") if isinstance(column, str) else ():
+                row = None if row is None else row.get(name)
+            return row if isinstance(column, str) else column(row)
+
         return np.array([missing if (value := read(row)) is None else value for row in self.rows], float)
 
     def spread(self, column: Column, missing: float = math.inf) -> Spread:
@@ -135,7 +140,7 @@ class Results:
                     names |= line | _ends(dict.fromkeys(row[of] or {}))
                     line |= _ends(value or {})
             names |= line
-            lines.append({name: _cell(value) for name, value in line.items()})
+            lines.append({name: "null" if value is None else value for name, value in line.items()})
         text = io.StringIO()
         writer = csv.DictWriter(text, names, lineterminator="\n")
         writer.writeheader()
@@ -159,17 +164,6 @@ def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[
             yield f"{prefix}{name}", value
 
 
-def _at(row: Row, path: str) -> Any:
-    value: Any = row
-    for name in path.split("."):
-        value = None if value is None else value.get(name)
-    return value
-
-
 def _ends(intervals: Mapping[str, Any]) -> dict[str, Any]:
     pairs = {name: pair or (None, None) for name, pair in intervals.items()}
     return {f"{name}_{end}": pair[i] for name, pair in pairs.items() for i, end in enumerate(("low", "high"))}
-
-
-def _cell(value: Any) -> str:
-    return "null" if value is None else repr(value) if isinstance(value, float) else str(value)

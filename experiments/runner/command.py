@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -55,7 +54,12 @@ def run(
         console, folder = Console(stderr=True, quiet=not main), config.out / name
         with contextlib.ExitStack() as stack:
             if main:
-                stack.enter_context(locked(folder))
+                folder.mkdir(parents=True, exist_ok=True)
+                try:
+                    stack.enter_context(FileLock(folder / ".lock", timeout=0))  # released with the process
+                except Timeout:
+                    wait = "wait for it, or choose another folder"
+                    raise ValueError(f"--out: another run is writing to {folder}; {wait}") from None
                 say = partial(console.print, highlight=False, soft_wrap=True)
                 stack.enter_context(recorded(folder, config, say))
             experiment(config, console)
@@ -87,15 +91,6 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
         if not stop.code:
             raise  # --help
         raise ValueError(f"{_message(output.getvalue())}; see --help") from None
-
-
-def locked(folder: Path) -> AbstractContextManager:
-    """Hold the lock of an output folder, which is created. It is released with the process, however that ends."""
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        return FileLock(folder / ".lock", timeout=0).acquire()
-    except Timeout:
-        raise ValueError(f"--out: another run is writing to {folder}; wait for it, or choose another folder") from None
 
 
 def check_folder(option: str, folder: Path) -> None:

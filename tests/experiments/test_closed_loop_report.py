@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from experiments.closed_loop import figures
+from experiments.closed_loop.__main__ import draw
 from experiments.closed_loop.claims import Evidence, Speed, claims
 from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flights import Flown, Scenario
 from experiments.closed_loop.path_figures import paths, strip
-from experiments.closed_loop.report import draw
 from experiments.closed_loop.results import ERROR, REFERENCES, TAGS, Agent, ablation_tables, gap_tables, gaps, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
