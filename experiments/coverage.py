@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
 
-from experiments.paper.sensors import Noise, measure
+from experiments.paper.conditions import Noise, measure
 from experiments.reporting.results import Results
 from experiments.reporting.tables import print_tables, tabulate
 from experiments.runner import command

@@ -15,10 +15,9 @@ import numpy as np
 from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
-from experiments.paper.conditions import adaptation, fresh_fields, pretraining, sampled_indices, settings
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, sampled_indices, settings
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, rows_of, source_of
-from experiments.paper.sensors import measured
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
