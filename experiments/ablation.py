@@ -4,6 +4,7 @@ python -m experiments.ablation --help
 """
 
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any, Literal, get_args
 
 from rich.console import Console
@@ -11,7 +12,7 @@ from rich.console import Console
 from experiments.external_force import FLOOR
 from experiments.paper import figures
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
-from experiments.paper.lanes import rows_of, with_rho
+from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, flown, pretrained, source_splits, target_splits, tested
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY
@@ -78,11 +79,7 @@ PRESETS = {
 
 
 def varied(choice: str, config: Kind) -> dict[str, Kind]:
-    """Name of each value of a choice → the configuration with it; the default's is the configuration itself.
-
-    Raises:
-        ValueError: a value that does not go with the other options.
-    """
+    """Name of each value of a choice → the configuration with it; the default's is the configuration itself."""
     seen = {"all": "all of x", "no_xy": "no p_x, p_y", "body": "seen from the body"}
     added = {"all": "all 13", "accelerations": "v̇, ω̇"}
     low, high = config.guess
@@ -127,9 +124,8 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     rows = Results()
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
-        found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.best, config, stages, target)}
-        lanes = [tested(HYBRID, mode, states, config, stages, target) for mode, states in found.items()]
-        rows += with_rho(rows_of(lanes, domain.name))
+        found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.fields, config, stages, target)}
+        rows += rows_of([tested(HYBRID, mode, fit, config, stages, target) for mode, fit in found.items()])
     return rows
 
 
@@ -153,11 +149,8 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
     write_report(out, report)
 
 
-def main() -> None:
-    """The command line."""
-    about = "Which choices of the method matter, and where it breaks."
-    command.run(NAME, about, experiment, presets=PRESETS)
-
+ABOUT = "Which choices of the method matter, and where it breaks."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -4,6 +4,7 @@ python -m experiments.comparison --help
 """
 
 from dataclasses import dataclass, field, replace
+from functools import partial
 from typing import Any, get_args
 
 import numpy as np
@@ -16,7 +17,7 @@ from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
 from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
 from experiments.paper.figures import ranking
-from experiments.paper.lanes import rows_of, save_models, source_of, with_rho
+from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
 from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
@@ -34,7 +35,6 @@ from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.record import SplitSpec
 from hybrid_jax.sweep import hosts
-from hybrid_jax.training.fitting import FitState
 from hybrid_jax.trajectories import split
 from hybrid_jax.vehicle import IRIS
 
@@ -87,7 +87,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         case = Case(config, stages, learned, experts, target)
         lanes = [source_only(case, model) for model in learned]
         lanes += [adapted(case, method) for method in config.methods]
-        found = with_rho(rows_of(lanes, domain.name))
+        found = rows_of(lanes)
         if hosts.is_main_process():
             save_models(out / "models" / domain.name, lanes, found)
         rows, flights = rows + found, flights | {domain.name: target.metadata}
@@ -107,7 +107,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     write_report(out, report, Console())
 
 
-def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, FitState], FitState | None]:
+def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:
     """What is pre-trained on the source: a model for each method that starts from one, and the experts."""
     source = flown(SOURCE, source_splits(config), config, stages)
     models = dict.fromkeys([HYBRID, *map(source_of, config.methods)])
@@ -119,8 +119,8 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
     renamed = Dataset({name.removesuffix("_with_past"): longer.splits[name] for name in with_past}, longer.metadata)
     past, _ = split(renamed.splits["train"], PAST)
     learning = replace(settings(config), objective=Augmentation(PAST))
-    lanes = augmentation(learned[HYBRID].best, past, config.encoding, config)
-    return learned, stages.run("expert augmentation", *lanes, learning, renamed)
+    lanes = augmentation(learned[HYBRID].fields, past, config.encoding, config)
+    return learned, fit_of(stages.run("expert augmentation", *lanes, learning, renamed))
 
 
 def past_splits(**windows: int) -> dict[str, SplitSpec]:
@@ -128,11 +128,8 @@ def past_splits(**windows: int) -> dict[str, SplitSpec]:
     return {f"{name}_with_past": SplitSpec(count, 2 * PAST) for name, count in windows.items()}
 
 
-def main() -> None:
-    """The command line."""
-    about = "Ten ways to adapt to ten seconds of flight, in both experiments (Table 2)."
-    command.run(NAME, about, experiment, presets=PRESETS)
-
+ABOUT = "Ten ways to adapt to ten seconds of flight, in both experiments (Table 2)."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -4,7 +4,6 @@ python -m experiments.coverage --help
 """
 
 import itertools
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
 
-from experiments.paper.sensors import Noise, measure
+from experiments.paper.conditions import Noise, measure
 from experiments.reporting.results import Results
 from experiments.reporting.tables import print_tables, tabulate
 from experiments.runner import command
@@ -101,12 +100,6 @@ def coverage(config: Config, console: Console) -> Results:
     """A row for each parameter in every case: exact physics and unknown drag, with noise on what was asked for.
 
     Shares; bias and half-width in % of the truth. A repeat that did not converge is a miss.
-
-    Args:
-        console: where progress is drawn.
-
-    Raises:
-        ValueError: an option that makes no sense, by its name on the command line.
     """
     if config.n_train <= len(LEARNED):
         raise ValueError(f"--n-train must be more than the {len(LEARNED)} parameters, got {config.n_train}")
@@ -216,9 +209,7 @@ def experiment(config: Config) -> None:
     print_tables(Console(), [tabulate(title, groups, columns, ("truth", "noise on", "θ_p"))])
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line."""
-    command.call(NAME, Config, experiment, arguments)
+main = partial(command.call, NAME, Config, experiment)
 
 
 if __name__ == "__main__":

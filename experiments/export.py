@@ -3,8 +3,8 @@
 python -m experiments.export --help
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -45,13 +45,7 @@ class Config:
 
 
 def export(config: Config) -> None:
-    """Write the files; print their paths.
-
-    Raises:
-        ValueError: no model, a model that cannot be exported, or a step length that is not known or not positive.
-        ImportError: the extra `export` or `casadi` is not installed.
-        OSError: the folder cannot be written.
-    """
+    """Write the files; print their paths."""
     model = load(config.model)
     dt = model.about.get("dt") if config.dt is None else config.dt
     if dt is None:
@@ -71,9 +65,7 @@ def export(config: Config) -> None:
     print(*written, sep="\n")
 
 
-def main(arguments: Sequence[str] | None = None) -> None:
-    """The command line."""
-    command.call(NAME, Config, export, arguments)
+main = partial(command.call, NAME, Config, export)
 
 
 if __name__ == "__main__":

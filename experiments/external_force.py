@@ -34,11 +34,8 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
 FLOOR = sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))  # on test flights
 
 
-def main() -> None:
-    """The command line."""
-    about = "A side wind that no source flight had: adapt to it."
-    command.run(NAME, about, partial(adapt_and_report, NAME, EXTERNAL_FORCE, FLOOR), presets=PRESETS)
-
+ABOUT = "A side wind that no source flight had: adapt to it."
+main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, EXTERNAL_FORCE, FLOOR), presets=PRESETS)
 
 if __name__ == "__main__":
     main()

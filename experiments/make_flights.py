@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Literal
 
@@ -47,11 +48,7 @@ class Options:
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
 
     def splits(self) -> dict[str, SplitSpec]:
-        """The requested splits.
-
-        Raises:
-            ValueError: none, or a negative size.
-        """
+        """The requested splits."""
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}
         splits = {name: SplitSpec(getattr(self, name), n) for name, n in steps.items() if getattr(self, name) != 0}
         if not splits:
@@ -66,11 +63,7 @@ def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_di
 
 
 def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
-    """The dataset in a file; it is flown and saved if the file does not exist.
-
-    Raises:
-        ValueError: the file is damaged or holds another configuration; names it, so that it can be deleted.
-    """
+    """The dataset in a file; it is flown and saved if the file does not exist."""
     if not path.exists():
         with Line(f"flying {domain.name}", Console(stderr=True)) as line:
             dataset = make_dataset(domain, splits, seed, lambda share: line.say(f"{share:.0%}"))
@@ -79,11 +72,7 @@ def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], see
 
 
 def chosen_flights(path: Path, domain: Domain, splits: Mapping[str, SplitSpec]) -> Dataset:
-    """The first windows of each split of an existing file.
-
-    Raises:
-        ValueError: the file is damaged, of another domain, or has fewer windows than asked for, or of other lengths.
-    """
+    """The first windows of each split of an existing file."""
     whole = load_dataset(path, domain.describe())
     parts = {name: whole.first(name, spec.windows) for name, spec in splits.items()}
     for name, spec in splits.items():
@@ -106,9 +95,7 @@ def make_flights(options: Options) -> None:
     print_tables(Console(), [Table(title, ("", *dataset.splits), lines)])
 
 
-def main() -> None:
-    """The command line."""
-    command.call("make_flights", Options, make_flights)
+main = partial(command.call, "make_flights", Options, make_flights)
 
 
 if __name__ == "__main__":

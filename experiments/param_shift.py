@@ -13,11 +13,8 @@ from hybrid_jax.sim.domain import PARAMETER_SHIFT
 NAME = "param_shift"
 
 
-def main() -> None:
-    """The command line."""
-    about = "The vehicle's roll and pitch inertia change: adapt to it."
-    command.run(NAME, about, partial(adapt_and_report, NAME, PARAMETER_SHIFT, 0.0), presets=PRESETS)
-
+ABOUT = "The vehicle's roll and pitch inertia change: adapt to it."
+main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, PARAMETER_SHIFT, 0.0), presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -3,22 +3,30 @@
 python -m experiments.closed_loop --help
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 
+from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.closed_loop.ablation import train_networks, unnormalised, variants
+from experiments.closed_loop import figures, flights, models
+from experiments.closed_loop.claims import Evidence, Speed, claims
 from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
-from experiments.closed_loop.flown import Flown, flown
-from experiments.closed_loop.models import Trained, disturbance_counts, least_squares, model_set, train
-from experiments.closed_loop.report import Outcome, write
-from experiments.closed_loop.rows import Agent
-from experiments.closed_loop.scenarios import DOMAINS, ModelSet, Scenario
+from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, results_of
+from experiments.closed_loop.models import Trained
+from experiments.closed_loop.path_figures import flown_paths, rendered
+from experiments.closed_loop.results import ORACLE, SOURCES, Agent, ablation_tables, gap_tables, speed_table, tables
 from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
+from experiments.reporting.claims import evaluate, verdict_table
+from experiments.reporting.names import label
+from experiments.reporting.plots import save_figures
+from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.stages import stages_of
+from experiments.runner.environment import environment
+from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -32,60 +40,100 @@ Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
 
+HEAD = """# closed_loop
+
+A model predictive controller flies the simulated quadrotor after a change: other moments of inertia (parameter shift),
+or a side wind of 4 N with a sine of 1 N (external force). Every 0.01 s the controller plans 1 s ahead with its
+prediction model; nothing else differs between the flights of a column. It knows the true state without noise.
+
+- **nominal physics**: the rigid body of the data sheet, not trained
+- **physics**: the same with Ix, Iy, k fitted to N target trajectories of 0.1 s
+- **hybrid**: physics plus the paper's network, trained on source flights (source), then on N target trajectories
+- **no-physics**: the paper's network alone
+- **invariant hybrid**: a hybrid with a translation- and yaw-invariant residual. Its network reads neither p_x, p_y nor
+  yaw, but by default the distance of each rotor from the ground (--invariant-inputs). It adds a force and a torque,
+  with a linear skip connection (--invariant-linear); a smaller network, shared by all rotors, adds to the thrust of
+  each (--invariant-outputs). The output bias, which represents a constant force, has its own learning rate in
+  adaptation (--invariant-offset)
+- **invariant, least squares**: the invariant hybrid of the source with a frozen network. Least squares fits Ix, Iy, k
+  and a constant disturbance (three accelerations, three angular ones) to N target trajectories, without validation
+  flights. By default the disturbance stays zero where it does not lower the leave-one-out error
+  (--invariant-disturbance)
+- **true vehicle, mean wind**: the simulator's own equations and the mean of the wind. It is no lower bound, because an
+  observer follows the sine as well
+- **+ observer**: a disturbance observer adds the constant acceleration that explains the last prediction errors
+
+RMSE: over the flight after its initial state. A flight crashes if it goes below the ground or 10 m from the reference;
+its error then counts as infinite. Predicted cost: of the plan of a call, by the prediction model (`promised` in
+rows.csv). Actual cost: of the same inputs run open loop for 1 s in the true system (`realised`); the relative error is
+(actual − predicted) / predicted (`excess`). Calls every 0.5 s are compared. Models that were not adapted also fly the
+unchanged vehicle, on which the source networks were trained.
+"""
+
+
+@dataclass
+class Training:
+    """Seconds of the stages of training, and notes on these."""
+
+    seconds: dict[str, float] = field(default_factory=dict)
+    notes: list[str] = field(default_factory=list)
+
+    def record(self, name: str, stages: Stages) -> None:
+        """Keep the seconds of the stages of a model, and the notes on them."""
+        self.seconds |= {f"{name}, {stage}": seconds for stage, seconds in stages.seconds.items()}
+        self.notes += [f"{name}: {note}" for note in stages.notes()]
+
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
     """Train, fly and write the report."""
-    outcome = Outcome()
-    trained = models(config, console, outcome)
-    fly_models(config, trained, console, outcome)
-    if config.ablation:
-        fly_ablation(config, console, outcome)
+    training = Training()
+    trained = train_all(config, console, training)
+    flown = fly_models(config, trained, console)
+    ablation = fly_ablation(config, console, training) if config.ablation else []
     if hosts.is_main_process():
-        outcome.speeds = speeds(config, trained)
-        write(NAME, config, outcome, Console())
+        write(config, flown, ablation, speeds(config, trained), training)
 
 
-def train_one(console: Console, outcome: Outcome, name: str, model: str, config: Config) -> Trained:
+def train_one(console: Console, training: Training, name: str, model: str, config: Config) -> Trained:
     """Train a model and record its stages."""
     console.print(name, style="bold", highlight=False)
     stages = stages_of(config, console)
-    found = train(model, config, stages)
-    outcome.record(name, stages)
+    found = models.train(model, config, stages)
+    training.record(name, stages)
     return found
 
 
-def models(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> dict[str, Trained]:
-    """All trained models by their id in `rows.LEARNED`."""
-    trained = {name: train_one(console, outcome, name, model, config) for name, model in MODELS.items()}
+def train_all(config: ClosedLoopConfig, console: Console, training: Training) -> dict[str, Trained]:
+    """All trained models by their id in `results.LEARNED`."""
+    trained = {name: train_one(console, training, name, model, config) for name, model in MODELS.items()}
     own = config.invariant()
-    trained["invariant"] = train_one(console, outcome, "invariant", "hybrid", own)
+    trained["invariant"] = train_one(console, training, "invariant", "hybrid", own)
     stages, solve = stages_of(own, console), DISTURBANCES[config.invariant_disturbance]
-    trained["least_squares"] = least_squares(trained["invariant"].source, solve, own, stages)
-    outcome.record("least squares", stages)
-    outcome.notes += [f"least squares: {note}" for note in disturbance_counts(trained["least_squares"])]
+    trained["least_squares"] = models.least_squares(trained["invariant"].source, solve, own, stages)
+    training.record("least squares", stages)
+    training.notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     return trained
 
 
-def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console, outcome: Outcome) -> None:
+def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console) -> list[Flown]:
     """Fly every model along every reference, before and after the changes; after them also away from home."""
-    changed = {domain.name: model_set(domain, trained, config.ends) for domain in DOMAINS}
-    sets = {SOURCE.name: model_set(SOURCE, trained, ()), **changed}
+    changed = {domain.name: models.model_set(domain, trained, config.ends) for domain in DOMAINS}
+    sets = {SOURCE.name: models.model_set(SOURCE, trained, ()), **changed}
     home = scenarios(config, sets, [(name, 0.0) for name in config.references])
     away = scenarios(config, changed, [(name, config.away) for name in config.flown_away])
-    outcome.flown = fly_all(config, Controller(IRIS), [*home, *away], console)
+    return fly_all(config, Controller(IRIS), [*home, *away], console)
 
 
-def fly_ablation(config: ClosedLoopConfig, console: Console, outcome: Outcome) -> None:
+def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training) -> list[Flown]:
     """Train and fly the networks of the ablation."""
     own = config.ablated()
-    trained = train_networks(config.ablation, own, partial(train_one, console, outcome))
+    trained = models.train_networks(config.ablation, own, partial(train_one, console, training))
     places = [(name, 0.0) for name in ABLATED if name in config.references] + [("hover", config.away)]
-    sets = {domain.name: variants(config.ablation, domain, trained, own) for domain in DOMAINS}
-    outcome.ablation = fly_all(config, Controller(IRIS), scenarios(config, sets, places), console)
-    if "quaternion" in config.ablation:
-        sets = {domain.name: unnormalised(domain, trained, own) for domain in DOMAINS}
-        controller = Controller(IRIS, unit_quaternion=False)
-        outcome.ablation += fly_all(config, controller, scenarios(config, sets, places), console)
+    found = []
+    for unit in (True, False) if "quaternion" in config.ablation else (True,):
+        sets = {domain.name: models.variants(config.ablation, domain, trained, own, unit) for domain in DOMAINS}
+        found += fly_all(config, Controller(IRIS, unit_quaternion=unit), scenarios(config, sets, places), console)
+    return found
 
 
 def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Places) -> list[Scenario]:
@@ -96,7 +144,7 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
 
 def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
     """Fly scenarios with one controller, or find them in the cache."""
-    return flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
+    return flights.flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
 
 
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
@@ -108,11 +156,74 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     return on_one_core(fields, Controller(IRIS), config.calls, config.cache)
 
 
-def main() -> None:
-    """The command line."""
-    about = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."
-    command.run(NAME, about, experiment, presets=PRESETS)
+def write(
+    config: ClosedLoopConfig,
+    flown: Sequence[Flown],
+    ablation: Sequence[Flown],
+    speeds: Mapping[str, Mapping[str, float]],
+    training: Training,
+) -> None:
+    """Write the report and its figures, and print the tables."""
+    out, few, every = config.out / NAME, min(config.sizes), [*flown, *ablation]
+    rows, ablated, call = results_of(flown), results_of(ablation), speeds[Agent("hybrid", few).name]
+    count = sum(len(each.scenario.keys()) for each in every)
+    spent, worked = sum(each.seconds for each in every), sum(each.processor_seconds for each in every)
+    clocked = call["processor_ms"], call["median_ms"], config.seconds * count, spent, worked, every[0].devices
+    verdicts = evaluate(claims(few), Evidence(rows, Speed(*clocked)))
+    drawn, missing = draw(rows, ablated, flown, few)
+    seconds = dict(training.seconds)
+    for each in every:  # the ablation repeats some
+        stage = f"flights {each.scenario.name}"
+        seconds[stage] = seconds.get(stage, 0.0) + each.seconds
+    titled = [verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), *ablation_tables(ablated)]
+    report = Report(
+        experiment=NAME,
+        config=config.described(),
+        environment=environment(seconds),
+        rows=rows,
+        claims=verdicts,
+        figures=save_figures(out, drawn),
+        notes=[*missing, *training.notes],
+        extra={"ablation": ablated.rows, "speed": speeds},
+        head=HEAD.strip(),
+        tables=[*titled, speed_table(speeds)],
+        more_rows=ablated,
+    )
+    write_report(out, report, Console())
 
+
+def draw(
+    rows: Results, ablated: Results, flown: Sequence[Flown], few: int
+) -> tuple[dict[str, tuple[Figure, str]], list[str]]:
+    """Figures with their captions by file, and notes on those that could not be drawn."""
+    nominal, sources = Agent("nominal"), [Agent("hybrid"), Agent("invariant")]
+    adapted = [Agent(model, few) for model in SOURCES]
+    followed = (nominal, sources[0], *adapted, ORACLE)
+    wanted: dict[str, tuple[str, Callable[[], Figure]]] = {}
+    for domain in (each.name for each in DOMAINS):
+        for file, caption, drawing in (
+            ("errors", "Position RMSE of all seeds", partial(figures.errors, rows, domain)),
+            ("gap", "Share of the gap to the true vehicle", partial(figures.shares, rows, domain)),
+            ("paths", "Flights of seed 0", partial(flown_paths, flown, domain, followed)),
+            ("ablation", "Ablation of the invariant residual", partial(figures.errors, ablated, domain, True)),
+        ):
+            if file != "ablation" or len(ablated):
+                wanted[f"{file}_{domain}"] = f"{caption}, {label(domain)}", drawing
+    costs = partial(figures.open_loop_costs, rows, (nominal, *sources, *adapted, ORACLE))
+    wanted["open_loop_costs"] = "Predicted and actual open-loop cost of plans", costs
+    wanted["away"] = "The same flights away from home", partial(figures.away_from_home, rows)
+    wanted["strip"] = "Hover in the wind; the red mark is the reference", partial(rendered, flown, few)
+    made, missing = {}, []
+    for file, (caption, drawing) in wanted.items():
+        try:
+            made[file] = drawing(), caption
+        except ValueError as error:  # nothing of it was flown, or there is no renderer
+            missing.append(f"{file}.png is missing: {error}.")
+    return made, missing
+
+
+ABOUT = "Does ten seconds of flight improve the control of a vehicle? A predictive controller flies every model."
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -9,9 +9,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.rows import LEARNED, ORACLE, REFERENCES, SOURCES, UNCHANGED, Agent, away, uncrashed
-from experiments.closed_loop.tables import gaps
-from experiments.reporting.claims import Claim, Inconclusive
+from experiments.closed_loop.results import (
+    LEARNED,
+    ORACLE,
+    REFERENCES,
+    SOURCES,
+    UNCHANGED,
+    Agent,
+    away,
+    gaps,
+    uncrashed,
+)
+from experiments.reporting.claims import Claim, Inconclusive, all_of
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
 from experiments.reporting.results import Results
 from experiments.reporting.stats import mean_difference
@@ -36,17 +45,18 @@ class Speed(NamedTuple):
 
 @dataclass(frozen=True)
 class Evidence:
-    """All rows but those of the ablation, the smallest N, and the speed if it was measured."""
+    """All rows but those of the ablation, and the speed."""
 
     rows: Results
-    few: int
-    speed: Speed | None
+    speed: Speed
 
-    def group(self, domain: str, reference: str, agent: Agent, distance: float = 0.0) -> Results:
-        rows = self.rows.where(domain=domain, reference=reference, distance=distance, **asdict(agent))
+    def group(self, agent: Agent, domain: str, reference: str | None = None, distance: float = 0.0) -> Results:
+        """The flights of an agent in a domain, along one reference or all."""
+        place = {} if reference is None else {"reference": reference}
+        rows = self.rows.where(domain=domain, distance=distance, **place, **asdict(agent))
         if not len(rows):
-            place = f"{domain}, {REFERENCES[reference]}{away(distance)}"
-            raise Inconclusive(f"there are no flights of {agent.name}, {place}")
+            where = domain if reference is None else f"{domain}, {REFERENCES[reference]}{away(distance)}"
+            raise Inconclusive(f"there are no flights of {agent.name}, {where}")
         return rows
 
     def errors(self, *place: Any) -> np.ndarray:
@@ -55,10 +65,8 @@ class Evidence:
 
     def references(self, agent: Agent) -> list[str]:
         """What an agent flew at home under the parameter shift."""
-        own = self.rows.where(domain=PARAMETER_SHIFT, distance=0.0, **asdict(agent))
-        if not len(own):
-            raise Inconclusive(f"there are no flights of {agent.name}, {PARAMETER_SHIFT}")
-        return [name for name in REFERENCES if name in own["reference"]]
+        own = self.group(agent, PARAMETER_SHIFT)["reference"]
+        return [name for name in REFERENCES if name in own]
 
 
 Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
@@ -66,7 +74,7 @@ Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbe
 
 def claims(few: int) -> list[Claim[Evidence]]:
     """All hypotheses, those on a model for each of SOURCES; `few` is the smallest N."""
-    made = [Claim(name, text, predicate) for name, text, predicate in SPEED_CLAIMS]
+    made = [Claim(*claim) for claim in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         predicate = partial(_in_all, parts, Agent(SOURCES[model]), Agent(model, few))
         made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", predicate))
@@ -74,40 +82,33 @@ def claims(few: int) -> list[Claim[Evidence]]:
 
 
 def _in_all(parts: Callable[..., Iterable[Part]], source: Agent, adapted: Agent, e: Evidence) -> Part:
-    holds, words = zip(*parts(source, adapted, e), strict=True)
-    return all(holds), "; ".join(words)
+    return all_of(parts(source, adapted, e))
 
 
 def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     for reference in THREE:
-        before, after = (e.errors(EXTERNAL_FORCE, reference, agent).mean() for agent in (source, adapted))
+        before, after = (e.errors(agent, EXTERNAL_FORCE, reference).mean() for agent in (source, adapted))
         words = f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))} ({before / after:.2f} ×)"
         yield before >= WIND_FACTOR * after, words
 
 
 def _closes_the_gap(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
-    errors = {pair: e.errors(EXTERNAL_FORCE, *pair) for pair in product(THREE, (source, adapted, ORACLE))}
-    shares = gaps(e.rows, EXTERNAL_FORCE)[adapted]
     for reference in THREE:
-        value, low, high = (100 * number for number in shares[reference])
-        sound = bool(np.isfinite(errors[reference, adapted]).all())
-        words = f"{REFERENCES[reference]}: {value:.1f} % ({low:.1f} … {high:.1f})"
-        yield sound and shares[reference].value >= GAP_SHARE, words
+        _, errors, _ = (e.errors(agent, EXTERNAL_FORCE, reference) for agent in (source, adapted, ORACLE))
+        share = gaps(e.rows.where(reference=reference), EXTERNAL_FORCE)[adapted][reference]
+        value, low, high = (100 * number for number in share)
+        sound = bool(np.isfinite(errors).all())
+        yield sound and share.value >= GAP_SHARE, f"{REFERENCES[reference]}: {value:.1f} % ({low:.1f} … {high:.1f})"
 
 
 def _none_worse(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     for reference in e.references(adapted):
-        errors = [e.errors(PARAMETER_SHIFT, reference, agent) for agent in (adapted, source)]
-        after, before = (values.mean() for values in errors)
-        interval = mean_difference(list(errors[0]), list(errors[1]))
+        new, old = (e.errors(agent, PARAMETER_SHIFT, reference) for agent in (adapted, source))
+        after, before, interval = new.mean(), old.mean(), mean_difference(new, old)
         significant = interval.low > 0 or interval.high < 0
         remark = ", equal" if _equal(before, after) else ", significant" if significant else ""
         words = f"{REFERENCES[reference]}: {' → '.join(_cm(before, after))}{remark}"
         yield after <= before or _equal(before, after), words
-
-
-def _none_worse_observed(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
-    return _none_worse(replace(source, observer=True), replace(adapted, observer=True), e)
 
 
 def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
@@ -115,20 +116,20 @@ def _cost_predicted(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part
         return e.group(*place).spread(uncrashed("excess", 100.0)).mean
 
     for reference in e.references(adapted):
-        value = error(PARAMETER_SHIFT, reference, adapted)
-        others = f"source {error(PARAMETER_SHIFT, reference, source):+.0f} %"
+        value = error(adapted, PARAMETER_SHIFT, reference)
+        others = f"source {error(source, PARAMETER_SHIFT, reference):+.0f} %"
         if len(e.rows.where(domain=UNCHANGED, reference=reference, **asdict(source))):
-            others += f", before the change {error(UNCHANGED, reference, source):+.0f} %"
+            others += f", before the change {error(source, UNCHANGED, reference):+.0f} %"
         yield abs(value) <= 100 * COST_TOLERANCE, f"{REFERENCES[reference]}: {value:+.1f} % ({others})"
 
 
 def _observer_adds(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     agents = adapted, replace(source, observer=True), replace(adapted, observer=True)
-    for domain, reference in product((PARAMETER_SHIFT, EXTERNAL_FORCE), THREE):
-        *single, both = (e.errors(domain, reference, agent).mean() for agent in agents)
+    for place in product((PARAMETER_SHIFT, EXTERNAL_FORCE), THREE):
+        *single, both = (e.errors(agent, *place).mean() for agent in agents)
         texts, equal = _cm(*single, both), _equal(both, min(single))
         words = f"adapted {texts[0]}, observer {texts[1]} → both {texts[2]}{', equal' if equal else ''}"
-        yield both < min(single) and not equal, f"{LABELS[domain]}, {REFERENCES[reference]}: {words}"
+        yield both < min(single) and not equal, f"{LABELS[place[0]]}, {REFERENCES[place[1]]}: {words}"
 
 
 def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
@@ -136,25 +137,18 @@ def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
     if not places:
         raise Inconclusive("nothing was flown away from home")
     for domain, reference, distance in places:
-        home, there = (e.errors(domain, reference, adapted, d).mean() for d in (0.0, distance))
+        home, there = (e.errors(adapted, domain, reference, d).mean() for d in (0.0, distance))
         words = f"{LABELS[domain]}, {REFERENCES[reference]}: {' → '.join(_cm(home, there))}"
         yield there <= AWAY_FACTOR * home, words
 
 
-def _measured(e: Evidence) -> Speed:
-    if e.speed is None:
-        raise Inconclusive("it was not timed")
-    return e.speed
-
-
 def _fast_call(e: Evidence) -> Part:
-    speed = _measured(e)
-    words = f"{speed.call_ms:.2f} ms of processor time, {speed.median_ms:.2f} ms on the clock (median)"
-    return speed.call_ms <= CALL_MS, words
+    words = f"{e.speed.call_ms:.2f} ms of processor time, {e.speed.median_ms:.2f} ms on the clock (median)"
+    return e.speed.call_ms <= CALL_MS, words
 
 
 def _fast_flights(e: Evidence) -> Part:
-    speed = _measured(e)
+    speed = e.speed
     share = FLIGHTS * FLIGHT_SECONDS / speed.flown_seconds / 60
     minutes, alone = share * speed.seconds, share * speed.processor_seconds / speed.devices
     words = f"{minutes:.1f} minutes on {speed.devices} devices, {alone:.1f} if they did nothing else"
@@ -196,7 +190,8 @@ CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]
     (6, f"adapted with the smallest N, the mean RMSE away from home is at most {AWAY_FACTOR:g} times that at home, in "
         "each domain and on each reference flown there.", _same_away),
     (9, "with the observer before and after, under the parameter shift, the mean RMSE after adaptation with the "
-        f"smallest N is not above that of the source model on any reference ({_SIGNIFICANT}).", _none_worse_observed),
+        f"smallest N is not above that of the source model on any reference ({_SIGNIFICANT}).",
+     lambda source, adapted, e: _none_worse(replace(source, observer=True), replace(adapted, observer=True), e)),
 ]  # fmt: skip
 SPEED_CLAIMS: list[tuple[str, str, Callable[[Evidence], Part]]] = [
     ("R7", f"A call of the controller with the adapted hybrid takes at most {CALL_MS:g} ms on one core (processor "

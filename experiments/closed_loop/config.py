@@ -3,11 +3,11 @@
 from dataclasses import dataclass, fields, replace
 from typing import Any, Literal, get_args
 
-from experiments.closed_loop.ablation import Option
 from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
 from experiments.runner.options import Count, Positive, distinct
 
 Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
+Option = Literal["networks", "offset", "statistics", "quaternion"]
 ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
 

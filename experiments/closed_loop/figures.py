@@ -5,6 +5,7 @@ Each raises ValueError if the rows hold nothing to draw.
 
 import math
 from collections.abc import Mapping, Sequence
+from operator import attrgetter
 from typing import Any
 
 import matplotlib as mpl
@@ -14,9 +15,18 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.closed_loop.claims import COST_TOLERANCE
-from experiments.closed_loop.rows import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, centimetres
-from experiments.closed_loop.tables import gaps
-from experiments.reporting.plots import COLOURS, STYLE, Line, error_legend, error_panel, legend_below, tick_errors
+from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
+from experiments.reporting.plots import (
+    COLOURS,
+    STYLE,
+    Line,
+    error_legend,
+    error_panel,
+    legend_below,
+    name_lines,
+    note,
+    tick_errors,
+)
 from experiments.reporting.results import Results
 from experiments.reporting.stats import Interval
 
@@ -37,15 +47,27 @@ SMALLEST_COST = 1e-3
 XLABEL = "position RMSE [cm]  (log scale)"
 
 
-def errors(rows: Results, domain: str) -> Figure:
-    """A panel per reference at home, a line per agent, a dot per seed."""
-    home = rows.where(domain=domain, distance=0.0).sort(reference=list(REFERENCES))
-    return _error_panels(home, "name", domain, "position error of each model")
-
-
-def ablation(rows: Results, domain: str) -> Figure:
-    """A panel per reference and distance, a line per variant."""
-    return _error_panels(rows.where(domain=domain), "variant", domain, "ablation of the invariant residual")
+@mpl.rc_context(STYLE)
+def errors(rows: Results, domain: str, ablation: bool = False) -> Figure:
+    """A panel per reference at home, a line per agent, a dot per seed; of an ablation also away, a line per variant."""
+    rows = rows.where(domain=domain)
+    if not ablation:
+        rows = rows.where(distance=0.0).sort(reference=list(REFERENCES))
+    what = "ablation of the invariant residual" if ablation else "position error of each model"
+    label = attrgetter("variant" if ablation else "name")
+    groups = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
+    if not groups:
+        raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
+    figure, grid = _grid(len(groups), [label(agent) for group in groups.values() for agent in group])
+    for axes, ((reference, distance), group) in zip(grid, groups.items(), strict=False):
+        drawn = {agent: np.maximum(100 * own.numbers(ERROR), SMALLEST_ERROR) for agent, own in group.items()}
+        marks = {ORACLE: "the true vehicle as its own model"}
+        lines = [Line(label(a), values, COLOURS_OF[a.model], marks.get(a, "")) for a, values in drawn.items()]
+        error_panel(axes, lines, REFERENCES[reference] + away(distance))
+        axes.set_xlabel(XLABEL)
+    note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
+    title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
+    return error_legend(figure, title, any(rows["crashed"]))
 
 
 @mpl.rc_context(STYLE)
@@ -83,10 +105,9 @@ def shares(rows: Results, domain: str) -> Figure:
         raise ValueError(f"rows must hold a source model and the true vehicle in {domain}")
     figure, panels = _grid(len(names), [agent.name for agent in found], width=2.6)
     for axes, name in zip(panels, names, strict=False):
-        axes.set(xlim=SHARES, ylim=(len(found) - 0.4, -0.6), xlabel="share of the gap closed [%]")
+        axes.set(xlim=SHARES, xticks=[0, 50, 100], xlabel="share of the gap closed [%]")
         axes.set_title(REFERENCES[name], pad=16)
-        axes.set_xticks([0, 50, 100])
-        axes.set_yticks(range(len(found)), [agent.name for agent in found])
+        name_lines(axes, [agent.name for agent in found])
         for x, words in ((0.0, "source"), (100.0, "true vehicle")):
             axes.axvline(x, color="0.4", linestyle=":", linewidth=1)
             axes.text(x, -0.66, words, fontsize=7, color="0.4", ha="center", va="bottom")
@@ -123,27 +144,6 @@ def floor_note(smallest: float, floor: float, before: str, after: str = "") -> s
     return f"{before}below {floor:g} cm drawn there{after}" if smallest < floor else ""
 
 
-@mpl.rc_context(STYLE)
-def _error_panels(rows: Results, label: str, domain: str, what: str) -> Figure:
-    """A panel per reference and distance, a line per agent with this attribute of it as its label."""
-    groups = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
-    if not groups:
-        raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
-    figure, grid = _grid(len(groups), [getattr(agent, label) for group in groups.values() for agent in group])
-    for axes, ((reference, distance), group) in zip(grid, groups.items(), strict=False):
-        lines = [_line(getattr(agent, label), agent, own) for agent, own in group.items()]
-        error_panel(axes, lines, REFERENCES[reference] + away(distance))
-        axes.set_xlabel(XLABEL)
-    note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
-    title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
-    return error_legend(figure, title, any(rows["crashed"]))
-
-
-def _line(label: str, agent: Agent, rows: Results) -> Line:
-    marked = "the true vehicle as its own model" if agent == ORACLE else ""
-    return Line(label, np.maximum(100 * rows.numbers(ERROR), SMALLEST_ERROR), COLOURS_OF[agent.model], marked)
-
-
 def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure, list[Axes]]:
     """So many panels, with room for the labels of lines in the first column."""
     columns = 2 if count == 4 else min(count, 3)
@@ -159,13 +159,13 @@ def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure
 
 def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, Results]) -> float:
     """Draw mean errors at home and away, joined by a line; returns the smallest [cm]."""
-    means = {agent: (centimetres(home[agent]), centimetres(rows)) for agent, rows in there.items()}
+    means = {agent: [100 * each.spread(ERROR).mean for each in (home[agent], rows)] for agent, rows in there.items()}
     values = [value for pair in means.values() for value in pair]
     finite = [max(value, SMALLEST_ERROR) for value in values if math.isfinite(value)] or [1.0]
     edge = max(finite) * 1.8
-    axes.set(xscale="log", xlim=(min(finite) / 1.4, edge), ylim=(len(means) - 0.4, -0.6), xlabel=XLABEL)
+    axes.set(xscale="log", xlim=(min(finite) / 1.4, edge), xlabel=XLABEL)
     tick_errors(axes.xaxis, *axes.get_xlim())
-    axes.set_yticks(range(len(means)), [agent.name for agent in means])
+    name_lines(axes, [agent.name for agent in means])
     for y, (agent, (here, error)) in enumerate(means.items()):
         start, end = max(here, SMALLEST_ERROR), min(max(error, SMALLEST_ERROR), edge)
         colour, crashed = COLOURS_OF[agent.model], sum(there[agent]["crashed"])
@@ -173,16 +173,10 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, 
         axes.plot(start, y, "o", color=colour, markersize=5)
         axes.plot(end, y, "x" if crashed else ">", color=colour, markersize=7, clip_on=False)
         if crashed:
-            _note(axes, f"{crashed} of {len(there[agent])} crash", (end, y), (-8, 4), va="bottom", ha="right")
+            note(axes, f"{crashed} of {len(there[agent])} crash", (end, y), (-8, 4), va="bottom", ha="right")
         else:
-            number = f"{error:.2g}" if error >= SMALLEST_ERROR else f"{error:.2f}"
-            _note(axes, number, (end, y), (7, 0), va="center", ha="left")
+            note(axes, f"{error:.2g}" if error >= SMALLEST_ERROR else f"{error:.2f}", (end, y), (7, 0), va="center")
     return min(values)
-
-
-def _note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[int, int], **align: str) -> None:
-    style: Any = {"textcoords": "offset points", "fontsize": 7, "annotation_clip": False, **align}
-    axes.annotate(words, at, offset, **style)
 
 
 def _draw_share(axes: Axes, y: int, share: Interval, colour: str) -> None:
@@ -198,7 +192,7 @@ def _draw_share(axes: Axes, y: int, share: Interval, colour: str) -> None:
     axes.plot(x, y, marker, color=colour, markersize=5, clip_on=False, markerfacecolor=filled)
     if x != value:
         offset, side = ((6, 3), "left") if value < x else ((-6, 3), "right")
-        _note(axes, f"{value:.0f}", (x, y), offset, va="bottom", ha=side)
+        note(axes, f"{value:.0f}", (x, y), offset, va="bottom", ha=side)
 
 
 def _draw_costs(axes: Axes, rows: Results, agents: Sequence[Agent]) -> None:

@@ -1,6 +1,6 @@
-"""Train or load every prediction model of the closed loop; all stages come from the shared cache."""
+"""Prediction models of the closed loop, trained or from the shared cache; those of the ablation undo a choice each."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -8,20 +8,42 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from experiments.closed_loop.rows import SOURCES, Agent
-from experiments.closed_loop.scenarios import DOMAINS, ModelSet
+from experiments.closed_loop.flights import DOMAINS, ModelSet
+from experiments.closed_loop.results import SOURCES, Agent
 from experiments.closed_loop.true_model import true_field
-from experiments.paper.config import Config
-from experiments.paper.solved import solved
-from experiments.paper.study import adapted, flown, places, pretrained, source_splits, target_splits
+from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
+from experiments.paper.lanes import Fit
+from experiments.paper.study import (
+    adapted,
+    domain_name,
+    flown,
+    places,
+    pretrained,
+    solved,
+    source_splits,
+    target_splits,
+)
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import Method
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
+
+# The networks of the ablation; those COMPARED are also flown with its other options.
+PAPER, INVARIANT = "paper: all of x → all 13", "invariant: no p_x, p_y, yaw → v̇, ω̇"
+NETWORKS: dict[str, tuple[ResidualInputs, ResidualOutputs]] = {
+    PAPER: ("all", "all"),
+    "no p_x, p_y → all 13": ("no_xy", "all"),
+    "all of x → v̇, ω̇": ("all", "accelerations"),
+    "no p_x, p_y → v̇, ω̇": ("no_xy", "accelerations"),
+    INVARIANT: ("no_xy_yaw", "accelerations"),
+}
+COMPARED = (PAPER, INVARIANT)
+SLOW = "invariant, output bias at the common rate"
 
 
 @dataclass(frozen=True)
@@ -34,26 +56,27 @@ class Trained:
 
 def train(model: str, config: Config, stages: Stages) -> Trained:
     """Pre-train a model (an id in `experiments.paper.conditions`) and adapt it to each domain."""
-    start = pretrained(model, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages)).best
-    sizes, _ = places(config.sizes, config)
-    found = {}
-    for domain in DOMAINS:
-        target = flown(domain, target_splits(config), config, stages)
-        final = adapted(model, "fine_tuned", start, config, stages, target).best
-        for size in config.sizes:
-            found[domain.name, size] = lane(final, np.flatnonzero(np.equal(sizes, size)))
-    return Trained(start, found)
+    start = pretrained(model, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages)).fields
+    return _adapt(start, config, stages, lambda target: adapted(model, "fine_tuned", start, config, stages, target))
 
 
 def least_squares(source: AbstractVectorField, method: Method, config: Config, stages: Stages) -> Trained:
     """Fit θ_p and a constant disturbance of the source models to the smallest N of each domain by least squares."""
-    own = replace(config, sizes=(min(config.sizes),))
+    own = replace(config, sizes=(min(config.sizes),), pool=config.pooled())
+
+    def fit(target: Dataset) -> Fit:
+        return solved(f"least squares {domain_name(target)}", method, source, own, stages, target)
+
+    return _adapt(source, own, stages, fit)
+
+
+def _adapt(start: AbstractVectorField, config: Config, stages: Stages, fit: Callable[[Dataset], Fit]) -> Trained:
+    sizes, _ = places(config.sizes, config)
     found = {}
     for domain in DOMAINS:
-        target = flown(domain, target_splits(config), config, stages)
-        fit = solved(f"least squares {domain.name}", method, source, own, stages, target)
-        found[domain.name, *own.sizes] = fit.fields
-    return Trained(source, found)
+        fields = fit(flown(domain, target_splits(config), config, stages)).fields
+        found |= {(domain.name, n): lane(fields, np.flatnonzero(np.equal(sizes, n))) for n in config.sizes}
+    return Trained(start, found)
 
 
 def disturbance_counts(fitted: Trained) -> list[str]:
@@ -66,9 +89,7 @@ def disturbance_counts(fitted: Trained) -> list[str]:
 def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int]) -> ModelSet:
     """All models that fly in a domain, by agent: with each model its observed version, and last the true vehicle.
 
-    Args:
-        trained: by id in `rows.LEARNED`.
-        sizes: numbers of target trajectories, the smallest first; none for the vehicle before the change.
+    `trained` is by id in `results.LEARNED`; `sizes` begins with the smallest N, or is empty for the unchanged vehicle.
     """
     fields: dict[Agent, Any] = {Agent("nominal"): as_stack(rigid_body(IRIS))}
     for model, found in trained.items():
@@ -101,3 +122,46 @@ def with_statistics_of(source: AbstractVectorField, field: AbstractVectorField) 
         return [node.running for node in nodes if isinstance(node, BatchNorm)]
 
     return eqx.tree_at(running, field, running(source))
+
+
+def train_networks(
+    options: Sequence[str], config: Config, train: Callable[[str, str, Config], Trained]
+) -> dict[str, Trained]:
+    """The networks that these options of the ablation compare, trained by `train(name, model, config)`."""
+    wanted = {name: NETWORKS[name] for name in NETWORKS if "networks" in options or name in COMPARED}
+    if "offset" in options:
+        wanted[SLOW] = NETWORKS[INVARIANT]
+    trained = {}
+    for name, (inputs, outputs) in wanted.items():
+        # A network that writes all derivatives is adapted as in the paper.
+        fast = outputs == "accelerations" and name != SLOW
+        rates = replace(config.rates, offset=config.rates.offset if fast else None)
+        own = replace(config, residual_inputs=inputs, residual_outputs=outputs, rates=rates)
+        trained[name] = train(f"ablation, {name}", "hybrid", own)
+    return trained
+
+
+def variants(
+    options: Sequence[str], domain: Domain, trained: dict[str, Trained], config: Config, normalised: bool = True
+) -> ModelSet:
+    """Models for the usual controller: each network adapted, with the statistics of the source, and unadapted with an
+    observer; or for one that does not renormalise the quaternion in its predictions.
+    """
+    (few,) = config.sizes
+    adapted = {name: found.adapted[domain.name, few] for name, found in trained.items()}
+    if not normalised:
+        models = {_variant(name, few, ", |q| not renormalised"): adapted[name] for name in COMPARED}
+        return {agent: fused(field) for agent, field in models.items()}
+    models = {_variant(name, few): field for name, field in adapted.items()}
+    if "statistics" in options and config.norm == "batch":
+        for name in COMPARED:
+            mixed = with_statistics_of(trained[name].source, adapted[name])
+            models[_variant(name, few, ", batch statistics of the source")] = mixed
+    for name in COMPARED:
+        models[replace(_variant(name, 0, ", not adapted, + observer"), observer=True)] = trained[name].source
+    return {agent: fused(field) for agent, field in models.items()}
+
+
+def _variant(network: str, n_train: int, what: str = "") -> Agent:
+    name = network.partition(":")[0] + what if what else network
+    return Agent("invariant" if network.startswith("invariant") else "hybrid", n_train, variant=name)

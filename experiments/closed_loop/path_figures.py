@@ -3,20 +3,27 @@
 import math
 from collections.abc import Mapping, Sequence
 
+import jax.numpy as jnp
 import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float, UInt8
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from experiments.closed_loop.claims import THREE
 from experiments.closed_loop.figures import COLOURS_OF, floor_note
-from experiments.closed_loop.rows import KNOWN, REFERENCES, Agent
+from experiments.closed_loop.flights import DRAW_EVERY, PATHS, Flown
+from experiments.closed_loop.results import DOMAINS, EXTERNAL_FORCE, KNOWN, REFERENCES, Agent
 from experiments.reporting.plots import STYLE, legend_below, tick_errors
+from hybrid_jax.control import Controller, sample
+from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from hybrid_jax.state import POSITION
+from hybrid_jax.vehicle import IRIS
 
 States = Float[np.ndarray, "t 13"]
 Images = UInt8[np.ndarray, "k h w 3"]
 LARGEST_ERROR, SMALLEST_ERROR = 300.0, 0.02  # cm: errors are clipped to these
+DRAWN_TIMES = (0.0, 0.5, 1.0, 2.0, 4.0, 8.0)  # s, of the strip
 TOP_VIEW = [0, 1]  # x, y
 VIEWS = {"low_pass": [0, 2]}  # x, z: the altitude matters
 
@@ -65,6 +72,40 @@ def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence
         axes.set_title(f"{t:g} s")
     figure.suptitle(title, fontsize=12)
     return figure
+
+
+def flown_paths(flown: Sequence[Flown], domain: str, agents: Sequence[Agent]) -> Figure:
+    """`paths` of seed 0 at home."""
+    own = {each.scenario.name: each for each in flown}
+    at_home = {name: own[f"{domain} {name}"] for name in THREE if f"{domain} {name}" in own}
+    flights = {name: {agent: each.states(agent) for agent in agents} for name, each in at_home.items()}
+    controller = Controller(IRIS)
+    dt = DRAW_EVERY * controller.period
+    wanted = {}
+    for name, states in flights.items():
+        length = len(states[agents[0]])
+        reference = sample(PATHS[name], controller, dt * (length - 1))
+        wanted[name] = np.asarray(reference[: DRAW_EVERY * length : DRAW_EVERY])
+    return paths(flights, wanted, dt, f"{DOMAINS[domain].capitalize()}: flights of one seed")
+
+
+def rendered(flown: Sequence[Flown], few: int) -> Figure:
+    """Rendered images of hover in the wind, before and after adaptation."""
+    found = [each for each in flown if each.scenario.name == f"{EXTERNAL_FORCE} hover"]
+    if not found:
+        raise ValueError("nothing hovered in the wind")
+    dt = DRAW_EVERY * Controller(IRIS).period
+    mark = np.asarray(PATHS["hover"](jnp.zeros(()))[0])
+    agents = (Agent("hybrid"), Agent("hybrid", few), Agent("invariant", few))
+    states = np.stack([found[0].states(agent) for agent in agents])
+    times = [t for t in DRAWN_TIMES if t < dt * states.shape[1]]
+    shown = states[:, [round(t / dt) for t in times]]
+    if not np.isfinite(shown).all():
+        raise ValueError("a flight is not finite")
+    images = frames(shown[..., :7].reshape(-1, 7), mark).reshape(*shown.shape[:2], FRAME_HEIGHT, FRAME_WIDTH, 3)
+    errors = np.linalg.norm(shown[..., POSITION] - mark, axis=-1)
+    pictures = {agent.name: (images[i], errors[i]) for i, agent in enumerate(agents)}
+    return strip(pictures, times, "Hover in the wind: the red mark is the reference")
 
 
 def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:

@@ -1,13 +1,15 @@
 """The paper's claims (Sec. 4.4 to 4.7); the text of each states how it is evaluated."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
+from typing import Any
 
 from experiments.paper.lanes import DOMAINS, cells, gain
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate
+from experiments.reporting.claims import Claim, Inconclusive, Verdict, all_of, evaluate
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
 from experiments.reporting.results import Results
 from experiments.reporting.stats import Spread
@@ -44,99 +46,95 @@ class Evidence:
             raise Inconclusive(f"needs {seeds} seeds, {model} {mode} at N = {n} has {len(rows)}")
         return rows
 
-    def mse(self, model: str, n: int, mode: str = FINE_TUNED, seeds: int = 1) -> Spread:
-        """The spread of the test error of a cell."""
-        return self.rows(model, n, mode, seeds).spread("test_mse")
+    def mse(self, *cell: Any, **seeds: int) -> Spread:
+        """The spread of the test error of `rows`."""
+        return self.rows(*cell, **seeds).spread("test_mse")
 
     def rho(self, model: str, n: int) -> float:
         """The mean ρ of a fine-tuned model."""
         return self.rows(model, n).spread(gain).mean
 
 
-Predicate = Callable[[Evidence], tuple[bool, str]]
+Part = tuple[bool, str]  # whether a claim holds in one case, and the numbers behind that
+Predicate = Callable[[Evidence], Iterator[Part]]
 
 
 def claims(rows: Results, experiment: str, truth: Mapping[str, float] | None) -> list[Verdict]:
     """Evaluate the claims about one of DOMAINS_OF. An error that is not finite counts as infinite."""
     evidence = [Evidence(domain, cells(rows.where(domain=domain)), truth) for domain in DOMAINS_OF[experiment]]
     own = [id for id in CLAIMS if experiment in ONLY.get(id, ("param_shift", "external_force"))]
-    return evaluate([Claim(id, CLAIMS[id][0], _in_each_domain(CLAIMS[id][1])) for id in own], evidence)
+    return evaluate([Claim(id, CLAIMS[id][0], partial(_in_each_domain, CLAIMS[id][1])) for id in own], evidence)
 
 
-def _in_each_domain(predicate: Predicate) -> Callable[[list[Evidence]], tuple[bool, str]]:
-    """A predicate that must hold in each domain, and is inconclusive if it is so in one."""
+def _in_each_domain(predicate: Predicate, evidence: Sequence[Evidence]) -> Part:
+    """Whether a claim holds in each domain; it is inconclusive if it is so in one."""
 
-    def in_each(evidence: list[Evidence]) -> tuple[bool, str]:
-        found = []
-        for part in evidence:
-            place = f"{label(part.domain)}: " if len(evidence) > 1 else ""
-            try:
-                holds, measured = predicate(part)
-            except Inconclusive as why:
-                raise Inconclusive(f"{place}{why}") from None
-            found.append((holds, f"{place}{measured}"))
-        return all(holds for holds, _ in found), "; ".join(words for _, words in found)
+    def part(e: Evidence) -> Part:
+        place = f"{label(e.domain)}: " if len(evidence) > 1 else ""
+        try:
+            holds, measured = all_of(predicate(e))
+        except Inconclusive as why:
+            raise Inconclusive(f"{place}{why}") from None
+        return holds, f"{place}{measured}"
 
-    return in_each
+    return all_of(map(part, evidence))
 
 
 def _hybrid_better(value: Callable[[Evidence, str, int], float], sign: int = 1) -> Predicate:
     """At every N, a value of the hybrid is below (with sign −1 above) that of no-physics."""
 
-    def predicate(e: Evidence) -> tuple[bool, str]:
-        pairs = {n: [value(e, model, n) for model in (HYBRID, NO_PHYSICS)] for n in e.sizes()}
-        words = [f"N = {n}: hybrid {hybrid:.3g}, no-physics {plain:.3g}" for n, (hybrid, plain) in pairs.items()]
-        return all(sign * hybrid < sign * plain for hybrid, plain in pairs.values()), "; ".join(words)
+    def predicate(e: Evidence) -> Iterator[Part]:
+        for n in e.sizes():
+            hybrid, plain = (value(e, model, n) for model in (HYBRID, NO_PHYSICS))
+            yield sign * hybrid < sign * plain, f"N = {n}: hybrid {hybrid:.3g}, no-physics {plain:.3g}"
 
     return predicate
 
 
-def _only_hybrid_adapts(e: Evidence) -> tuple[bool, str]:
+def _only_hybrid_adapts(e: Evidence) -> Iterator[Part]:
     n = e.sizes()[0]
     hybrid, plain, group = e.rho(HYBRID, n), e.rho(NO_PHYSICS, n), e.rows(NO_PHYSICS, n)
     failed = sum(row["status"] == "diverged" or row["test_mse"] is None for row in group)
     fails = plain < 0 or (e.domain == EXTERNAL_FORCE and 2 * failed >= len(group))
     words = f"N = {n}: mean ρ of hybrid {hybrid:.3g}, of no-physics {plain:.3g}"
-    return fails and hybrid > 0, f"{words} ({failed} of its {len(group)} seeds diverged or not finite)"
+    yield fails and hybrid > 0, f"{words} ({failed} of its {len(group)} seeds diverged or not finite)"
 
 
-def _falls_with_n(e: Evidence) -> tuple[bool, str]:
+def _falls_with_n(e: Evidence) -> Iterator[Part]:
     sizes = e.sizes()
     if len(sizes) < 2:
         raise Inconclusive("needs two sizes N")
-    falls, words = True, []
     for model in (HYBRID, NO_PHYSICS):
         means = {n: e.mse(model, n).mean for n in sizes}
         rises = [f"{small} to {large}" for small, large in pairwise(sizes) if not means[large] < means[small]]
         lower = "below" if means[sizes[-1]] < means[sizes[0]] else "not below"
         trend = f"does not fall from {', '.join(rises)}" if rises else "falls at every step"
         shown = ", ".join(f"{mean:.3g}" for mean in means.values())
-        words.append(f"{label(model)} {trend} ({shown}; the last is {lower} the first)")
-        falls = falls and not rises
-    return falls, "; ".join(words)
+        yield not rises, f"{label(model)} {trend} ({shown}; the last is {lower} the first)"
 
 
-def _beats_source_only(e: Evidence) -> tuple[bool, str]:
-    means = {n: e.rho(HYBRID, n) for n in e.sizes()}
-    return min(means.values()) > 0, "; ".join(f"N = {n}: ρ = {mean:.3g}" for n, mean in means.items())
+def _beats_source_only(e: Evidence) -> Iterator[Part]:
+    for n in e.sizes():
+        mean = e.rho(HYBRID, n)
+        yield mean > 0, f"N = {n}: ρ = {mean:.3g}"
 
 
-def _pretraining_helps_when_small(e: Evidence) -> tuple[bool, str]:
+def _pretraining_helps_when_small(e: Evidence) -> Iterator[Part]:
     smallest, large = e.sizes()[0], [n for n in e.sizes() if n >= EQUAL_FROM]
     if smallest >= EQUAL_FROM or not large:
         raise Inconclusive(f"needs a size N below {EQUAL_FROM} and one from {EQUAL_FROM} on")
-    ratios = {n: _ratio(e.mse(HYBRID, n, TARGET_ONLY), e.mse(HYBRID, n)) for n in (smallest, *large)}
-    tuned, alone = e.mse(HYBRID, smallest, seeds=2), e.mse(HYBRID, smallest, TARGET_ONLY, seeds=2)
+    tuned, alone = (e.mse(HYBRID, smallest, mode, seeds=2) for mode in (FINE_TUNED, TARGET_ONLY))
     apart = tuned.mean + tuned.std < alone.mean - alone.std or alone.non_finite > tuned.non_finite == 0
-    near = all(1 / CLEARLY <= ratios[n] <= CLEARLY for n in large)
-    words = "; ".join(f"N = {n}: ratio {ratio:.3g}" for n, ratio in ratios.items())
-    intervals = "are apart" if apart else "overlap"
-    return ratios[smallest] >= CLEARLY and apart and near, f"{words}; one-std intervals at N = {smallest} {intervals}"
+    for n in (smallest, *large):
+        ratio = _ratio(e.mse(HYBRID, n, TARGET_ONLY), e.mse(HYBRID, n))
+        holds = ratio >= CLEARLY if n == smallest else 1 / CLEARLY <= ratio <= CLEARLY
+        yield holds, f"N = {n}: ratio {ratio:.3g}"
+    yield apart, f"one-std intervals at N = {smallest} {'are apart' if apart else 'overlap'}"
 
 
-def _few_are_enough(e: Evidence) -> tuple[bool, str]:
+def _few_are_enough(e: Evidence) -> Iterator[Part]:
     ratio = _ratio(e.mse(HYBRID, FEW), e.mse(HYBRID, MANY))
-    return ratio <= CLEARLY, f"ratio {ratio:.3g}"
+    yield ratio <= CLEARLY, f"ratio {ratio:.3g}"
 
 
 def _ratio(above: Spread, below: Spread) -> float:
@@ -146,69 +144,47 @@ def _ratio(above: Spread, below: Spread) -> float:
     return above.mean / below.mean
 
 
-def _leads_the_baselines(e: Evidence) -> tuple[bool, str]:
+def _leads_the_baselines(e: Evidence) -> Iterator[Part]:
     hybrid = e.mse(HYBRID, FEW).mean
     expert = e.mse(names.EXPERT_AUGMENTATION, 0, names.SOURCE_ONLY).smallest
     physics = e.mse(names.PHYSICS_ONLY, FEW).smallest
     words = f"mean of hybrid {hybrid:.3g}, smallest of Expert Augmentation {expert:.3g}, of physics-only {physics:.3g}"
-    return hybrid < expert < physics, words
+    yield hybrid < expert < physics, words
 
 
-def _theta_recovered(e: Evidence) -> tuple[bool, str]:
+def _theta_recovered(e: Evidence) -> Iterator[Part]:
     if e.truth is None:
         raise Inconclusive("the true θ_p is not given")
-    biases, words = [], []
     for n in e.sizes():
         rows = e.rows(HYBRID, n)
         if None in rows["theta"]:
             raise Inconclusive(f"a hybrid row at N = {n} has no theta")
-        off = {name: rows.spread(f"theta.{name}").mean / e.truth[name] - 1 for name in ("Ix", "Iy")}
-        words.append(f"N = {n}: Ix {off['Ix']:+.2%}, Iy {off['Iy']:+.2%}")
-        biases += off.values()
-    return all(abs(bias) <= THETA_TOLERANCE for bias in biases), "; ".join(words)
+        x, y = (rows.spread(f"theta.{name}").mean / e.truth[name] - 1 for name in ("Ix", "Iy"))
+        yield all(abs(off) <= THETA_TOLERANCE for off in (x, y)), f"N = {n}: Ix {x:+.2%}, Iy {y:+.2%}"
 
 
 ONLY = {"C9": (COMPARISON,), "C10": ("param_shift",)}  # the others are about both shifts, not about the comparison
 CLAIMS: Mapping[str, tuple[str, Predicate]] = {
-    "C1": (
-        "At every N, the mean test error of the fine-tuned hybrid is below that of fine-tuned no-physics.",
-        _hybrid_better(lambda e, model, n: e.mse(model, n).mean),
-    ),
-    "C2": (
-        "At every N, the mean ρ of the fine-tuned hybrid is above that of fine-tuned no-physics.",
-        _hybrid_better(Evidence.rho, sign=-1),
-    ),
-    "C3": (
-        "At the smallest N, fine-tuned no-physics fails and the hybrid does not: mean ρ of no-physics is below 0 "
-        "(under the external force, diverging in at least half of the seeds counts too), that of the hybrid above 0.",
-        _only_hybrid_adapts,
-    ),
-    "C4": (
-        "At every N, the standard deviation over seeds of the test error of the fine-tuned hybrid is below that of "
-        "fine-tuned no-physics.",
-        _hybrid_better(lambda e, model, n: e.mse(model, n, seeds=2).std),
-    ),
-    "C5": (
-        "The mean test error after fine-tuning falls strictly from each N to the next, for hybrid and for no-physics.",
-        _falls_with_n,
-    ),
+    "C1": ("At every N, the mean test error of the fine-tuned hybrid is below that of fine-tuned no-physics.",
+           _hybrid_better(lambda e, model, n: e.mse(model, n).mean)),
+    "C2": ("At every N, the mean ρ of the fine-tuned hybrid is above that of fine-tuned no-physics.",
+           _hybrid_better(Evidence.rho, sign=-1)),
+    "C3": ("At the smallest N, fine-tuned no-physics fails and the hybrid does not: mean ρ of no-physics is below 0 "
+           "(under the external force, diverging in at least half of the seeds counts too), that of the hybrid above "
+           "0.", _only_hybrid_adapts),
+    "C4": ("At every N, the standard deviation over seeds of the test error of the fine-tuned hybrid is below that of "
+           "fine-tuned no-physics.", _hybrid_better(lambda e, model, n: e.mse(model, n, seeds=2).std)),
+    "C5": ("The mean test error after fine-tuning falls strictly from each N to the next, for hybrid and for "
+           "no-physics.", _falls_with_n),
     "C6": ("Fine-tuning beats source-only: the mean ρ of the hybrid is above 0 at every N.", _beats_source_only),
-    "C7": (
-        f"Hybrid, mean error of target-only over that of fine-tuned: at least {CLEARLY} at the smallest N, where the "
-        f"one-std intervals do not overlap, and between 1/{CLEARLY} and {CLEARLY} at every N from {EQUAL_FROM} on.",
-        _pretraining_helps_when_small,
-    ),
-    "C8": (
-        f"The mean error of the hybrid fine-tuned with N = {FEW} is at most {CLEARLY} times that with N = {MANY}.",
-        _few_are_enough,
-    ),
-    "C9": (
-        f"In both experiments: mean error of the hybrid fine-tuned at N = {FEW} < smallest error over seeds of Expert "
-        f"Augmentation < smallest error over seeds of physics-only fine-tuned at N = {FEW}.",
-        _leads_the_baselines,
-    ),
-    "C10": (
-        f"Mean Ix and Iy of the fine-tuned hybrid are within {THETA_TOLERANCE:.0%} of the true ones at every N.",
-        _theta_recovered,
-    ),
-}
+    "C7": (f"Hybrid, mean error of target-only over that of fine-tuned: at least {CLEARLY} at the smallest N, where "
+           f"the one-std intervals do not overlap, and between 1/{CLEARLY} and {CLEARLY} at every N from {EQUAL_FROM} "
+           "on.", _pretraining_helps_when_small),
+    "C8": (f"The mean error of the hybrid fine-tuned with N = {FEW} is at most {CLEARLY} times that with N = {MANY}.",
+           _few_are_enough),
+    "C9": (f"In both experiments: mean error of the hybrid fine-tuned at N = {FEW} < smallest error over seeds of "
+           f"Expert Augmentation < smallest error over seeds of physics-only fine-tuned at N = {FEW}.",
+           _leads_the_baselines),
+    "C10": (f"Mean Ix and Iy of the fine-tuned hybrid are within {THETA_TOLERANCE:.0%} of the true ones at every N.",
+            _theta_recovered),
+}  # fmt: skip

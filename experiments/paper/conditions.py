@@ -1,21 +1,27 @@
-"""Initial models and hyper-parameters of every run of a sweep: models by seed, plans by size (paper, App. A)."""
+"""Conditions of a sweep's runs: models by seed, hyper-parameters by size (paper, App. A), and measurement noise."""
 
-from dataclasses import replace
+import zlib
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PRNGKeyArray
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from experiments.paper.config import Config, Encoding, Stopping, column
+from experiments.runner.options import NotNegative
+from hybrid_jax import rotation
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.rigid_body import ForcedBody, perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
+from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
@@ -68,13 +74,10 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
     return eqx.filter_vmap(build)(seeds)
 
 
-def pretraining(model: str, vehicle: Vehicle, config: Config) -> tuple[FitState, RunConfig]:
-    """One run per seed, on all source trajectories."""
-    return annealing(model, fresh_fields(model, vehicle, config), 1.0, config)
-
-
-def annealing(model: str, fields: AbstractVectorField, factor: float, config: Config) -> tuple[FitState, RunConfig]:
-    """Pre-training from the seeds' fields, with all rates times a factor."""
+def pretraining(
+    model: str, fields: AbstractVectorField, config: Config, factor: float = 1.0
+) -> tuple[FitState, RunConfig]:
+    """One run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
     patience = config.patience
     rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
     plan = _plan(model, config, config.rates.pretraining, rule, np.arange(config.source_train), config.source_train)
@@ -161,3 +164,41 @@ def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: i
 
 def _key(seed, purpose: int) -> PRNGKeyArray:
     return jax.random.fold_in(jax.random.key(seed), purpose)
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviation of the white measurement noise on each entry of a group of the state."""
+
+    position: NotNegative = 0.001
+    """[m], motion capture."""
+    quaternion: NotNegative = 0.002
+    """Of each component, motion capture: about 0.2 degrees."""
+    velocity: NotNegative = 0.02
+    """[m/s], differentiated motion capture."""
+    body_rates: NotNegative = 0.02
+    """[rad/s], gyroscope."""
+
+
+def measure(x: Float[Array, "*n 13"], noise: Noise, key: PRNGKeyArray) -> Float[Array, "*n 13"]:
+    """The states with white noise; quaternions are normalised again."""
+    sizes = np.zeros(13)
+    for group, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), asdict(noise).values(), strict=True):
+        sizes[group] = size
+    noisy = x + jnp.asarray(sizes, x.dtype) * jax.random.normal(key, x.shape, x.dtype)
+    return noisy.at[..., QUATERNION].set(rotation.normalise(noisy[..., QUATERNION]))
+
+
+def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
+    """The dataset with `level` times the typical noise on all but its test splits."""
+    if not level:
+        return dataset
+    noise = Noise(**{name: level * size for name, size in asdict(Noise()).items()})
+    splits = dict(dataset.splits)
+    for name, windows in dataset.splits.items():
+        if not name.startswith("test"):
+            start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())))
+            x0 = np.asarray(measure(jnp.asarray(windows.x0), noise, start_key))
+            x = np.asarray(measure(jnp.asarray(windows.x), noise, key))
+            splits[name] = Trajectories(x0, windows.u, x, windows.dt)
+    return Dataset(splits, {**dataset.metadata, "noise": asdict(noise)})

@@ -1,7 +1,8 @@
 """Figures of the paper's experiments: scores and θ_p against N (Figs. 3 and 5), methods ranked (Table 2), ablations."""
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
 
@@ -11,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import THETA_TOLERANCE
-from experiments.paper.lanes import THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.paper.lanes import THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
@@ -71,71 +72,57 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     return legend_below(figure, "Physical parameters after training", MEANING, columns=4)
 
 
-@mpl.rc_context(STYLE)
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:
     """Table 2: the test errors of all seeds of every method, the smallest mean on top, a panel for each domain.
 
-    Args:
-        floors: domain → an error that no model can get below.
+    `floors` has for a domain the error that no model can get below.
     """
-    several_sizes = len(adapted_sizes(rows)) > 1
-    panels = {}
-    for domain, group in by_domain(rows).items():
-        panels[domain] = lines = []
-        for cell, own in ranked(group).items():
-            name = f"{method_label(cell)}, N = {cell[2]}" if several_sizes and cell[2] else method_label(cell)
-            marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
-            lines.append(Line(name, own.numbers("test_mse"), colour(cell[0]), marked))
-    counts = [len(lines) for lines in panels.values()]
-    figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
-    column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
-    _draw_panels(column, panels, floors)
-    return error_legend(figure, title, None in rows["test_mse"])
+    several = len(adapted_sizes(rows)) > 1
+
+    def line(cell: Cell, own: Results) -> Line:
+        name = f"{method_label(cell)}, N = {cell[2]}" if several and cell[2] else method_label(cell)
+        marked = "mean of the adapted hybrid" if cell[:2] == (HYBRID, FINE_TUNED) else ""
+        return Line(name, own.numbers("test_mse"), colour(cell[0]), marked)
+
+    panels = {domain: [line(*item) for item in ranked(group).items()] for domain, group in by_domain(rows).items()}
+    return _error_panels(panels, title, floors)
+
+
+def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
+    """The fine-tuned models of one choice, as in `ranking`: a line for each value and N."""
+    sizes = adapted_sizes(rows)
+
+    def line(own: Results, n: int) -> Line:
+        tint, marked = (colour(HYBRID), "mean of the default") if own[0]["default"] else ("0.35", "")
+        name = f"{value_label(own[0])}, N = {n}" if len(sizes) > 1 else value_label(own[0])
+        return Line(name, own.numbers("test_mse"), tint, marked if n == sizes[0] else "")
+
+    panels = {
+        domain: [line(own, n) for n in sizes for own in group.where(n_train=n).group("value").values()]
+        for domain, group in by_domain(rows.where(mode=FINE_TUNED)).items()
+    }
+    return _error_panels(panels, title, floors)
 
 
 @mpl.rc_context(STYLE)
-def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
-    """The fine-tuned models of one choice, as in `ranking`: a line for each value and N.
-
-    Args:
-        rows: with the tags value and default.
-    """
-    panels = {domain: _ablation_lines(group) for domain, group in by_domain(rows.where(mode=FINE_TUNED)).items()}
-    count = max(len(lines) for lines in panels.values())
-    figure = Figure(figsize=(11, 1.9 + 0.32 * count), layout="constrained")
-    row = figure.subplots(1, len(panels), squeeze=False)[0]
-    _draw_panels(row, panels, floors)
-    for axes in row[1:]:
-        axes.tick_params(labelleft=False)  # the lines are those of the first panel
-    return error_legend(figure, title, None in rows["test_mse"])
-
-
-def _draw_panels(panels: Iterable[Axes], lines: Mapping[str, Sequence[Line]], floors: Mapping[str, float]) -> None:
-    for axes, (domain, own) in zip(panels, lines.items(), strict=True):
-        error_panel(axes, own, label(domain).capitalize(), floors.get(domain, 0.0))
-
-
-def _ablation_lines(rows: Results) -> list[Line]:
-    sizes, lines = adapted_sizes(rows), []
-    for n in sizes:
-        for group in rows.where(n_train=n).group("value").values():
-            tint, marked = (colour(HYBRID), "mean of the default") if group[0]["default"] else ("0.35", "")
-            name = f"{value_label(group[0])}, N = {n}" if len(sizes) > 1 else value_label(group[0])
-            lines.append(Line(name, group.numbers("test_mse"), tint, marked if n == sizes[0] else ""))
-    return lines
+def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapping[str, float]) -> Figure:
+    counts = [len(lines) for lines in panels.values()]
+    figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
+    column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
+    for axes, (domain, lines) in zip(column, panels.items(), strict=True):
+        error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
+    failed = any(np.isinf(line.errors).any() for lines in panels.values() for line in lines)
+    return error_legend(figure, title, failed)
 
 
 def _curves(rows: Results, value: Column) -> _Curves:
-    points: dict[tuple[str, str], list[tuple[float, ...]]] = {}
+    points = defaultdict(list)
     for (model, mode, n), group in cells(rows).items():
         values = group.numbers(value)
         finite = values[np.abs(values) < DRAWABLE]
-        mean, low, high, smallest = (math.nan,) * 4
-        if len(finite):
-            mean, std = finite.mean(), finite.std(ddof=1) if len(finite) > 1 else 0.0
-            low, high, smallest = mean - std, mean + std, finite.min()
-        point = (n, mean, low, high, smallest, len(values) - len(finite), len(values))
-        points.setdefault((model, mode), []).append(point)
+        mean, std = finite.mean() if len(finite) else math.nan, finite.std(ddof=1) if len(finite) > 1 else 0.0
+        failed, smallest = len(values) - len(finite), min(finite, default=math.nan)
+        points[model, mode].append((n, mean, mean - std, mean + std, smallest, failed, len(values)))
     return {key: _Curve(*np.array(found, float).T) for key, found in points.items()}
 
 

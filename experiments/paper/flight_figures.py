@@ -23,11 +23,7 @@ States = Float[np.ndarray, "t+1 13"]
 def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], title: str) -> Figure:
     """Figs. 2 and 4: one test flight in the horizontal plane, a panel for each N, every model against the truth.
 
-    The truth alone sets the view; a prediction that leaves it is cut, and the panel says so.
-
-    Args:
-        truth: states from the start on.
-        predicted: N → model → its states from the same start; any number of them, also ones that are not finite.
+    The truth alone sets the view; a prediction, N → model → its states, that leaves it is cut, and the panel says so.
     """
     figure = Figure(figsize=(3.1 * max(len(predicted), 2), 4.1), layout="constrained")
     panels = figure.subplots(1, len(predicted), sharey=True, squeeze=False)[0]
@@ -40,11 +36,7 @@ def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], ti
 
 @mpl.rc_context(STYLE)
 def example_flight(states: States, inputs: Float[np.ndarray, "t 4"], dt: float) -> Figure:
-    """Fig. 7: the path in space, and altitude, speed, tilt and rotor speeds over time.
-
-    Args:
-        inputs: rotor speeds [rad/s], each held for dt [s].
-    """
+    """Fig. 7: the path in space, and altitude, speed, tilt and rotor speeds [rad/s], held for dt [s], over time."""
     time = dt * np.arange(len(states))
     figure = Figure(figsize=(9, 5.4), layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.15, 1))

@@ -4,12 +4,11 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 import hybrid_jax
-from experiments.paper.solved import Solved
 from experiments.reporting import names
 from experiments.reporting.names import HYBRID, SOURCE_ONLY, label
 from experiments.reporting.results import Results, Row
@@ -31,43 +30,68 @@ TAGS = ("domain", *CELL, "seed")
 Cell = tuple[str, str, int]  # model, mode, n_train
 
 
+class Fit(NamedTuple):
+    """Models after training, or adapted by a method that is solved instead: stacked, one for each size and seed."""
+
+    fields: Any
+    val_mse: Any  # L_MSE of each on the validation windows
+    epochs: Any
+    status: Any  # see `training`
+
+
 @dataclass(frozen=True)
 class Lanes:
-    """The trained models of one kind in one mode, one for each size and seed.
-
-    Attributes:
-        fields: the models, stacked.
-        errors: L^T_MSE of each on the test flights.
-        val_mse: L_MSE of each on the validation windows.
-        epochs, status: of its training; see `training`.
-        theta: Ix, Iy, k of each; None for models without physics.
-        intervals: name → (lanes, 2), low and high end of the 95 % interval; None where there are none.
-    """
+    """The tested models of one kind in one mode, stacked, and the row of each in the table of results."""
 
     model: str
     mode: str
-    sizes: Sequence[int]
-    seeds: Sequence[int]
     fields: Any
-    errors: np.ndarray
-    val_mse: np.ndarray
-    epochs: np.ndarray
-    status: np.ndarray
-    theta: Mapping[str, np.ndarray] | None
-    intervals: Mapping[str, np.ndarray] | None = None
+    rows: Sequence[Row]
 
 
-def trained(
-    model: str, mode: str, sizes: Sequence[int], seeds: Sequence[int], final: FitState, errors: np.ndarray
+def fit_of(final: FitState) -> Fit:
+    """The best models of a sweep."""
+    return Fit(final.best, final.best_mse, final.epoch, final.status)
+
+
+def lanes_of(
+    domain: str,
+    model: str,
+    mode: str,
+    where: tuple[Sequence[int], Sequence[int]],
+    fit: Fit,
+    errors: np.ndarray,
+    theta: Mapping[str, np.ndarray] | None = None,
+    intervals: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """The best models of a sweep, tested."""
-    fit = (np.asarray(leaf) for leaf in (final.best_mse, final.epoch, final.status))
-    return Lanes(model, mode, sizes, seeds, final.best, errors, *fit, theta=theta_of(final.best))
+    """Models tested in a domain: their sizes and seeds (see `study.places`), and L^T_MSE on the test flights.
 
+    Args:
+        theta: name → the value of each, instead of that in the models.
+        intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
+    """
+    theta = theta_of(fit.fields) if theta is None else theta
 
-def solution(model: str, sizes: Sequence[int], seeds: Sequence[int], found: Solved, errors: np.ndarray) -> Lanes:
-    """The models of a method that is solved instead of trained, tested."""
-    return Lanes(model, names.FINE_TUNED, sizes, seeds, found.fields, errors, *found[1:], theta=theta_of(found.fields))
+    def row(i: int) -> Row:
+        ends = {name: pair[i] for name, pair in (intervals or {}).items()}
+        # An interval with an end that is not finite bounds nothing.
+        bounds = {name: pair.tolist() if np.isfinite(pair).all() else None for name, pair in ends.items()}
+        return {
+            "domain": domain,
+            "model": model,
+            "mode": mode,
+            "n_train": int(where[0][i]),
+            "seed": int(where[1][i]),
+            "test_mse": float(errors[i]),
+            "rho": None,  # see `with_rho`
+            "val_mse": float(fit.val_mse[i]),
+            "epochs": int(fit.epochs[i]),
+            "status": STATUS_NAMES.get(int(fit.status[i]), STATUS_NAMES[STOPPED]),
+            "theta": {name: float(value[i]) for name, value in theta.items()} or None,
+            "theta_interval": bounds or None,
+        }
+
+    return Lanes(model, mode, fit.fields, [row(i) for i in range(len(errors))])
 
 
 def physics_in(field: Any) -> Any:
@@ -75,44 +99,19 @@ def physics_in(field: Any) -> Any:
     return physics_in(field.physics) if isinstance(field, Hybrid) else field
 
 
-def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray] | None:
-    """θ_p of a model that has physics, or of stacked ones."""
-    theta = getattr(physics_in(field), "theta", None)
-    return None if theta is None else {name: np.asarray(value) for name, value in theta().items()}
+def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
+    """θ_p of a model, or of stacked ones; empty for one without physics."""
+    theta = getattr(physics_in(field), "theta", dict)
+    return {name: np.asarray(value) for name, value in theta().items()}
 
 
-def rows_of(groups: Sequence[Lanes], domain: str) -> Results:
-    """A row for each model, tested in a domain; without ρ, see `with_rho`."""
-
-    def row(lanes: Lanes, i: int) -> Row:
-        theta = {name: float(value[i]) for name, value in (lanes.theta or {}).items()}
-        ends = {name: pair[i] for name, pair in (lanes.intervals or {}).items()}
-        # An interval with an end that is not finite bounds nothing.
-        bounds = {name: pair.tolist() if np.isfinite(pair).all() else None for name, pair in ends.items()}
-        return {
-            "domain": domain,
-            "model": lanes.model,
-            "mode": lanes.mode,
-            "n_train": int(lanes.sizes[i]),
-            "seed": int(lanes.seeds[i]),
-            "test_mse": float(lanes.errors[i]),
-            "rho": None,
-            "val_mse": float(lanes.val_mse[i]),
-            "epochs": int(lanes.epochs[i]),
-            "status": STATUS_NAMES.get(int(lanes.status[i]), STATUS_NAMES[STOPPED]),
-            "theta": theta or None,
-            "theta_interval": bounds or None,
-        }
-
-    return Results([row(lanes, i) for lanes in groups for i in range(len(lanes.sizes))], TAGS)
+def rows_of(groups: Sequence[Lanes]) -> Results:
+    """The rows of all models, with ρ."""
+    return with_rho(Results([row for lanes in groups for row in lanes.rows], TAGS))
 
 
 def with_rho(rows: Results) -> Results:
-    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`.
-
-    Raises:
-        ValueError: a row without its source-only row, or a source-only error of 0, for which ρ is undefined.
-    """
+    """The rows with ρ = (L^S − L^T) / L^S (paper, Eq. 9), L^S the same seed's source-only error; see `source_of`."""
     source = {(row["domain"], row["model"], row["seed"]): row["test_mse"] for row in rows.where(mode=SOURCE_ONLY)}
 
     def rho(row: Row) -> float | None:
@@ -139,11 +138,7 @@ def gain(row: Row) -> float:
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
-    """The rows of each model, mode and N, in the order of MODELS, MODES and N.
-
-    Raises:
-        ValueError: rows of several domains, which have no mean together.
-    """
+    """The rows of each model, mode and N, in the order of MODELS, MODES and N."""
     if len(domains := sorted(rows.unique("domain"))) > 1:
         raise ValueError(f"rows must be of one domain, got {', '.join(domains)}")
     return rows.sort(model=MODELS, mode=MODES, n_train=None).group(*CELL)
@@ -178,7 +173,7 @@ def method_label(cell: Cell) -> str:
 
 def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:
     """Save every trained model, with what its row says about it; the rows as `rows_of` orders them."""
-    models = [lane(lanes.fields, i) for lanes in groups for i in range(len(lanes.sizes))]
+    models = [lane(lanes.fields, i) for lanes in groups for i in range(len(lanes.rows))]
     for model, row in zip(models, rows, strict=True):
         about = {name: row[name] for name in ("model", "mode", "n_train", "seed", "test_mse", "val_mse")}
         path = folder / "{model}-{mode}-{n_train}-seed{seed}.npz".format(**row)

@@ -1,7 +1,7 @@
 """The methods of Table 2 and more baselines: from a case to trained and tested models."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any, Literal
 
 import equinox as eqx
@@ -11,9 +11,8 @@ import numpy as np
 
 from experiments.paper.conditions import adaptation, settings
 from experiments.paper.config import Config
-from experiments.paper.lanes import Lanes, physics_in, solution, source_of, theta_of, trained
-from experiments.paper.solved import SOLVED, solved, subsets
-from experiments.paper.study import domain_name, places
+from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, physics_in, source_of, theta_of
+from experiments.paper.study import SOLVED, domain_name, places, solved, subsets
 from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import covariance_of, intervals
@@ -25,7 +24,6 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.sweep.training import evaluate
-from hybrid_jax.training.fitting import FitState
 from hybrid_jax.trajectories import Trajectories, split
 
 PAST = 10  # intervals of a test window before the ones to predict
@@ -38,19 +36,13 @@ Method = Literal[
 
 @dataclass(frozen=True)
 class Case:
-    """The data and models that a method may use in one target domain.
-
-    Attributes:
-        pretrained: by model, the final states of its pre-training, one per seed.
-        experts: the trained `ExpertAugmented` of all seeds, if Expert Augmentation is compared.
-        target: splits train (the pool), validation and test_with_past.
-    """
+    """The data and models that a method may use in one target domain."""
 
     config: Config
     stages: Stages
-    pretrained: Mapping[str, FitState]
-    experts: FitState | None
-    target: Dataset
+    pretrained: Mapping[str, Fit]  # by model, one per seed
+    experts: Fit | None  # the `ExpertAugmented` of all seeds, if Expert Augmentation is compared
+    target: Dataset  # splits train (the pool), validation and test_with_past
 
     @property
     def name(self) -> str:
@@ -65,28 +57,29 @@ class Case:
 
 def source_only(case: Case, model: str) -> Lanes:
     """A pre-trained model, unchanged."""
-    final = case.pretrained[model]
-    errors = case.tested(f"{names.SOURCE_ONLY} {model}", final.best)
-    return trained(model, names.SOURCE_ONLY, *places((0,), case.config), final, errors)
+    fit, mode = case.pretrained[model], names.SOURCE_ONLY
+    errors = case.tested(f"{mode} {model}", fit.fields)
+    return lanes_of(case.name, model, mode, places((0,), case.config), fit, errors)
 
 
 def adapted(case: Case, method: Method) -> Lanes:
     """The source models adapted by a method: fine-tuned by Adam, by an encoder, or by a method of the library."""
     if method == names.EXPERT_AUGMENTATION:
         return _augmented(case)
-    config, stage, model = case.config, f"{names.FINE_TUNED} {method} {case.name}", source_of(method)
-    start, (sizes, seeds) = case.pretrained[model].best, places(config.sizes, config)
+    config, mode, model = case.config, names.FINE_TUNED, source_of(method)
+    start, stage = case.pretrained[model].fields, f"{mode} {method} {case.name}"
     if method in SOLVED:
-        found = solved(stage, SOLVED[method], start, config, case.stages, case.target)
-        return _with_intervals(case, solution(method, sizes, seeds, found, case.tested(method, found.fields)))
-    if method == names.THETA_P_ONLY:
-        start = Hybrid(start.physics, Frozen(start.residual))
-    elif method == names.THETA_D_ONLY:
-        start = Hybrid(Frozen(start.physics), start.residual)
-    final = case.stages.run(stage, *adaptation(model, names.FINE_TUNED, start, config), settings(config), case.target)
-    whole = eqx.tree_at(lambda state: state.best, final, unfreeze(final.best))
-    errors = case.tested(method, whole.best)
-    return _with_intervals(case, trained(method, names.FINE_TUNED, sizes, seeds, whole, errors))
+        fit = solved(stage, SOLVED[method], start, config, case.stages, case.target)
+    else:
+        if method == names.THETA_P_ONLY:
+            start = Hybrid(start.physics, Frozen(start.residual))
+        elif method == names.THETA_D_ONLY:
+            start = Hybrid(Frozen(start.physics), start.residual)
+        fit = fit_of(case.stages.run(stage, *adaptation(model, mode, start, config), settings(config), case.target))
+        fit = fit._replace(fields=unfreeze(fit.fields))
+    errors = case.tested(method, fit.fields)
+    known = _intervals_of(case, method, fit.fields)
+    return lanes_of(case.name, method, mode, places(config.sizes, config), fit, errors, intervals=known)
 
 
 def _augmented(case: Case) -> Lanes:
@@ -95,11 +88,11 @@ def _augmented(case: Case) -> Lanes:
     assert experts is not None
 
     def test():
-        return jax.device_get(_encoded(experts.best, windows, settings(case.config).solver))
+        return jax.device_get(_encoded(experts.fields, windows, settings(case.config).solver))
 
     errors, physics = case.stages.timed(f"test {name} {case.name}", test)
-    lanes = trained(name, names.SOURCE_ONLY, *places((0,), case.config), experts, errors)
-    return replace(lanes, theta=theta_of(physics))
+    where = places((0,), case.config)
+    return lanes_of(case.name, name, names.SOURCE_ONLY, where, experts, errors, theta_of(physics))
 
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
@@ -114,24 +107,23 @@ def _encoded(experts, windows: Trajectories, solver):
     return jax.lax.map(one, experts)
 
 
-def _with_intervals(case: Case, lanes: Lanes) -> Lanes:
-    """The models with the 95 % interval of θ_p from the windows of their adaptation, if θ_p was adapted.
+def _intervals_of(case: Case, method: Method, fields: Any) -> Mapping[str, np.ndarray] | None:
+    """The ends of the 95 % interval of θ_p from the windows of the adaptation, if θ_p was adapted.
 
     The interval treats the network as fixed. It would do so with a disturbance too, so models that fitted one get none.
     """
-    if not isinstance(physics_in(lanes.fields), RigidBody) or lanes.model in WITHOUT_INTERVALS:
-        return lanes
+    if not isinstance(physics_in(fields), RigidBody) or method in WITHOUT_INTERVALS:
+        return None
     config, pool = case.config, case.target.splits["train"]
 
     def of_size(index: int, size: int):
-        fields = lane(lanes.fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
-        return jax.device_get(_intervals((fields, subsets(size, config)), pool, settings(config).solver))
+        own = lane(fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
+        return jax.device_get(_intervals((own, subsets(size, config)), pool, settings(config).solver))
 
     parts = case.stages.timed(
-        f"intervals {lanes.model} {case.name}",
-        lambda: [of_size(index, size) for index, size in enumerate(config.sizes)],
+        f"intervals {method} {case.name}", lambda: [of_size(index, size) for index, size in enumerate(config.sizes)]
     )
-    return replace(lanes, intervals=jax.tree.map(lambda *ends: np.concatenate(ends), *parts))
+    return jax.tree.map(lambda *ends: np.concatenate(ends), *parts)
 
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]

@@ -1,4 +1,4 @@
-"""What an experiment leaves in its folder: the report, the figures and the models."""
+"""What an experiment leaves in its folder: the report with its introduction, the figures and the models."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -14,15 +14,16 @@ from experiments.paper.claims import COMPARISON, claims
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
-from experiments.paper.introduction import introduction
-from experiments.paper.lanes import save_models
+from experiments.paper.lanes import BASELINES, by_domain, save_models
 from experiments.paper.study import EVERY, Study, study
 from experiments.paper.tables import by_size, parameters, ranking, run_notes
+from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY, label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
+from experiments.reporting.tables import over_seeds
 from experiments.runner.environment import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import Domain
@@ -33,13 +34,38 @@ from hybrid_jax.vehicle import IRIS
 
 FLIGHT_SECONDS = 11.0
 FLOOR = "wind_sine_mse"  # the key of report.json for the share of L^T_MSE that is the wind's sine
+PAPER = "Osaka, Takeishi, Yairi, *Domain Adaptation with Hybrid Modeling for Learning Dynamical Systems*, ACML 2025"
+QUESTIONS = {
+    "param_shift": "A quadrotor's moments of inertia Ix and Iy have changed (Sec. 4.4 of the paper).",
+    "external_force": "A wind now pushes the quadrotor: a steady force and a slow sine (Sec. 4.5 of the paper).",
+    COMPARISON: "A quadrotor's moments of inertia have changed, or a wind pushes it; several methods adapt to each, "
+    "tested on windows of 0.1 s (Sec. 4.7 and Table 2 of the paper, and baselines that the paper does not have).",
+}
+ABOUT = {
+    names.HYBRID: "rigid-body physics f_p(x, u; θ_p) plus a small network f_d(x, u; θ_d), both trained",
+    names.NO_PHYSICS: "the same network alone",
+    names.PHYSICS_ONLY: "the rigid-body physics alone, its θ_p trained",
+    names.EXPERT_AUGMENTATION: "the source's hybrid; an encoder estimates its θ_p from the flight's last states and "
+    "inputs, trained on rollouts with random θ_p (Wehenkel et al., 2023)",
+    names.THETA_P_ONLY: "the source's hybrid, of which only θ_p is trained on, by Adam",
+    names.THETA_D_ONLY: "the source's hybrid, of which only the network is trained on, by Adam",
+    names.LAST_LAYER: "the source's hybrid, of which only the network's last layer is refitted, by ridge regression, "
+    "as in Neural-Fly",
+    names.LEAST_SQUARES: "the source's hybrid, of which only θ_p is refitted, by nonlinear least squares "
+    "(Levenberg–Marquardt)",
+    names.CONSTANT_DISTURBANCE: "the source's hybrid, of which θ_p and a constant disturbance (six accelerations) are "
+    "fitted by nonlinear least squares",
+    names.LINEAR_RESIDUAL: "the source's hybrid, unchanged, plus a linear map fitted to its errors",
+    names.FINE_TUNED: "trained on many flights from before the change, then on N trajectories from after it",
+    names.TARGET_ONLY: "trained on the N trajectories from after the change only",
+    names.SOURCE_ONLY: "trained on flights from before the change only",
+}
 
 
 def adapt_and_report(experiment: str, domain: Domain, floor: float, config: AdaptationConfig, console: Console) -> None:
     """Run the protocol on a target domain; write models, figures and, last, the report; print its tables.
 
-    Args:
-        floor: the share of the test error that no model ẋ = f(x, u) can remove.
+    `floor` is the share of the test error that no model ẋ = f(x, u) can remove.
     """
     found = study(domain, IRIS, config, console)
     if not hosts.is_main_process():
@@ -63,12 +89,7 @@ def paper_report(
     floor: float = 0.0,
     extra: Mapping[str, Any] | None = None,
 ) -> Report:
-    """The report of an experiment of the paper.
-
-    Args:
-        truth: the true θ_p, by domain where there are several.
-        figures: caption by file.
-    """
+    """The report of an experiment of the paper; `truth`: the true θ_p, by domain where there are several."""
     verdicts = claims(rows, experiment, truth)
     headline = ranking if experiment == COMPARISON else by_size
     sine = f"About {floor:.2e} of a test error in the wind is due to its sine, which no model without a clock can see."
@@ -84,6 +105,26 @@ def paper_report(
         head=introduction(experiment, rows),
         tables=[*headline(rows), verdict_table(verdicts, "Claims of the paper"), *parameters(rows, truth)],
     )
+
+
+def introduction(experiment: str, rows: Results) -> str:
+    """Title and introduction of a report, Markdown."""
+    domains = list(by_domain(rows))
+    sizes = ", ".join(str(n) for n in sorted({*rows["n_train"]} - {0})) or "none"
+    where = f" in each of {len(domains)} targets ({', '.join(map(label, domains))})" if len(domains) > 1 else ""
+    seen = {*rows["model"], *rows["mode"]}
+    baselines = ", or of the source-only hybrid for a method that adapts it" if seen & {*BASELINES} else ""
+    parts = [
+        f"# {experiment}",
+        f"{QUESTIONS.get(experiment, '')} How well can a model trained on flights from before the change predict "
+        f"flights after it, given a little new flight? Question and protocol are those of {PAPER}.",
+        f"{len(rows)} trained models: N of {sizes} target trajectories, {over_seeds(rows)} each{where}.",
+        "\n".join(f"- **{label(name)}**: {about}" for name, about in ABOUT.items() if name in seen),
+        "L^T_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² is the test MSE on flights from after the change, x̂ integrated from the "
+        "window's first state with the recorded rotor speeds; ρ = (L^S − L^T) / L^S, where L^S is the same error of "
+        f"the source-only model of the same seed{baselines}.",
+    ]
+    return "\n\n".join(parts)
 
 
 def draw(
@@ -112,12 +153,12 @@ def paths(title: str, found: Study) -> Figure:
     states = np.asarray(eqx.filter_jit(hybrid_jax.rollout_batch)(lane(tuned[0].fields, 0), test.x0, test.u, test.dt))
     errors = np.square(states - test.x)[:, EVERY - 1 :: EVERY].sum(-1).mean(-1)
     window = test[int(np.argsort(errors)[len(errors) // 2])]
-    sizes = set(tuned[0].sizes)
+    sizes = {row["n_train"] for row in tuned[0].rows}
     shown = {100, 500, 1000} & sizes or set(sorted(sizes)[:3])
     predicted: dict[int, dict[str, np.ndarray]] = {}
     for lanes in tuned:
-        for i, (size, seed) in enumerate(zip(lanes.sizes, lanes.seeds, strict=True)):
-            if seed == lanes.seeds[0] and size in shown:
+        for i, row in enumerate(lanes.rows):
+            if row["seed"] == lanes.rows[0]["seed"] and row["n_train"] in shown:
                 states = hybrid_jax.rollout(lane(lanes.fields, i), window.x0, window.u, window.dt)
-                predicted.setdefault(size, {})[lanes.model] = np.vstack([window.x0, states])
+                predicted.setdefault(row["n_train"], {})[lanes.model] = np.vstack([window.x0, states])
     return predictions(np.vstack([window.x0, window.x]), predicted, f"{title}: one second of a test flight")

@@ -1,36 +1,53 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
-from experiments.paper.conditions import adaptation, annealing, fresh_fields, pretraining, settings
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, sampled_indices, settings
 from experiments.paper.config import AdaptationConfig, Config
-from experiments.paper.lanes import Lanes, rows_of, solution, source_of, trained, with_rho
-from experiments.paper.sensors import measured
-from experiments.paper.solved import SOLVED, Solved, solved
+from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, rows_of, source_of
+from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
-from experiments.runner.precompile import PrecompilePool, placeholder
 from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.runtime import FAST_COMPILE, cores
 from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sim.flight import DT
 from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.sweep import hosts
+from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import evaluate, sweep
-from hybrid_jax.training.fitting import STOPPED, FitState
+from hybrid_jax.training.fitting import STOPPED
+from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 EVERY = 10  # test flights are compared with the truth every 0.1 s
+# The models that are not trained: a method of the library adapts the hybrid.
+SOLVED: Mapping[str, Method] = {
+    names.LAST_LAYER: METHODS["last_layer"],
+    names.LEAST_SQUARES: METHODS["theta_least_squares"],
+    names.CONSTANT_DISTURBANCE: LeastSquares(disturbance=True),
+    names.LINEAR_RESIDUAL: METHODS["linear_residual"],
+}
 
 
 @dataclass(frozen=True)
@@ -49,86 +66,111 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
     """Run the protocol on a target domain, from models around the nominal θ_p of the vehicle before the change."""
     stages = stages_of(config, console)
     lanes: list[Lanes] = []
-    learned: dict[str, FitState] = {}
+    learned: dict[str, Fit] = {}
     sources = dict.fromkeys(source_of(model) for model in config.models)
-    unseen = [model for model in sources if not stages.knows(f"pre-training {model}")]
-    with PrecompilePool({model: partial(_compile, model, vehicle, config) for model in unseen}) as programs:
+    programs: dict[str, Future] = {}
+    with ExitStack() as stack:
+        # Compiled on other threads, while flights are simulated or another model is trained; not by several processes,
+        # which must compile in the same order.
+        pool = ThreadPoolExecutor(cores())
+        stack.callback(pool.shutdown, cancel_futures=True)
+        for model in sources if jax.process_count() == 1 else ():
+            if not stages.knows(f"pre-training {model}"):
+                programs[model] = pool.submit(_compile, model, vehicle, config)
         source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
         target = flown(domain, target_splits(config), config, stages, config.target_flights)
         for model in config.models:
             start = source_of(model)
             if start not in learned:
-                programs.wait_for(start)
+                wait([programs[start]] if start in programs else [])  # an error is met again below
                 learned[start] = pretrained(start, vehicle, config, stages, source)
                 lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
-            fields, finals = learned[start].best, dict[str, FitState | Solved]()
+            fields = learned[start].fields
             if model in SOLVED:
                 name = f"{FINE_TUNED} {model} {domain_name(target)}"
-                finals[FINE_TUNED] = solved(name, SOLVED[model], fields, config, stages, target)
+                finals = {FINE_TUNED: solved(name, SOLVED[model], fields, config, stages, target)}
             else:
-                finals[FINE_TUNED] = adapted(model, FINE_TUNED, fields, config, stages, target)
-                fresh = fresh_fields(model, vehicle, config)
-                finals[TARGET_ONLY] = adapted(model, TARGET_ONLY, fresh, config, stages, target)
+                starts = {FINE_TUNED: fields, TARGET_ONLY: fresh_fields(model, vehicle, config)}
+                finals = {mode: adapted(model, mode, begin, config, stages, target) for mode, begin in starts.items()}
             lanes += [tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
-    rows = with_rho(rows_of(lanes, domain_name(target)))
-    return Study(source, target, lanes, rows, stages.seconds, stages.notes())
+    return Study(source, target, lanes, rows_of(lanes), stages.seconds, stages.notes())
 
 
-def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> FitState:
+def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
     """A model after pre-training on source flight, one run per seed."""
-    shared = settings(config), source, capacity(config)
-    found = stages.run(f"pre-training {model}", *pretraining(model, vehicle, config), *shared)
+    shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
+    found = stages.run(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
     for factor in config.rates.decay:
-        lanes = annealing(model, found.best, factor, config)
-        found = stages.run(f"pre-training {model}, rates times {factor:g}", *lanes, *shared)
-    return found
+        lanes = pretraining(model, found.best, config, factor)
+        found = stages.run(f"{name}, rates times {factor:g}", *lanes, *shared)
+    return fit_of(found)
 
 
-def adapted(
-    model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
-) -> FitState:
+def adapted(model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Fit:
     """A model after training on target flight, one run for each size and seed; see `places`."""
-    lanes = adaptation(model, mode, fields, config)
-    return stages.run(f"{mode} {model} {domain_name(target)}", *lanes, settings(config), target, capacity(config))
+    name, lanes = f"{mode} {model} {domain_name(target)}", adaptation(model, mode, fields, config)
+    return fit_of(stages.run(name, *lanes, settings(config), target, capacity(config)))
 
 
-def tested(model: str, mode: str, found: FitState | Solved, config: Config, stages: Stages, target: Dataset) -> Lanes:
+def solved(
+    name: str, method: Method, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
+) -> Fit:
+    """Each seed's field adapted to its target windows by a method, for each of the sizes, as the stage `name`."""
+    windows = target.splits["train"], target.splits["validation"]
+
+    def of_size(size: int) -> Fit:
+        return jax.device_get(_solved(method, settings(config), (fields, subsets(size, config)), *windows))
+
+    parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
+
+
+# A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
+# Equinox passes the options to jax.jit, but does not declare them.
+@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+def _solved(method: Method, shared: Settings, lanes: Any, pool: Trajectories, validation: Trajectories) -> Fit:
+    def one(lane) -> Fit:
+        field, subset = lane
+        field, steps, status = method.solve(field, pool[subset], validation, shared)
+        val_mse = rollout_mse(field, validation, solver=shared.solver)
+        return Fit(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
+
+    return jax.lax.map(one, lanes)
+
+
+def subsets(size: int, config: Config) -> np.ndarray:
+    """The indices of the target trajectories of each seed (seeds, size)."""
+    return stack([sampled_indices(seed, config)[:size] for seed in range(config.seeds)])
+
+
+def tested(model: str, mode: str, fit: Fit, config: Config, stages: Stages, target: Dataset) -> Lanes:
     """The models with their L^T_MSE on the test flights."""
-    fields = found.fields if isinstance(found, Solved) else found.best
     windows, count = target.splits["test"], capacity(config)[0]
-    errors = stages.timed(f"test {mode} {model}", lambda: evaluate(fields, windows, EVERY, settings(config), count))
+    errors = stages.timed(f"test {mode} {model}", lambda: evaluate(fit.fields, windows, EVERY, settings(config), count))
     where = places((0,) if mode == SOURCE_ONLY else config.sizes, config)
-    if isinstance(found, Solved):
-        return solution(model, *where, found, errors)
-    return trained(model, mode, *where, found, errors)
+    return lanes_of(domain_name(target), model, mode, where, fit, errors)
 
 
 def flown(
     domain: Domain, splits: dict[str, SplitSpec], config: Config, stages: Stages, file: Path | None = None
 ) -> Dataset:
-    """The flights of a domain with the configured measurement noise: of a file, or from the cache or the simulator."""
+    """The flights of a domain with the configured measurement noise: of a file, or from the cache or the simulator.
 
-    def read() -> Dataset:
+    Process 0 reads or flies them; the others receive the same bits and need no file.
+    """
+
+    def read() -> tuple[Any, Arrays]:
         if file is not None:
-            return chosen_flights(file, domain, splits)
-        return flights(domain, splits, config.data_seed, config.cache)
-
-    found = stages.timed(f"flights {domain.name}", lambda: from_first(read))
-    return measured(found, config.noise, config.data_seed)
-
-
-def from_first(read: Callable[[], Dataset]) -> Dataset:
-    """The dataset that `read` returns on process 0; the others receive the same bits and need no file."""
-
-    def parts() -> tuple[Any, Arrays]:
-        found = read()
+            found = chosen_flights(file, domain, splits)
+        else:
+            found = flights(domain, splits, config.data_seed, config.cache)
         arrays = {f"{name}/{part}": getattr(found.splits[name], part) for name in found.splits for part in ARRAYS}
         steps = {name: windows.dt for name, windows in found.splits.items()}
         return [dict(found.metadata), steps, found.origin], arrays
 
-    (metadata, steps, origin), arrays = hosts.from_first(parts)
-    splits = {name: Trajectories(*(arrays[f"{name}/{part}"] for part in ARRAYS), dt=dt) for name, dt in steps.items()}
-    return Dataset(splits, metadata, origin)
+    (metadata, steps, origin), arrays = stages.timed(f"flights {domain.name}", lambda: hosts.from_first(read))
+    received = {n: Trajectories(*(arrays[f"{n}/{part}"] for part in ARRAYS), dt=dt) for n, dt in steps.items()}
+    return measured(Dataset(received, metadata, origin), config.noise, config.data_seed)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
@@ -143,7 +185,7 @@ def target_splits(config: Config) -> dict[str, SplitSpec]:
 
 def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
     """The splits of the target for adaptation."""
-    return {"train": SplitSpec(config.pooled(), 10), "validation": SplitSpec(config.validation, 10)}
+    return source_splits(config) | {"train": SplitSpec(config.pooled(), 10)}
 
 
 def capacity(config: Config) -> tuple[int, int]:
@@ -157,12 +199,19 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
-    before = pretraining(model, vehicle, config)
+    before = pretraining(model, fresh, config)
     after = adaptation(model, TARGET_ONLY, fresh, config)
     for (states, plans), windows in ((before, source), (after, target)):
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
+
+
+def placeholder(spec: SplitSpec) -> Trajectories:
+    """Windows at rest with the shapes of a split that is not yet simulated."""
+    x = np.zeros((spec.windows, spec.steps, STATE_SIZE), np.float32)
+    x[..., QUATERNION] = [1, 0, 0, 0]
+    return Trajectories(x[:, 0], np.zeros((*x.shape[:2], INPUT_SIZE), np.float32), x, dt=DT)
 
 
 def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:

@@ -1,7 +1,7 @@
 """The tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any
 
 from experiments.paper.claims import FEW
@@ -37,14 +37,6 @@ def rho_text(rows: Results) -> str:
 
 def by_size(rows: Results) -> list[Table]:
     """Test error and ρ in each domain: a line per N, a column per model and mode."""
-
-    def table(
-        rows: Results, title: str, columns: Mapping[str, Mapping[str, Any]], text: Callable[[Results], str]
-    ) -> Table:
-        groups = rows.sort(n_train=None).group("n_train")
-        lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": group for n, group in groups.items()}
-        return cross_table(title, lines, columns, text, "N, target trajectories")
-
     tables = []
     for place, group in _places(rows):
         trained, of = group.where(mode=(FINE_TUNED, TARGET_ONLY)), mean_over_seeds(group)
@@ -56,9 +48,13 @@ def by_size(rows: Results) -> list[Table]:
             for mode, seen in modes.items()
             if len((trained or group).where(model=model, mode=seen))
         }
-        error = f"Test error L^T_MSE{place} ({of}; less is better)"
-        rho = f"Improvement ρ over source-only{place} ({of}; 1 is perfect)"
-        tables += [table(group, error, columns, error_text), table(trained, rho, columns, rho_text)]
+        for own, title, text in (
+            (group, f"Test error L^T_MSE{place} ({of}; less is better)", error_text),
+            (trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
+        ):
+            sizes = own.sort(n_train=None).group("n_train")
+            lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": cell for n, cell in sizes.items()}
+            tables.append(cross_table(title, lines, columns, text, "N, target trajectories"))
     return tables
 
 
@@ -96,24 +92,22 @@ def _ratio(above: float, below: float, kind: str) -> str:
 
 def parameters(rows: Results, truth: Mapping[str, Any] | None) -> list[Table]:
     """θ_p of each cell that has it, mean ± std over seeds, and the truth (or that by domain): a table per domain."""
-    known = _places(rows.where(lambda row: row["theta"] is not None))
-    if truth is None or set(truth) == set(THETA):
-        return [_parameters(group, place, truth) for place, group in known]
-    return [_parameters(group, place, truth.get(group[0]["domain"])) for place, group in known]
-
-
-def _parameters(rows: Results, place: str, truth: Mapping[str, float] | None) -> Table:
-    groups = {(label(m), label(mode), str(n or EMPTY)): group for (m, mode, n), group in cells(rows).items()}
-    columns = {
-        f"{k} [{UNITS[k]}]": lambda group, k=k: _theta_text(group, k, None if truth is None else truth[k])
-        for k in THETA
-    }
-    given = any(row["theta_interval"] is not None for row in rows)
-    of = f" ({over_seeds(rows)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
-    table = tabulate(f"Recovered physical parameters θ_p{place}{of}", groups, columns, ("model", "mode", "N"))
-    if truth is None:
-        return table
-    return table._replace(lines=[*table.lines, ("truth", "", "", *(f"{truth[name]:.5g}" for name in THETA))])
+    tables = []
+    for place, group in _places(rows.where(lambda row: row["theta"] is not None)):
+        true = truth if truth is None or set(truth) == set(THETA) else truth.get(group[0]["domain"])
+        groups = {(label(m), label(mode), str(n or EMPTY)): cell for (m, mode, n), cell in cells(group).items()}
+        columns = {
+            f"{k} [{UNITS[k]}]": lambda cell, k=k, true=true: _theta_text(cell, k, None if true is None else true[k])
+            for k in THETA
+        }
+        given = any(row["theta_interval"] is not None for row in group)
+        of = (
+            f" ({over_seeds(group)}; 95 %: mean half-width of the seeds' intervals, how many are true)" if given else ""
+        )
+        table = tabulate(f"Recovered physical parameters θ_p{place}{of}", groups, columns, ("model", "mode", "N"))
+        known = [] if true is None else [("truth", "", "", *(f"{true[name]:.5g}" for name in THETA))]
+        tables.append(table._replace(lines=[*table.lines, *known]))
+    return tables
 
 
 def _theta_text(rows: Results, name: str, truth: float | None) -> str:
@@ -129,19 +123,15 @@ def _theta_text(rows: Results, name: str, truth: float | None) -> str:
     if not finite:
         return f"{text}, 95 % interval not finite"
     text += f", 95 % ± {spread([(high - low) / 2 for low, high in finite]).mean:.2g}"
-    if len(finite) < len(intervals):
-        text += f" in {len(finite)} of {len(intervals)} seeds"
-    if truth is None:
-        return text
-    return f"{text} ({sum(low <= truth <= high for low, high in finite)} of {len(intervals)} true)"
+    text += f" in {len(finite)} of {len(intervals)} seeds" if len(finite) < len(intervals) else ""
+    true = None if truth is None else sum(low <= truth <= high for low, high in finite)
+    return text if true is None else f"{text} ({true} of {len(intervals)} true)"
 
 
 def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> list[Table]:
     """A table for each choice, a line for each value, domain and N: errors and biases of θ_p, mean ± std over seeds.
 
-    Args:
-        rows: with the tags choice, value and default.
-        truth: the true θ_p by domain.
+    The rows have the tags choice, value and default; `truth` is the true θ_p by domain.
     """
 
     def bias(rows: Results) -> str:
@@ -174,7 +164,7 @@ def value_label(row: Row) -> str:
 
 def run_notes(rows: Results) -> list[str]:
     """A sentence on runs that reached the cap on epochs, one on those that diverged, one on errors not finite."""
-    diverged = rows.where(status="diverged")
+    diverged, several = rows.where(status="diverged"), len(rows.group("domain")) > 1
     epochs = ", ".join(map(str, sorted({*diverged["epochs"]})))
     when = f", in epoch {epochs}," if epochs else ""
     kinds = {
@@ -183,7 +173,6 @@ def run_notes(rows: Results) -> list[str]:
         "have a test error that is not finite; it counts as infinite (∞)": rows.where(test_mse=None),
     }
     notes = []
-    several = len(rows.group("domain")) > 1
     for words, found in kinds.items():
         counted = [
             f"{label(model, mode)}, N = {n}{f', {label(domain)}' if several else ''}: {len(cell)}"

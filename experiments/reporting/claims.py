@@ -1,6 +1,6 @@
 """Hypotheses about results as data: each is evaluated to holds, fails or inconclusive, with the numbers behind it."""
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
@@ -37,16 +37,23 @@ class Verdict:
     measured: str
 
 
+def all_of(parts: Iterable[tuple[bool, str]]) -> tuple[bool, str]:
+    """Whether all parts of a hypothesis hold, and their numbers."""
+    holds, measured = zip(*parts, strict=True)
+    return all(holds), "; ".join(measured)
+
+
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
     """The verdict on each claim."""
-    verdicts = []
-    for claim in claims:
+
+    def verdict(claim: Claim[Evidence]) -> Verdict:
         try:
             holds, measured = claim.predicate(evidence)
-            verdicts.append(Verdict(claim.id, claim.text, bool(holds), measured))
+            return Verdict(claim.id, claim.text, bool(holds), measured)
         except Inconclusive as why:
-            verdicts.append(Verdict(claim.id, claim.text, None, str(why)))
-    return verdicts
+            return Verdict(claim.id, claim.text, None, str(why))
+
+    return [verdict(claim) for claim in claims]
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
@@ -61,21 +68,3 @@ def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:
         "claims": [vars(each) for each in verdicts if each.holds is not None],
         "not_judged": [{"id": v.id, "text": v.text, "why": v.measured} for v in verdicts if v.holds is None],
     }
-
-
-def from_json(record: Mapping[str, Any]) -> list[Verdict]:
-    """Read the keys of `to_json`, in the order of the claims' numbers.
-
-    Raises:
-        ValueError: an entry is malformed; names it.
-    """
-    decided, undecided = ("id", "text", "holds", "measured"), ("id", "text", "why")
-    found = []
-    for key, names in (("claims", decided), ("not_judged", undecided)):
-        for index, item in enumerate(record.get(key, [])):
-            given = {"text": "", **item} if isinstance(item, dict) else {}  # old reports lack the text of a claim
-            wrong = [n for n in names if not isinstance(given.get(n), bool if n == "holds" else str)]
-            if wrong or len(given) > len(names):
-                raise ValueError(f"{key}[{index}] must hold {', '.join(names)}: true or false, else text")
-            found.append(Verdict(given["id"], given["text"], given.get("holds"), given[names[-1]]))
-    return sorted(found, key=lambda verdict: (len(verdict.id), verdict.id))

@@ -60,11 +60,7 @@ def colour(model: str) -> str:
 
 
 def save_figure(figure: Figure, path: str | Path) -> list[Path]:
-    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths.
-
-    Raises:
-        OSError: the folder cannot be written.
-    """
+    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths."""
     paths = []
     for suffix, metadata in (("png", {}), ("svg", {"Date": None})):
         content = io.BytesIO()
@@ -99,9 +95,9 @@ def legend_below(
 def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0) -> None:
     """Draw the lines, the first on top, and the error that no model can get below (`floor`), if it is not 0."""
     limits = _limits([line.errors for line in lines], floor)
-    axes.set(xscale="log", xlim=limits, ylim=(len(lines) - 0.4, -0.6), title=title)
+    axes.set(xscale="log", xlim=limits, title=title)
     axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
-    axes.set_yticks(range(len(lines)), [line.name for line in lines])
+    name_lines(axes, [line.name for line in lines])
     tick_errors(axes.xaxis, *limits)
     for y, line in enumerate(lines):
         mean = _draw_line(axes, y, line.errors, line.colour, limits)
@@ -119,6 +115,17 @@ def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
         "mean over seeds (broken: over the finite ones)" if failed else "mean over seeds": Line2D([], [], **bar),
     }
     return legend_below(figure, title, columns=2, entries=entries)
+
+
+def name_lines(axes: Axes, names: Sequence[str]) -> None:
+    """A line for each name, the first on top, at y = 0, 1, …"""
+    axes.set(ylim=(len(names) - 0.4, -0.6))
+    axes.set_yticks(range(len(names)), names)
+
+
+def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
+    """Small words beside a point, also outside the axes; the offset is in points."""
+    axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 7, **style})
 
 
 def tick_errors(axis: Axis, low: float, high: float) -> None:
@@ -158,15 +165,10 @@ def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[
     shown = f"{mean:.0f}" if 100 <= mean < 10_000 else f"{mean:.2g}"
     words = [f"{above} of {len(values)} beyond, mean {shown}"] if above else []
     words += [f"{failed} of {len(values)} not finite"] if failed else []
-    if words:
-        _mark_edge(axes, "x" if failed == len(values) else ">", (high, y), ";\n".join(words), tint)
-    if below:
-        _mark_edge(axes, "<", (low, y), f"{below} of {len(values)} below", tint)
+    marks = [("x" if failed == len(values) else ">", high, ";\n".join(words))] if words else []
+    marks += [("<", low, f"{below} of {len(values)} below")] if below else []
+    for marker, x, text in marks:
+        axes.plot(x, y, marker, color=tint, markersize=7, clip_on=False, zorder=5)
+        # Right of the marker: outside the panel at its right edge, where they hide no seed.
+        note(axes, text, (x, y), (8, 0), va="center", fontsize=8, color=tint)
     return mean
-
-
-def _mark_edge(axes: Axes, marker: str, at: tuple[float, float], words: str, tint: str) -> None:
-    """The words stand right of the marker: outside the panel at its right edge, where they hide no seed."""
-    axes.plot(*at, marker, color=tint, markersize=7, clip_on=False, zorder=5)
-    style = {"va": "center", "fontsize": 8, "color": tint, "annotation_clip": False}
-    axes.annotate(words, at, (8, 0), textcoords="offset points", **style)

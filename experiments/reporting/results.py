@@ -4,7 +4,7 @@ import csv
 import io
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, overload
 
@@ -15,23 +15,18 @@ from hybrid_jax.io.files import json_value
 
 Row = Mapping[str, Any]  # JSON values by column; a nested column, such as theta, is a mapping
 Column = str | Callable[[Row], float]
-_NOT_FINITE = "null"  # in CSV, where an empty cell means that the row has no such number
 
 
 @dataclass(frozen=True)
 class Results:
     """Rows of JSON values. A number that is not finite is stored as None, as in JSON.
 
-    Attributes:
-        rows: one mapping per run: column → value.
-        tags: columns that identify a row.
-
     Raises:
         ValueError: a row lacks a tag, two rows have the same tags, or a value has no JSON form.
     """
 
-    rows: Sequence[Row] = ()
-    tags: Sequence[str] = ()
+    rows: Sequence[Row] = ()  # one per run
+    tags: Sequence[str] = ()  # columns that identify a row
 
     def __post_init__(self):
         object.__setattr__(self, "rows", tuple(json_value(row) for row in self.rows))
@@ -39,8 +34,8 @@ class Results:
         for index, row in enumerate(self.rows):
             if not isinstance(row, dict) or not set(self.tags) <= row.keys():
                 raise ValueError(f"rows[{index}] must be an object with {', '.join(self.tags)}")
-        keys = Counter(tuple(row[tag] for tag in self.tags) for row in self.rows) if self.tags else {}
-        for key, times in keys.items():
+        keys = Counter(tuple(row[tag] for tag in self.tags) for row in self.rows if self.tags)
+        for key, times in keys.most_common(1):
             if times > 1:
                 shown = ", ".join(f"{tag} {value}" for tag, value in zip(self.tags, key, strict=True))
                 raise ValueError(f"rows must be different in {', '.join(self.tags)}; {times} rows have {shown}")
@@ -63,11 +58,7 @@ class Results:
         return Results((*self.rows, *other.rows), self.tags or other.tags)
 
     def where(self, keep: Callable[[Row], bool] | None = None, **tags: Any) -> "Results":
-        """The rows with these values; a tuple, list or set allows any of its values.
-
-        Args:
-            keep: a further condition on a row.
-        """
+        """The rows with these values, for which `keep` holds; a tuple, list or set allows any of its values."""
 
         def kept(row: Row) -> bool:
             same = (row.get(t) in v if isinstance(v, tuple | list | set) else row.get(t) == v for t, v in tags.items())
@@ -101,13 +92,16 @@ class Results:
         return Results(rows, (*tags, *(tag for tag in self.tags if tag not in tags)))
 
     def numbers(self, column: Column, missing: float = math.inf) -> np.ndarray:
-        """The numbers of a column, or of a function of a row.
+        """The numbers of a column or of a function of a row; what was not finite counts as `missing`.
 
-        Args:
-            column: a name, a dotted path into nested columns ("theta.Ix"), or a function.
-            missing: what a number that was not finite counts as.
+        A nested column has a dotted path: "theta.Ix".
         """
-        read = column if callable(column) else lambda row: _at(row, column)
+
+        def read(row: Any) -> Any:
+            for name in column.split(".") if isinstance(column, str) else ():
+                row = None if row is None else row.get(name)
+            return row if isinstance(column, str) else column(row)
+
         return np.array([missing if (value := read(row)) is None else value for row in self.rows], float)
 
     def spread(self, column: Column, missing: float = math.inf) -> Spread:
@@ -118,9 +112,6 @@ class Results:
         """The numbers of a column here, and of the rows with the same seeds in another table.
 
         A table of one row, such as that of a model that was not trained, is paired with every seed.
-
-        Raises:
-            ValueError: a seed that the other table lacks.
         """
         theirs = dict(zip(other["seed"], other.numbers(column), strict=True))
         if len(other) == 1:
@@ -131,18 +122,29 @@ class Results:
         return self.numbers(column), np.array([theirs[seed] for seed in self["seed"]])
 
     def to_csv(self) -> str:
-        """CSV. Nested columns become one column per entry: theta.Ix is `Ix`, an interval of it `Ix_low` and `Ix_high`.
+        """CSV. A nested column becomes one per entry: theta.Ix is `Ix`, and its theta_interval `Ix_low` and `Ix_high`.
 
         A number that is not finite is `null`; a cell is empty where a row has no such number.
         """
         nested = {name for row in self.rows for name, value in row.items() if isinstance(value, dict)}
-        ends = {name for name in nested for row in self.rows if any(map(_is_pair, (row.get(name) or {}).values()))}
-        flat = [_flat(row, ends) for row in self.rows]
-        names = list(dict.fromkeys(name for row in flat for name in row if name not in nested))
+        names: dict[str, Any] = {}
+        lines = []
+        for row in self.rows:
+            line: dict[str, Any] = {}
+            for name, value in row.items():
+                if (of := name.removesuffix("_interval")) not in nested:
+                    line[name] = value
+                elif of == name:
+                    line |= leaves(value or {}, " ")
+                else:  # columns for all entries, also of a row without intervals
+                    names |= line | _ends(dict.fromkeys(row[of] or {}))
+                    line |= _ends(value or {})
+            names |= line
+            lines.append({name: "null" if value is None else value for name, value in line.items()})
         text = io.StringIO()
-        writer = csv.writer(text, lineterminator="\n")
-        writer.writerow(names)
-        writer.writerows([_cell(row[name]) if name in row else "" for name in names] for row in flat)
+        writer = csv.DictWriter(text, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(lines)
         return text.getvalue()
 
     def _with(self, rows: Iterable[Row]) -> "Results":
@@ -162,30 +164,6 @@ def leaves(tree: Mapping[str, Any], between: str, prefix: str = "") -> Iterator[
             yield f"{prefix}{name}", value
 
 
-def _at(row: Row, path: str) -> Any:
-    value: Any = row
-    for name in path.split("."):
-        value = None if value is None else value.get(name)
-    return value
-
-
-def _flat(row: Row, intervals: Container[str]) -> dict[str, Any]:
-    """Column → value; nested columns by the names of their entries, those of intervals by the names of the ends."""
-    found: dict[str, Any] = {}
-    for column, value in row.items():
-        for name, each in leaves(value, " ") if isinstance(value, dict) else [(column, value)]:
-            if isinstance(value, dict) and column in intervals:
-                own = dict(zip((f"{name}_low", f"{name}_high"), each or (None, None), strict=True))
-            else:
-                own = {name: each}
-            # The first of one name stands: an interval that is None in every row must not hide its parameter.
-            found |= {key: cell for key, cell in own.items() if key not in found}
-    return found
-
-
-def _is_pair(value: Any) -> bool:
-    return isinstance(value, list) and len(value) == 2
-
-
-def _cell(value: Any) -> str:
-    return _NOT_FINITE if value is None else repr(value) if isinstance(value, float) else str(value)
+def _ends(intervals: Mapping[str, Any]) -> dict[str, Any]:
+    pairs = {name: pair or (None, None) for name, pair in intervals.items()}
+    return {f"{name}_{end}": pair[i] for name, pair in pairs.items() for i, end in enumerate(("low", "high"))}

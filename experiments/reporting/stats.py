@@ -8,6 +8,7 @@ import numpy as np
 from scipy.special import stdtrit
 from scipy.stats import ttest_rel
 
+Values = Sequence[float] | np.ndarray  # of each seed
 LEVEL = 0.95
 
 
@@ -30,7 +31,7 @@ class Interval(NamedTuple):
     high: float = math.nan
 
 
-def spread(values: Sequence[float] | np.ndarray) -> Spread:
+def spread(values: Values) -> Spread:
     """The spread of at least one value."""
     array = np.asarray(values, float)
     non_finite = int(np.sum(~np.isfinite(array)))
@@ -40,13 +41,10 @@ def spread(values: Sequence[float] | np.ndarray) -> Spread:
     return Spread(mean, std, median, float(np.min(array)), len(array), non_finite)
 
 
-def mean_difference(first: Sequence[float], second: Sequence[float], level: float = LEVEL) -> Interval:
+def mean_difference(first: Values, second: Values, level: float = LEVEL) -> Interval:
     """The mean of first − second over the seeds where both are finite, with Student's t interval of the paired test.
 
     What the seeds of a pair share, such as the model from which both started, cancels.
-
-    Raises:
-        ValueError: different numbers of seeds.
     """
     one, other = _finite(first, second)
     value = float(np.mean(one - other)) if len(one) else math.nan
@@ -58,17 +56,12 @@ def mean_difference(first: Sequence[float], second: Sequence[float], level: floa
     return Interval(value, float(low), float(high))
 
 
-def share_of_gap(
-    before: Sequence[float], after: Sequence[float], reachable: Sequence[float], level: float = LEVEL
-) -> Interval:
+def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Interval:
     """(before − after) / (before − reachable), of the means over the seeds where all three are finite.
 
     1 closes the gap between before and what is reachable, 0 none of it. The interval is Fieller's ("Some problems in
     interval estimation", 1954): all shares s for which a paired t test does not reject (before − after) =
     s (before − reachable). It has no ends if the gap is not significant, and no value if there is no gap.
-
-    Raises:
-        ValueError: different numbers of seeds.
     """
     start, end, best = _finite(before, after, reachable)
     closed, gap = start - end, start - best
@@ -88,7 +81,7 @@ def share_of_gap(
     return Interval(value, float((b - half) / a), float((b + half) / a))
 
 
-def _finite(*samples: Sequence[float]) -> list[np.ndarray]:
+def _finite(*samples: Values) -> list[np.ndarray]:
     """The samples at the seeds where all are finite."""
     arrays = [np.asarray(sample, float) for sample in samples]
     if len({array.shape for array in arrays}) > 1:

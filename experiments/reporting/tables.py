@@ -30,8 +30,7 @@ def tabulate(
 ) -> Table:
     """A line per group of rows, by its label or tuple of labels; a column per function of a group, by its title.
 
-    Args:
-        header: titles of the labels' columns.
+    `header` has the titles of the labels' columns.
     """
     lines = [
         (*(label if isinstance(label, tuple) else (label,)), *(text(rows) for text in columns.values()))
@@ -57,12 +56,9 @@ def cross_table(
 
 
 def spread_text(values: Spread, form: str = ".3g", std_form: str = "", what: str = "not finite") -> str:
-    """Mean ± standard deviation; with values that are not finite, their number and the median of all.
+    """Mean ± standard deviation; with values that are not finite, their number, `what` they are, and the median of all.
 
-    Args:
-        form: format of mean and median.
-        std_form: format of the standard deviation, by default that of the mean.
-        what: what happened to seeds that are not finite.
+    The standard deviation has by default the format of the mean.
     """
     if values.non_finite:
         mean, median = _number(values.mean, form), _number(values.median, form)

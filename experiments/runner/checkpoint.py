@@ -1,14 +1,15 @@
-"""Checkpoints of an unfinished sweep: numbered archives, written atomically and verified when they are read."""
+"""Checkpoints of an unfinished sweep: numbered archives, saved between blocks of epochs, until which signals wait."""
 
+import signal
 import time
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
 from experiments.runner.environment import PACKAGES
-from experiments.runner.signals import DeferredSignals
 from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path
@@ -27,13 +28,9 @@ class Checkpoints:
         self._folder = folder
 
     def save(self, about: Any, arrays: Arrays) -> None:
-        """Write the next checkpoint, then delete all but the last two.
+        """Write the next checkpoint (`about`: JSON values), then delete all but the last two.
 
-        Args:
-            about: JSON values.
-
-        Raises:
-            OSError: it cannot be written, for example because the disk is full; earlier checkpoints are intact.
+        Raises OSError if it cannot be written, as on a full disk; earlier checkpoints are intact.
         """
         paths = self._paths()
         number = 1 + max((int(path.stem) for path in paths), default=0)
@@ -42,10 +39,9 @@ class Checkpoints:
             path.unlink()
 
     def load(self, say: Callable[[str], None]) -> tuple[Any, dict[str, np.ndarray]] | None:
-        """`about` and the arrays of the newest intact checkpoint; None if there is none.
+        """`about` and the arrays of the newest intact checkpoint, if there is one.
 
-        Args:
-            say: receives one line for each damaged checkpoint; the file is renamed, not deleted.
+        A damaged one is renamed, not deleted, with a line to `say`.
         """
         for path in reversed(self._paths()):
             try:
@@ -67,6 +63,41 @@ class Checkpoints:
     def _paths(self) -> list[Path]:
         """From the oldest to the newest."""
         return sorted(path for path in self._folder.glob("*.npz") if path.stem.isdecimal())
+
+
+class DeferredSignals(AbstractContextManager):
+    """Defer the first SIGINT or SIGTERM until `raise_pending` or the end of the context; a second one acts at once.
+
+    Only signals with a Python handler are deferred, and only in the main thread.
+    """
+
+    def __init__(self):
+        self.pending: int | None = None  # the signal that has arrived
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            if callable(handler := signal.getsignal(number)):
+                self._before[number] = handler
+                signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, kind, error, trace) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+        if kind is None:
+            self.raise_pending()
+
+    def raise_pending(self) -> None:
+        """Call the original handler of a signal that has arrived; the handler raises."""
+        number, self.pending = self.pending, None
+        if number is not None:
+            self._before[number](number, None)
+
+    def _note(self, number: int, frame) -> None:
+        again, self.pending = self.pending is not None, number
+        if again:
+            self.raise_pending()
 
 
 class Autosave:
@@ -91,7 +122,8 @@ class Autosave:
     def after_block(self, states: FitState) -> None:
         """Save the states if it is time to, then let a pending signal act."""
         self._unsaved = states
-        if self._signals.pending or self.saving + self._cost < self._share * (self.seconds() - self._spent):
+        due = self.saving + self._cost < self._share * (self.seconds() - self._spent)
+        if due or self._signals.pending is not None:
             self.save_last_block()
         self._signals.raise_pending()
 

@@ -7,7 +7,6 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
@@ -40,8 +39,7 @@ def run(
     Args:
         name: of the module in `experiments`, and of the subfolder of --out.
         about: first paragraph of --help.
-        arguments: of the command line; by default the process's own.
-        presets: the choices of --preset by name, all of the class that `experiment` takes; "paper" is the default.
+        presets: the choices of --preset by name, all of the class that `experiment` takes.
     """
     given = sys.argv[1:] if arguments is None else arguments
     fresh = " without --fresh" if "--fresh" in given else ""
@@ -56,7 +54,12 @@ def run(
         console, folder = Console(stderr=True, quiet=not main), config.out / name
         with contextlib.ExitStack() as stack:
             if main:
-                stack.enter_context(locked(folder))
+                folder.mkdir(parents=True, exist_ok=True)
+                try:
+                    stack.enter_context(FileLock(folder / ".lock", timeout=0))  # released with the process
+                except Timeout:
+                    wait = "wait for it, or choose another folder"
+                    raise ValueError(f"--out: another run is writing to {folder}; {wait}") from None
                 say = partial(console.print, highlight=False, soft_wrap=True)
                 stack.enter_context(recorded(folder, config, say))
             experiment(config, console)
@@ -65,21 +68,13 @@ def run(
 def call(
     name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
 ) -> None:
-    """Read the command line of a command without presets and run it. Errors as in `run`.
-
-    Args:
-        kind: a dataclass of the options; its docstring is the description.
-    """
+    """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     with _exit_codes(name, "interrupted, nothing was written"):
         command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
 
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
-    """The configuration given by a command line: a preset, changed by the other options.
-
-    Raises:
-        ValueError: an unknown preset, or options that do not fit together.
-    """
+    """The configuration given by a command line: a preset, changed by the other options."""
     arguments = [_renamed(argument) for argument in arguments]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", nargs="?", default=Run.preset, const="")
@@ -98,25 +93,8 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
         raise ValueError(f"{_message(output.getvalue())}; see --help") from None
 
 
-def locked(folder: Path) -> AbstractContextManager:
-    """Hold the lock of an output folder, which is created. It is released with the process, however that ends.
-
-    Raises:
-        ValueError: another run holds it.
-    """
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        return FileLock(folder / ".lock", timeout=0).acquire()
-    except Timeout:
-        raise ValueError(f"--out: another run is writing to {folder}; wait for it, or choose another folder") from None
-
-
 def check_folder(option: str, folder: Path) -> None:
-    """Create a folder and check that it can be written, before work begins.
-
-    Raises:
-        ValueError: it cannot be created or written.
-    """
+    """Create a folder and check that it can be written, before work begins."""
     probe = folder / f".writable.{os.getpid()}"
     try:
         folder.mkdir(parents=True, exist_ok=True)

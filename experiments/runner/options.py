@@ -61,11 +61,7 @@ class Run:
 
 
 def check_numbers(prefix: str, options: Any) -> None:
-    """Check every number of a dataclass whose type has a rule, such as `Count`, `tuple[Positive, ...]`, `Count | None`.
-
-    Raises:
-        ValueError: the first number that its rule refuses, by its name on the command line, which begins with `prefix`.
-    """
+    """Check every number of a dataclass whose type has a rule, such as `Count` or `tuple[Positive, ...] | None`."""
     for name, hint in get_type_hints(type(options), include_extras=True).items():
         option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
         if is_dataclass(value):

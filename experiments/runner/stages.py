@@ -8,12 +8,11 @@ from typing import Any, TypeVar
 
 from rich.console import Console
 
-from experiments.runner.checkpoint import Autosave, Checkpoints
+from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
 from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
 from experiments.runner.run_record import require_same
-from experiments.runner.signals import DeferredSignals
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
 from hybrid_jax.io.files import backup_path
@@ -31,11 +30,9 @@ Result = TypeVar("Result")
 
 
 class Stages:
-    """The stages of an experiment: cached training sweeps, and the time that each stage took.
+    """The stages of an experiment: training sweeps cached in a folder, and the time that each stage took.
 
     Args:
-        folder: of the cache.
-        console: shows progress.
         saving: largest share of a sweep's time spent on checkpoints.
         fresh: move unfinished sweeps, and finished ones of other versions, to a backup and run them anew.
     """
@@ -132,12 +129,9 @@ class Stages:
 
     def notes(self) -> list[str]:
         """Remarks on the times in `seconds`."""
-        notes = []
-        if self.reused:
-            notes.append(f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}.")
-        if self._ran:
-            notes.append(f"Saving checkpoints took {self._saving / self._ran:.2%} of the sweeps' time.")
-        return notes
+        reused = f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}."
+        saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
+        return [reused] * bool(self.reused) + [saved] * bool(self._ran)
 
     def _back_up(self, finished: Path, begun: Path) -> None:
         stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
@@ -155,8 +149,8 @@ def stages_of(config: Run, console: Console) -> Stages:
 
 def summary(states: FitState) -> str:
     """One line about a finished sweep."""
-    first, last = states.epoch.min(), states.epoch.max()
-    return f"{len(states.epoch)} runs, {first} to {last} epochs, best validation loss {states.best_mse.min():.3g}"
+    epochs, best = states.epoch, states.best_mse.min()
+    return f"{len(epochs)} runs, {epochs.min()} to {epochs.max()} epochs, best validation loss {best:.3g}"
 
 
 def _stem(name: str) -> str:

@@ -12,9 +12,9 @@ from rich.console import Console
 from smoke import experiments
 
 from experiments.ablation import PRESETS, Choice, experiment, varied
+from experiments.paper.conditions import Noise, measured
 from experiments.paper.figures import ablation
 from experiments.paper.lanes import TAGS
-from experiments.paper.sensors import Noise, measured
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.results import Results
 from hybrid_jax.io.datasets import Dataset

@@ -5,7 +5,7 @@ from reports import TRUTH, changed, make_rows, verdicts
 
 from experiments.paper.claims import claims
 from experiments.paper.lanes import DOMAINS
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate, from_json, to_json
+from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate, to_json
 
 
 def test_claims_hold_for_rows_like_the_papers():
@@ -60,11 +60,11 @@ def test_claims_are_inconclusive_without_the_rows_they_need():
     assert set(verdicts(make_rows().where(model=())).values()) == {None}
 
 
-def test_verdicts_round_trip_through_json():
+def test_json_separates_what_is_inconclusive():
     def undecided(_):
         raise Inconclusive("no rows")
 
     found = evaluate([Claim("C2", "less", lambda x: (x < 1, f"{x}")), Claim("C10", "?", undecided)], 0.5)
     assert found == [Verdict("C2", "less", True, "0.5"), Verdict("C10", "?", None, "no rows")]
-    assert from_json(to_json(found)) == found
+    assert to_json(found)["claims"] == [{"id": "C2", "text": "less", "holds": True, "measured": "0.5"}]
     assert to_json(found)["not_judged"] == [{"id": "C10", "text": "?", "why": "no rows"}]

@@ -16,10 +16,9 @@ from rich.console import Console
 from smoke import command, experiments, refused, smallest, unbegun
 
 import hybrid_jax as hj
-from experiments.closed_loop.flown import flown
+from experiments.closed_loop.flights import PATHS, Scenario, flown
 from experiments.closed_loop.models import as_stack, fused, with_statistics_of
-from experiments.closed_loop.rows import TAGS, Agent
-from experiments.closed_loop.scenarios import PATHS, Scenario
+from experiments.closed_loop.results import TAGS, Agent
 from experiments.closed_loop.timing import use_one_core
 from experiments.closed_loop.true_model import true_field
 from experiments.reporting.results import Results

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from experiments.make_flights import chosen_flights
-from experiments.runner.precompile import placeholder
+from experiments.paper.study import placeholder
 from hybrid_jax.io.datasets import Dataset, save_dataset
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.record import SplitSpec

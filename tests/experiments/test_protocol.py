@@ -10,8 +10,7 @@ import pytest
 
 from experiments.paper.conditions import adaptation, fresh_fields, pretraining, settings
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
-from experiments.paper.study import pretrained
-from experiments.runner.precompile import placeholder
+from experiments.paper.study import placeholder, pretrained
 from experiments.runner.stages import _identity
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
@@ -73,7 +72,7 @@ def test_other_input_scaling_is_another_pretraining():
     windows = placeholder(SplitSpec(2, 10))
     data = Dataset({"train": windows, "validation": windows}, {})
     identities = {
-        _identity(*pretraining("no_physics", IRIS, config), settings(config), data)
+        _identity(*pretraining("no_physics", fresh_fields("no_physics", IRIS, config), config), settings(config), data)
         for config in (SMOKE, replace(SMOKE), replace(SMOKE, inputs="raw"))
     }
     assert len(identities) == 2
@@ -83,7 +82,7 @@ def test_other_input_scaling_is_another_pretraining():
     ("model", "minimum", "patience"), [("hybrid", 100, 20), ("no_physics", 300, 50), ("physics_only", 100, 20)]
 )
 def test_pretraining_lanes_use_all_source_flights(model, minimum, patience):
-    _, plans = pretraining(model, IRIS, SMALL)
+    _, plans = pretraining(model, fresh_fields(model, IRIS, SMALL), SMALL)
     for seed in range(SMALL.seeds):
         plan = lane(plans, seed)
         assert numbers(plan) == (10_000, minimum, patience, 2000)
@@ -103,7 +102,7 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
 
     found = pretrained("hybrid", IRIS, config, Trained(), None)
     fields, rates = zip(*begun, strict=True)
-    for field, before in zip((*fields[1:], found.best), fields, strict=True):
+    for field, before in zip((*fields[1:], found.fields), fields, strict=True):
         assert eqx.tree_equal(field, jax.tree.map(lambda leaf: leaf + 1, before))
     for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
         np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)

@@ -1,4 +1,4 @@
-"""Reports: the contract of report.json, what a page and a terminal show, and malformed files."""
+"""Reports: the contract of report.json, and what a page and a terminal show."""
 
 import io
 import json
@@ -14,7 +14,7 @@ from rich.console import Console
 from experiments.paper.claims import DOMAINS_OF
 from experiments.paper.lanes import THETA
 from experiments.paper.tables import parameters, run_notes
-from experiments.reporting.report import load_report, write_report
+from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import spread_text
 from experiments.runner.environment import PACKAGES
@@ -36,16 +36,6 @@ def test_report_json_keeps_the_contract(tmp_path):
     assert all(claim["why"] for claim in record["not_judged"])
     assert (record["format"], record["odd"], record["wind_sine_mse"]) == (2, [1.0, None], 1e-3)
     assert record["truth_theta"] == TRUTH
-
-
-def test_report_round_trip_and_format_1(tmp_path):
-    report = make_report(make_rows(), figures={"scores.png": "Scores"}, notes=["A note."], extra={"more": [1, 2]})
-    write_report(tmp_path, report)
-    assert load_report(tmp_path) == report == load_report(tmp_path / "report.json")
-    record = json.loads((tmp_path / "report.json").read_text())
-    del record["format"], record["tags"]
-    (tmp_path / "report.json").write_text(json.dumps(record))
-    assert load_report(tmp_path).rows.rows == report.rows.rows
 
 
 def test_parameters_have_spread_and_interval_width():
@@ -115,44 +105,6 @@ def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):
     assert not (tmp_path / "new").exists()
 
 
-@pytest.mark.parametrize("content", [None, '{"experiment": "a', "[" * 200_000, "[]"])
-def test_missing_and_truncated_files_are_refused_in_one_line(tmp_path, content):
-    path = tmp_path / "none.json"
-    if content is not None:
-        path.write_text(content)
-    with pytest.raises(ValueError, match=r"none\.json: (cannot be read|truncated|not a report).*$") as caught:
-        load_report(path)
-    assert "\n" not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    ("old", "new", "words"),
-    [
-        ('"rows"', '"raws"', "not a report: rows is missing"),
-        ('"format": 2', '"format": 3', "not a report: format 3 is newer"),
-        ('"holds": true', '"holds": "yes"', r"claims\[0\] must hold id, text, holds"),
-        ('"k": 8.5e-06', '"k": NaN', "truncated or not JSON: NaN"),
-        ('"seed": 0', '"seed": 1', "rows must be different"),
-        ('"seed": 0', '"sead": 0', r"rows\[0\] must be an object with"),
-        ('"epochs": 150', '"epochs": -1', r"rows\[0\]: epochs must be an integer of at least 0 or null, got -1"),
-        ('"epochs": 150', '"epochs": true', r"rows\[0\]: epochs must be an integer"),
-        ('"mode": "source_only"', '"mode": "tuned"', r"rows\[0\]: mode must be one of fine_tuned, "),
-        ('"domain": "parameter_shift"', '"domain": "moon"', r"rows\[0\]: domain must be one of source, "),
-        ('"status": "ok"', '"status": 1', r"rows\[0\]: status must be one of running, "),
-        ('"val_mse": 0.', '"val_mse": -0.', r"rows\[0\]: val_mse must be a number of at least 0"),
-        ('"theta_interval": null', '"theta_interval": [1, 2]', r"rows\[0\]: theta_interval must be an object"),
-        ('"k": 8.5e-06', '"k": "8.5e-06"', r"rows\[1\]: theta.k must be "),
-    ],
-)
-def test_damaged_files_are_refused_by_file_row_and_field(tmp_path, old, new, words):
-    write_report(tmp_path, make_report(make_rows()))
-    path = tmp_path / "report.json"
-    path.write_text(path.read_text().replace(old, new, 1))
-    with pytest.raises(ValueError, match=rf"report\.json: .*{words}") as caught:
-        load_report(path)
-    assert "\n" not in str(caught.value)
-
-
 @pytest.mark.parametrize(
     ("values", "text"),
     [([0.1, 0.3], "2.00e-01 ± 1.4e-01"), ([0.1], "1.00e-01"),
@@ -167,8 +119,9 @@ def test_spread_text(values, text):
 
 @settings(max_examples=40, deadline=None)
 @given(ODD_ROWS, st.sampled_from(sorted(DOMAINS_OF)))
-def test_any_rows_make_a_report_that_reads_back(tmp_path_factory, rows, experiment):
+def test_any_rows_make_a_report_that_holds_them(tmp_path_factory, rows, experiment):
     out = tmp_path_factory.mktemp("report")
     write_report(out, make_report(rows, experiment))
-    assert load_report(out).rows == rows
+    record = json.loads((out / "report.json").read_text())
+    assert Results(record["rows"], record["tags"]) == rows
     assert len((out / "rows.csv").read_text().splitlines()) == 1 + len(rows)
