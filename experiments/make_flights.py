@@ -7,6 +7,7 @@ from typing import Literal
 
 from rich.console import Console
 
+from experiments.render import picture
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from experiments.runner.progress import Line
@@ -14,7 +15,6 @@ from hybrid_jax.io.archive import digest
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
 from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
-from hybrid_jax.sim.render import picture
 
 
 @dataclass(frozen=True)

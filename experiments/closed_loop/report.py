@@ -18,6 +18,7 @@ from experiments.closed_loop.rows import DOMAINS, ORACLE, SOURCES, Agent
 from experiments.closed_loop.runner import DRAW_EVERY
 from experiments.closed_loop.scenarios import PATHS
 from experiments.closed_loop.tables import ablation_tables, gap_tables, speed_table, tables
+from experiments.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
@@ -26,7 +27,6 @@ from experiments.runner.environment import environment
 from experiments.runner.stages import Stages
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
-from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from hybrid_jax.state import POSITION
 from hybrid_jax.vehicle import IRIS
 

@@ -9,8 +9,7 @@ from experiments.real_flight.config import Cleaning, RealFlightConfig
 from hybrid_jax.flights import windows
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.consistency import FAILS, check_log
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import gaps, repeats, segments
+from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.splits import flight_of
 from hybrid_jax.io.archive import digest
 from hybrid_jax.vehicle import Vehicle

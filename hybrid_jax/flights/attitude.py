@@ -28,7 +28,7 @@ class Frames:
 
     def __post_init__(self):
         for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", VELOCITY_FRAMES)):
-            if getattr(self, name) not in known:
+            if getattr(self, name) not in tuple(known):
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
 

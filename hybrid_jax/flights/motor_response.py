@@ -1,14 +1,12 @@
 """Estimate from angular acceleration the order of the motors, their direction of spin and their lag."""
 
-from dataclasses import dataclass
 from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.signal import lfilter
 
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import segments, sound_intervals
+from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES
 from hybrid_jax.vehicle import Vehicle
 
@@ -20,15 +18,14 @@ YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
 ORDERS = np.array(list(permutations(range(4))))
 
 
-@dataclass(frozen=True)
-class Response:
+class Response(NamedTuple):
     """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
 
-    order: tuple[int, int, int, int]  # u[:, order] is in the order of the vehicle's rotors
+    order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
     yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
     lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
-    correlations: tuple[float, float, float]  # of roll and pitch at that order and lag, of yaw at its best lag near it
-    as_is: tuple[float, float, float]  # of roll, pitch and yaw for the motors in their present order, at that lag
+    correlations: list[float]  # of roll and pitch at that order and lag, of yaw at its best lag near it
+    as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
 
 
 def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
@@ -48,10 +45,9 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     around = table[max(0, at - near) : at + near + 1, best, 2]
     yaw = around[np.abs(around).argmax()]
     sign = -1 if yaw < 0 else 1
-    found = np.array([*table[at, best, :2], abs(yaw)])
+    found = [*table[at, best, :2].tolist(), float(abs(yaw))]
     lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
-    order = tuple(int(i) for i in ORDERS[best])
-    return Response(order, sign, float(lag), tuple(found.tolist()), tuple(table[at, 0].tolist()))  # type: ignore
+    return Response(tuple(ORDERS[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
 
 
 def correlations(
@@ -63,22 +59,6 @@ def correlations(
     shared = np.einsum("aj,aoj->oa", mix, cross[:, ORDERS])
     variance = np.einsum("ai,oij,aj->oa", mix, spread[ORDERS[:, :, None], ORDERS[:, None, :]], mix)
     return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
-
-
-def lagged(log: FlightLog, time_constant: float) -> Float[np.ndarray, "n 4"]:
-    """Mean rotor speed over each interval for τ ẇ = u − w; each segment starts in equilibrium.
-
-    Samples must be evenly spaced within a segment.
-    """
-    if time_constant == 0:
-        return log.u
-    step = log.dt / time_constant
-    kept, u = np.exp(-step), log.u.copy()
-    for part in segments(log):
-        held = log.u[part]
-        speed, _ = lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
-        u[part] = held + (speed - held) * (1 - kept) / step
-    return u
 
 
 def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:

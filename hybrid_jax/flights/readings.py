@@ -7,9 +7,8 @@ from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
-from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.flights.motor_response import moving_mean
-from hybrid_jax.flights.segments import sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 NOTHING = "nothing to correct"  # the reading of the unchanged log

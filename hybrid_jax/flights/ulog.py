@@ -13,7 +13,7 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, interpolate, interpolate_attitude, mean_of_held, to_library
 from hybrid_jax.flights.flight_csv import MAX_ROWS
-from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
+from hybrid_jax.flights.log import FlightLog, wrong_norms
 
 FRAMES = Frames(world="NED", body="FRD", velocity="world")
 STATES = {
@@ -52,7 +52,7 @@ def read_ulog(
     data = _load(path)
     (tp, local), (tq, q), (tw, omega) = (_samples(data, path, topic, fields) for topic, fields in STATES.items())
     tu, u = _motors(data, path, motor_order, polynomial)
-    if np.abs(np.linalg.norm(q, axis=1) - 1).max() > NORM_TOLERANCE:
+    if wrong_norms(q):
         advice = "cut the log where there is no attitude"
         raise ValueError(f"{path}: topic vehicle_attitude, field q: norm is not 1; {advice}")
     times = (tp, tq, tw, tu)

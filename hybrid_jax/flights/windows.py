@@ -13,8 +13,7 @@ from hybrid_jax.flights.cleaning import lag_motors, resample
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, segments, unevenness
+from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
 from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of

@@ -27,25 +27,7 @@ def build_model(vehicle: Vehicle) -> mujoco.MjModel:
         actuator = spec.actuator(f"rotor{i}")
         actuator.gainprm[0] = vehicle.thrust_coefficient
         actuator.gear = [0, 0, 1, 0, 0, vehicle.spin[i] * reaction]
-        _draw_arm(body, x, y, vehicle.rotor_radius)
     return spec.compile()
-
-
-def _draw_arm(body: mujoco.MjsBody, x: float, y: float, radius: float) -> None:
-    """Draw an arm, a motor, a propeller and its disc, without mass or collisions."""
-    kind = mujoco.mjtGeom
-    disc = "front" if x > 0 else "rear"
-    root = [0.35 * x, 0.22 * y, -0.008]
-    parts = (
-        (kind.mjGEOM_CAPSULE, "carbon", [0.0095, 0, 0], {"fromto": [*root, x, y, -0.004]}),
-        (kind.mjGEOM_CAPSULE, "carbon", [0.0048, 0, 0], {"fromto": [*root, 0.75 * x, 0.75 * y, -0.1]}),
-        (kind.mjGEOM_CYLINDER, "metal", [0.0155, 0.013, 0], {"pos": [x, y, 0.006]}),
-        (kind.mjGEOM_ELLIPSOID, "carbon", [0.97 * radius, 0.0095, 0.0022], {"pos": [x, y, 0.022]}),
-        (kind.mjGEOM_CYLINDER, disc, [radius, 0.0008, 0], {"pos": [x, y, 0.022]}),
-        (kind.mjGEOM_CAPSULE, disc + "_cap", [0.005, 0.006, 0], {"pos": [x, y, 0.024]}),
-    )
-    for shape, material, size, place in parts:
-        body.add_geom(type=shape, material=material, size=size, contype=0, conaffinity=0, mass=0, **place)
 
 
 def traced_model(p: Parameters) -> mjx.Model:

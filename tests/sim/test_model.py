@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from experiments.render import picture
 from hybrid_jax.sim import check_versions
 from hybrid_jax.sim.forces import parameters_of
 from hybrid_jax.sim.model import build_model, traced_model
-from hybrid_jax.sim.render import picture
 from hybrid_jax.vehicle import IRIS
 
 OTHER = replace(
