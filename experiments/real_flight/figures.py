@@ -18,8 +18,9 @@ from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
 from experiments.reporting.plots import COLOURS, STYLE, legend_below
 from experiments.reporting.results import Results
+from hybrid_jax.flights.log import segments
 from hybrid_jax.flights.splits import flight_of
-from hybrid_jax.flights.windows import cut_windows, longest_segment
+from hybrid_jax.flights.windows import cut_windows, require_length
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
@@ -107,7 +108,9 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
 def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Figure:
     """Velocity and body rates of a part of one test flight, and predictions that restart from it at intervals."""
     config, dt = experiment.config, experiment.dt
-    log, begin, windows = longest_segment(outputs.folds[0].test, config.longest)
+    log = require_length(outputs.folds[0].test, config.longest)[0]
+    part = max(segments(log), key=lambda part: part.stop - part.start)
+    begin, windows = log.t[part.start] - log.t[0], cut_windows([log[part]], config.longest, config.longest).windows
     windows = windows[:PIECES]
     fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
     fields["thrust", "nominal"] = thrust_baseline(experiment.after)

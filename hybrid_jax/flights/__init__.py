@@ -5,18 +5,10 @@
     vehicle = hj.load_vehicle("vehicle.toml")
     windows = hj.load_windows("flights/", vehicle, steps=10)  # one CSV or ULog file per flight
 
-`load_windows` joins steps that can be taken one by one. Split by flight before cutting, since windows of one flight
-share samples, wind and battery:
-
-    from hybrid_jax.flights import cut_windows, hold_out, load_logs
+Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
 
     train, test = hold_out(load_logs("flights/"), ["flight_07"])
     windows = cut_windows(train, steps=10).windows
-
-- log, flight_csv, column_map, ulog: reading; attitude: frames.
-- consistency, readings, motor_response: checks of a log against itself and the vehicle.
-- segments, cleaning: gaps, resampling, filtering, delays of the motors.
-- splits, windows, scores: flights for training and test, windows, prediction errors.
 """
 
 from hybrid_jax.flights.cleaning import (

@@ -13,8 +13,8 @@ from jaxtyping import Float
 from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.log import COLUMNS, FlightLog, at_rest, gaps, repeats, sound_intervals
-from hybrid_jax.flights.motor_response import respond
-from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, smoother
+from hybrid_jax.flights.motor_response import moving_mean, respond
+from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -29,6 +29,7 @@ LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
 KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
+SPAN = 0.05  # s of moving average on both sides of an equation
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
@@ -156,8 +157,10 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
 
 def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
     """Compare two records under every reading; kinematics hold for each axis, v̇ is moved by wind and drag as well."""
-    smooth, limit = smoother(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
-    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in pairs.items()}
+    sound, limit = sound_intervals(log)[:, None].astype(float), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
+    width = min(max(1, round(SPAN / log.dt)), len(sound))
+    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
+    pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)

@@ -24,7 +24,7 @@ class Response(NamedTuple):
     order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
     yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
     lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
-    correlations: list[float]  # of roll and pitch at that order and lag, of yaw at its best lag near it
+    correlations: list[float]  # of roll and pitch at that order and lag, of yaw (its size) at its best lag near it
     as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
 
 

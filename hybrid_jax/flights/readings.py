@@ -1,18 +1,14 @@
 """Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake."""
 
-from collections.abc import Callable
-
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
 from hybrid_jax.flights.log import FlightLog, sound_intervals
-from hybrid_jax.flights.motor_response import moving_mean
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 NOTHING = "nothing to correct"  # the reading of the unchanged log
-SPAN = 0.05  # s of moving average on both sides of an equation
 LATE = 0.1  # delay or advance of a velocity that is tried [s]
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
@@ -25,7 +21,8 @@ Readings = dict[str, tuple[Vectors, Vectors]]
 def velocities(log: FlightLog) -> Readings:
     """dp/dt and v [m/s]."""
     p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
-    slope, late, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], round(LATE / log.dt), BODIES["FRD"]
+    slope, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], BODIES["FRD"]
+    now, late = np.arange(len(v)), round(LATE / log.dt)
     stated = {
         NOTHING: v,
         'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
@@ -36,8 +33,8 @@ def velocities(log: FlightLog) -> Readings:
         "velocity is in cm/s: set its unit": v * 1e-2,
         "position is in mm: set its unit": v * 1e3,
         "position is in cm: set its unit": v * 1e2,
-        f"velocity is about {LATE:g} s late: shift it": _shifted(v, late),
-        f"velocity is about {LATE:g} s early: shift it": _shifted(v, -late),
+        f"velocity is about {LATE:g} s late: shift it": v[np.minimum(now + late, now[-1])],
+        f"velocity is about {LATE:g} s early: shift it": v[np.maximum(now - late, 0)],
     }
     for axis, signs in FLIPS.items():
         stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
@@ -68,17 +65,15 @@ def accelerations(log: FlightLog) -> Readings:
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
 
-    def turned(world) -> Float[np.ndarray, "n 4"]:
-        return quaternion_of(Rotation.from_matrix(world @ attitude.as_matrix() @ BODIES["FRD"].T))
-
-    ned = turned(WORLDS["NED"])
+    frd = attitude.as_matrix() @ BODIES["FRD"].T
+    ned = quaternion_of(Rotation.from_matrix(WORLDS["NED"] @ frd))
     stated = {
         NOTHING: (q, v),
         'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
         "attitude alone is NED and FRD: convert it": (ned, v),
         'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
-        'the body is FRD in a world with z up: set body = "FRD"': (turned(np.eye(3)), v),
+        'the body is FRD in a world with z up: set body = "FRD"': (quaternion_of(Rotation.from_matrix(frd)), v),
         'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
     }
     # Other readings of attitudes rotate thrust about z only, which wind or a load may do as well.
@@ -96,10 +91,6 @@ def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"
     }
 
 
-def _shifted(values: Vectors, samples: int) -> Vectors:
-    return values[np.clip(np.arange(len(values)) + samples, 0, len(values) - 1)]
-
-
 def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
     slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], sound_intervals(log)[:, None]
     predicted = middle(rotation_of(q).apply(UP)) * thrust
@@ -111,11 +102,3 @@ def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
 def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
     """Means of adjacent samples."""
     return 0.5 * (values[1:] + values[:-1])
-
-
-def smoother(log: FlightLog) -> Callable[[Vectors], Vectors]:
-    """Return a moving mean over `SPAN` that uses sound intervals only."""
-    sound = sound_intervals(log)[:, None].astype(float)
-    width = min(max(1, round(SPAN / log.dt)), len(sound))
-    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
-    return lambda values: moving_mean(values, width)[whole]

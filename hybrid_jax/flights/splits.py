@@ -13,14 +13,13 @@ from hybrid_jax.flights.log import FlightLog
 
 Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
 SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of log files
+_SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg)$", re.IGNORECASE)
 _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
 
 def flight_of(log: FlightLog) -> str:
     """The name of a flight's file, without folder and `SUFFIXES`."""
-    name = Path(log.name).name
-    suffix = next((each for each in SUFFIXES if name.lower().endswith(each)), "")
-    return name[: len(name) - len(suffix)]
+    return _SUFFIX.sub("", Path(log.name).name)
 
 
 def manoeuvre_of(log: FlightLog) -> str:

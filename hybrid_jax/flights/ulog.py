@@ -36,16 +36,14 @@ def read_ulog(
 ) -> FlightLog:
     """Read one flight at intervals of dt [s]; where a topic has a gap, the log has one too.
 
-    Position, velocity and rates are interpolated linearly, attitude spherically; rotor speeds are the mean over the
-    interval of the values held in the log.
+    Position, velocity and rates are interpolated linearly, attitude spherically; rotor speeds are means of held values.
 
     Args:
         motor_order: which motor (0 is PX4's motor 1) each of the vehicle's rotors is.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ; not needed where the log has ESC rpm.
 
     Raises:
-        ValueError: file, topic and what to do, in one line.
-        ImportError: pyulog is not installed.
+        ValueError: file, topic and what to do, in one line; or pyulog is not installed.
     """
     if not dt > 0:
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
@@ -74,7 +72,7 @@ def _load(path: str | Path):
     try:
         import pyulog
     except ImportError as error:
-        raise ImportError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
+        raise ValueError(f"{path}: reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     try:
         # pyulog reports damage on standard output only.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -101,9 +99,7 @@ def _samples(data, path, topic: str, fields: tuple[str, ...], clock: str = "time
     t = table[clock if use_clock else "timestamp"].astype(np.int64) * 1e-6
     with np.errstate(invalid="ignore"):  # damaged numbers are refused below
         values = np.stack([table[field] for field in fields], axis=1).astype(float)
-    bad = ~np.isfinite(values)
-    if topic not in FIELDS and bad.any():
-        row, column = np.argwhere(bad)[0].tolist()
+    for row, column in () if topic in FIELDS else np.argwhere(~np.isfinite(values))[:1].tolist():
         where = f"topic {topic}, sample {row}, field {fields[column]}"
         raise ValueError(f"{path}: {where}: is not finite; cut the log there")
     t, kept = np.unique(t, return_index=True)

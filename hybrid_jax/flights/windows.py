@@ -75,10 +75,10 @@ def load_windows(
     logs = load_logs(folder, columns=columns, polynomial=polynomial)
     for log in logs:
         for check in check_log(log, vehicle):
-            message = f"{log.name}: {check.name}: {check.suggestion}"
-            if check.verdict == FAILS and strict:
-                raise ValueError(message)
             if check.verdict == FAILS:
+                message = f"{log.name}: {check.name}: {check.suggestion}"
+                if strict:
+                    raise ValueError(message)
                 warnings.warn(message, stacklevel=2)
     if dt is not None:
         logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
@@ -115,10 +115,7 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
         ValueError: the file, row, field and what to do, in one line.
     """
     if str(path).lower().endswith(".ulg"):
-        try:
-            return read_ulog(path, polynomial=polynomial)
-        except ImportError as error:
-            raise ValueError(f"{path}: {error}") from error
+        return read_ulog(path, polynomial=polynomial)
     log = read_csv(path) if columns is None else read_mapped(path, columns)
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
@@ -148,14 +145,15 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
         long = [part for part in even_segments(log) if part.stop - part.start > steps]
         cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
         parts.append(concatenate(cut))
-    return LogWindows(_float32(concatenate(parts)), [len(part) for part in parts], stride)
+    windows = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
+    return LogWindows(windows, [len(part) for part in parts], stride)
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
     """Return the logs that hold a window of `steps` intervals; refuse logs of which none does."""
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
-        names = ", ".join(flight_of(log) for log in logs)
+        names = ", ".join(map(flight_of, logs))
         longest = max((length for log in logs for length in _intervals(log)), default=0)
         raise ValueError(
             f"no window of {steps} intervals without gaps in {names}; the longest segment has {longest}: "
@@ -167,22 +165,6 @@ def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
 def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
     """Count the windows that `cut_windows` finds with a stride of 1."""
     return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
-
-
-def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, float, Trajectories]:
-    """Cut the longest segment of the first log that holds a window of `steps` intervals into adjacent windows.
-
-    Returns:
-        The log, the start of the segment [s] after the log's first sample, and the windows.
-    """
-    log = require_length(logs, steps)[0]
-    part = max(segments(log), key=lambda part: part.stop - part.start)
-    windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
-    return log, float(log.t[part.start] - log.t[0]), _float32(windows)
-
-
-def _float32(windows: Trajectories) -> Trajectories:
-    return jax.tree.map(lambda leaf: leaf.astype(np.float32), windows)
 
 
 def _intervals(log: FlightLog) -> list[int]:

@@ -52,36 +52,30 @@ class Quadrotor(eqx.Module):
         end = x + increment
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
 
-    def rollout(self, x0: State, u: Float[Array, "t 4"], t0: Scalar, dt: float) -> Float[Array, "t 13"]:
-        """The states at the end of each interval, from x0 at time t0 [s] with u[i] held over interval i.
+    def rollouts(
+        self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
+    ) -> Float[Array, "n t 13"]:
+        """The states of n flights at the end of each interval, from x0 at t0 [s] with u[:, i] held over interval i.
+
+        Args:
+            chunk: flights that are vectorised together.
 
         Raises:
             ValueError: shapes do not agree; or, outside of compiled code, a number is not finite, dt is not positive,
                 or x0 has no unit quaternion.
         """
-        x0, u = self._checked(x0, u, dt, windows=())
+        x0, u, n = checks.floating("x0", x0), checks.floating("u", u), jnp.shape(t0)
+        if len(n) != 1 or x0.shape != (*n, STATE_SIZE) or u.ndim != 3 or u.shape != (*n, u.shape[1], INPUT_SIZE):
+            raise ValueError(f"x0 (n, 13), u (n, t, 4) and t0 (n,) expected, got {x0.shape}, {u.shape} and {n}")
+        checks.positive("dt", dt, "a positive number of seconds")
+        checks.unit_quaternions("x0", x0)
+        checks.count("chunk", chunk)
 
         def advance(carry, held):
             x, t = carry
             x = self.step(x, held, t, dt)
             return (x, t + dt), x
 
-        return jax.lax.scan(advance, (x0, t0), u)[1]
-
-    def rollouts(
-        self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
-    ) -> Float[Array, "n t 13"]:
-        """`rollout` of n flights, in vectorised chunks; raises the same."""
-        x0, u = self._checked(x0, u, dt, windows=jnp.shape(t0))
-        checks.count("chunk", chunk)
-        return jax.lax.map(lambda one: self.rollout(one[0], one[1], one[2], dt), (x0, u, t0), batch_size=chunk)
-
-    def _checked(self, x0, u, dt, windows: tuple[int, ...]) -> tuple[Float[Array, "*n 13"], Float[Array, "*n t 4"]]:
-        """x0 and u as JAX arrays, with leading axes `windows`."""
-        x0, u = checks.floating("x0", x0), checks.floating("u", u)
-        lengths = u.shape[-2:-1]
-        if x0.shape != (*windows, STATE_SIZE) or u.shape != (*windows, *lengths, INPUT_SIZE) or not lengths:
-            raise ValueError(f"x0 (13,) and u (t, 4), or n of each and of t0, expected, got {x0.shape} and {u.shape}")
-        checks.positive("dt", dt, "a positive number of seconds")
-        checks.unit_quaternions("x0", x0)
-        return x0, u
+        return jax.lax.map(
+            lambda flight: jax.lax.scan(advance, (flight[0], flight[2]), flight[1])[1], (x0, u, t0), batch_size=chunk
+        )

@@ -29,7 +29,7 @@ from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
-from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, longest_segment, require_common_interval
+from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, require_common_interval
 from hybrid_jax.integrate import rollout
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.vehicle import IRIS
@@ -118,18 +118,6 @@ def test_random_samples_are_nested_and_contiguous_ones_are_runs():
 
 def test_non_overlapping_windows_share_no_sample():
     np.testing.assert_array_equal(non_overlapping(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
-
-
-def test_longest_segment_is_of_the_first_long_flight():
-    short, gap = LOGS[0][:4], LOGS[1][[*range(20), *range(40, SAMPLES)]]
-    log, begin, windows = longest_segment([short, gap, LOGS[2]], 10)
-    assert log.name == LOGS[1].name
-    assert begin == LOGS[1].t[40]
-    states = np.concatenate([windows.x0[:1], *windows.x])
-    np.testing.assert_array_equal(states, LOGS[1].x[40:].astype(np.float32)[: len(states)])
-    assert len(states) == 41
-    with pytest.raises(ValueError, match="no window of 10 intervals without gaps in chirp_run1"):
-        longest_segment([short], 10)
 
 
 def test_kinematics_move_and_turn_at_constant_rates():
