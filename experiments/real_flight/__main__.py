@@ -1,12 +1,33 @@
-"""The command line: python -m experiments.real_flight --help."""
+"""From the command line to the report: python -m experiments.real_flight --help."""
 
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from pathlib import Path
 
-from experiments.real_flight.config import PRESETS
-from experiments.real_flight.experiment import NAME, run
+from rich.console import Console
+
+from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
+from experiments.real_flight.folds import evenly_spaced, hold_out_validation
+from experiments.real_flight.logs import LogSet, load_logs, require_distinct, write_logs
+from experiments.real_flight.models import thrust_baseline
+from experiments.real_flight.report import failed_checks, write_report
+from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
+from experiments.real_flight.study import run_folds
+from experiments.real_flight.train import Experiment
 from experiments.runner import command
+from experiments.runner.stages import stages_of
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, learned_by_field, vehicle_model_of
+from hybrid_jax.flights.cleaning import choose_time_constant
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.windows import cut_windows, require_common_interval
+from hybrid_jax.sweep import hosts
+from hybrid_jax.vehicle import read_tables
 
+NAME = "real_flight"
+LAG_WINDOWS = 300  # windows that physics is fitted to for each candidate of the rotors' time constant
 ABOUT = "How well does a model of your own vehicle predict flights that it was not trained on?"
 GUIDE = """\
 real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--test FOLDER], or --simulated.
@@ -45,6 +66,79 @@ def split_lists(arguments: Sequence[str]) -> list[str]:
         else:
             words += [*([option] if named else []), *value.split(",")]
     return words
+
+
+def run(config: RealFlightConfig, console: Console) -> None:
+    """Run the experiment from the logs to the report."""
+    experiment = prepare(config, console)
+    results = run_folds(experiment)
+    if hosts.is_main_process():
+        write_report(NAME, experiment, results, Console())
+
+
+def prepare(config: RealFlightConfig, console: Console) -> Experiment:
+    """Load the vehicle and all logs, and check them."""
+    config.require_flights()
+    if config.simulated:
+        path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
+    else:
+        named = {"source": config.source, "target": config.target, "test": config.test}
+        path, folders = config.vehicle, {name: folder for name, folder in named.items() if folder is not None}
+    assert path is not None
+    before, after, chooses_lag = load_vehicle_models(path, config)
+    # The time constant may not be chosen on flights, or manoeuvres, that models are tested on.
+    if chooses_lag and "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
+        raise ValueError(
+            f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "
+            f"give --target, or state {LAG} under [terms]"
+        )
+    logs: dict[str, LogSet] = {}
+    for name, folder in folders.items():
+        model = before if name == "source" else after
+        time_constant = 0.0 if chooses_lag else model.terms.motor_time_constant
+        logs[name] = load_logs(name, folder, model.vehicle, time_constant, config)
+    require_distinct(list(logs.values()), config)
+    dt = require_common_interval([log for each in logs.values() for log in each.logs], "--cleaning.resample ")
+    if chooses_lag:
+        chosen = choose_lag(logs["source"], before, config)
+        console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
+        logs = {name: each.with_lag(chosen) for name, each in logs.items()}
+    print_failed_checks(logs, console)
+    return Experiment(config, before, after, logs, dt, stages_of(config, console))
+
+
+def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
+    """Read the vehicle of the source, that of target and test, and whether the rotors' time constant is chosen."""
+    tables = read_tables(path)
+    before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
+    learn = config.learn or (before.learn if "learn" in tables else LEARN)
+    before, after = (replace(each, learn=learned_by_field(learn)) for each in (before, after))
+    return before, after, LAG in learn
+
+
+def print_failed_checks(logs: Mapping[str, LogSet], console: Console) -> None:
+    """Print one line per failed check; the report holds the whole table."""
+    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        line = f"{flight}: {check['name']}: {check['suggestion']}"
+        console.print(line, highlight=False, soft_wrap=True, style="yellow")
+
+
+def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
+    """Choose the rotors' time constant [s] on the source's flights.
+
+    For each candidate, physics is fitted to training flights and predicts the validation flights.
+    """
+    train, validation = hold_out_validation(source.logs, config)
+    baseline = thrust_baseline(model)
+
+    def error(logs: list[FlightLog]) -> float:
+        known, unknown = (
+            cut_windows(part, INTERVAL_STEPS).windows for part in (logs[: len(train)], logs[len(train) :])
+        )
+        field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
+        return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
+
+    return choose_time_constant([*train, *validation], error)[0]
 
 
 if __name__ == "__main__":

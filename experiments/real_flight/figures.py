@@ -9,14 +9,14 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.rows import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, STYLE, legend_below
+from experiments.reporting.plots import COLOURS, STYLE, legend_below, tick_errors
 from experiments.reporting.results import Results
 from hybrid_jax.flights.log import segments
 from hybrid_jax.flights.splits import flight_of
@@ -58,16 +58,15 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     figure = Figure(figsize=(9.5, 7.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
     most = max(outputs.table["n_train"])
+    curves_of = {tuple(row[tag] for tag in TAGS): errors[kind] for row, errors in outputs.tests}
     for cell, group in cells(outputs.table).items():
         model, mode, n = cell
         if n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
             continue
         by_seed = []  # over the test windows of all folds
         for own in group.group("seed").values():
-            weights, errors = (
-                own.numbers("windows"),
-                np.array([outputs.errors[tuple(row[tag] for tag in TAGS)][kind] for row in own]),
-            )
+            weights = own.numbers("windows")
+            errors = np.array([curves_of[tuple(row[tag] for tag in TAGS)] for row in own])
             by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
         curves = zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True)
         for axes, mean, std in curves:
@@ -76,7 +75,7 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
             axes.fill_between(time, low, mean + std, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
     for axes, (name, unit) in zip(panels.flat, QUANTITIES.items(), strict=True):
         axes.set(yscale="log", title=name.replace("_", " ").capitalize(), ylabel=f"{measure} [{unit}]")
-        _tick(axes)
+        tick_errors(axes.yaxis, *axes.get_ylim())
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
     return legend_below(figure, "Error against horizon", "mean over seeds; band: ± one standard deviation")
@@ -114,9 +113,8 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     windows = windows[:PIECES]
     fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
     fields["thrust", "nominal"] = thrust_baseline(experiment.after)
-    states = {
-        cell: np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt)) for cell, field in fields.items()
-    }
+    inputs = windows.x0, windows.u, windows.dt
+    states = {cell: np.asarray(rollout_batch(field, *inputs)) for cell, field in fields.items()}
     truth = np.concatenate([windows.x0[:1], *windows.x])
     time = begin + dt * np.arange(len(truth))
     figure = Figure(figsize=(12, 6), layout="constrained")
@@ -147,21 +145,21 @@ def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> 
     Derivatives that no network changes have no panel.
     """
     windows = cut_windows(outputs.folds[0].test, 1).windows
-    x, u, residuals = windows.x0, windows.u[:, 0], {}
+    x, residuals = windows.x0, {}
     for mode, trained in hybrids.items():
-        residuals[cell_name("hybrid", mode)] = np.asarray(jax.jit(jax.vmap(_largest(trained).residual))(x, u))
+        network = jax.jit(jax.vmap(_largest(trained).residual))
+        residuals[cell_name("hybrid", mode)] = np.asarray(network(x, windows.u[:, 0]))
     every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
     figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
-    panels = figure.subplots(1, max(len(parts), 1), squeeze=False)[0][: len(parts)]
-    for axes, (name, part) in zip(panels, parts.items(), strict=True):
+    for column, (name, part) in enumerate(parts.items(), 1):
+        axes = figure.add_subplot(1, len(parts), column)
         for colour, (label, residual) in zip(COLOURS.values(), residuals.items(), strict=False):
             size = np.linalg.norm(residual[:, part], axis=1)
             _draw_bins(axes, np.linalg.norm(x[:, VELOCITY], axis=1), size, colour, label)
         axes.set(xlabel="speed [m/s]", ylabel=f"added to {name}", ylim=(0, None))
-    return legend_below(
-        figure, "Output of the network against speed", "median over the samples of a bin; band: quartiles"
-    )
+    meaning = "median over the samples of a bin; band: quartiles"
+    return legend_below(figure, "Output of the network against speed", meaning)
 
 
 def _largest(trained: TrainedModel) -> Any:
@@ -174,11 +172,8 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
     adapted = [each for each in drawn if (*each, 0) not in found]
     for model, mode in drawn:
         own = {n: pooled(found[model, mode, n], label, quantity) for n in (0, *sizes) if (model, mode, n) in found}
-        style: dict[str, Any] = {
-            "color": MODEL_COLOURS[model],
-            "linestyle": DASHES[mode],
-            "label": cell_name(model, mode),
-        }
+        style: dict[str, Any] = {"color": MODEL_COLOURS[model], "linestyle": DASHES[mode]}
+        style["label"] = cell_name(model, mode)
         if 0 in own:
             axes.axhline(own[0].mean(), linewidth=1.2, **style)
             continue
@@ -188,14 +183,7 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
         at, means = [n * factor for n in own], [values.mean() for values in own.values()]
         axes.errorbar(at, means, spread, capsize=2, marker="o", markersize=3.5, **style)
     axes.set_yscale("log")
-    _tick(axes)
-
-
-def _tick(axes: Axes) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade."""
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    tick_errors(axes.yaxis, *axes.get_ylim())
 
 
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:

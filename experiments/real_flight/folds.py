@@ -1,6 +1,6 @@
 """Assign flights to training, validation and test, and sample the windows of each run."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from hybrid_jax.flights.windows import count_windows, require_length
 from hybrid_jax.trajectories import Trajectories
 
 FOLDS, VALIDATION_SHARE = 3, 0.2
-GROUP_BY: dict[str, Callable[[FlightLog], str]] = {"flight": flight_of, "manoeuvre": manoeuvre_of}
+GROUP_BY = {"flight": flight_of, "manoeuvre": manoeuvre_of}
 
 
 @dataclass(frozen=True)
@@ -34,10 +34,8 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
     of = GROUP_BY[config.folds_by]
     names = {of(log) for log in train} & {of(log) for log in tested or train}
     if len(names) < 2:
-        raise ValueError(
-            f"--folds-by {config.folds_by}: all flights are of one name, so none is left to train on; "
-            "give flights to --test"
-        )
+        none_left = "all flights are of one name, so none is left to train on; give flights to --test"
+        raise ValueError(f"--folds-by {config.folds_by}: {none_left}")
     count = min(FOLDS, len(names)) if config.folds is None else config.folds
     try:
         splits = folds([log for log in train if of(log) in names], count, of, config.data_seed)
@@ -58,10 +56,8 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
     of = GROUP_BY[config.validated_by]
     names = sorted({of(log) for log in logs})
     if len(names) < 2:
-        raise ValueError(
-            f"--validate-by {config.validated_by}: {len(logs)} flights of one name ({names[0]}) are too few for "
-            "training and validation"
-        )
+        few = f"{len(logs)} flights of one name ({names[0]}) are too few for training and validation"
+        raise ValueError(f"--validate-by {config.validated_by}: {few}")
     count = max(1, round(VALIDATION_SHARE * len(names)))
     dealt = np.random.default_rng(config.data_seed).permutation(np.array(names, object))
     return hold_out(logs, list(dealt[:count]), of)
@@ -89,11 +85,6 @@ def _require_size(size: int, count: int) -> None:
 def evenly_spaced(windows: Trajectories, count: int) -> Trajectories:
     """Pick `count` evenly spaced windows; if there are fewer, some occur twice, so that all folds share one shape."""
     return windows[np.linspace(0, len(windows) - 1, count).round().astype(int)]
-
-
-def padded(windows: Trajectories, count: int) -> Trajectories:
-    """Pad windows to `count` by repetition, so that folds share one program; no run samples the padding."""
-    return windows[np.arange(count) % len(windows)]
 
 
 def sampled_indices(sizes: Sequence[int], size: int, draw: str, seed: int) -> Int[np.ndarray, " size"]:

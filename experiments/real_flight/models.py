@@ -61,11 +61,8 @@ def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds
 def move_to_vehicle(fields: Any, vehicle: Vehicle) -> Any:
     """Move stacked fields to another vehicle, such as one with a payload; θ_p keeps its values in SI units."""
 
-    def move(node):
-        return with_vehicle(node, vehicle) if is_body(node) else node
-
     def one(field):
-        return jax.tree.map(move, field, is_leaf=is_body)
+        return jax.tree.map(lambda node: with_vehicle(node, vehicle) if is_body(node) else node, field, is_leaf=is_body)
 
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(fields))
 

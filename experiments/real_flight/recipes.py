@@ -4,7 +4,10 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Literal
 
-from hybrid_jax.training.stages import Stage
+import equinox as eqx
+
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.io.archive import named_leaves
 
 Model = Literal["hybrid", "no_physics", "physics_only"]
 Physics = Literal["multirotor", "torque_off", "frozen_rates"]
@@ -16,19 +19,14 @@ NETWORK_ALONE = 5e-3  # rate of a network without physics in stages that train p
 
 @dataclass(frozen=True)
 class Step:
-    """One stage of training on the first `steps` intervals of each window, as `hybrid_jax.training.stages.Stage`.
+    """One stage of training, as `hybrid_jax.training.stages.Stage`."""
 
-    Attributes:
-        physics, residual: Adam's learning rates; 0 freezes that part.
-        frozen: names of physical parameters that are not trained.
-    """
-
-    physics: float
+    physics: float  # Adam's learning rate; 0 freezes that part
     residual: float
-    steps: int
+    steps: int  # the first intervals of each window
     epochs: int
     patience: int = 20
-    frozen: tuple[str, ...] = ()
+    frozen: tuple[str, ...] = ()  # names of physical parameters that are not trained
 
 
 @dataclass(frozen=True)
@@ -110,16 +108,16 @@ RECIPES: Mapping[str, Recipe] = {
 }
 
 
-def stage_of(step: Step, model: str, factor: float = 1.0) -> Stage:
-    """The training stage of one model; `factor` is on epochs and patience."""
-    epochs, patience = (max(1, round(factor * count)) for count in (step.epochs, step.patience))
+def rates_of(step: Step, model: str, field: AbstractVectorField) -> dict[str, float]:
+    """The learning rate of each group of a field's parameters; 0 for those that the step freezes."""
     rates = {
         "hybrid": {"physics": step.physics, "residual": step.residual},
         # It has no physics to train first, and gets as many epochs.
         "no_physics": {"residual": step.residual or NETWORK_ALONE},
         "physics_only": {"": step.physics},
     }
-    return Stage(rates[model], step.steps, epochs, patience)
+    paths = named_leaves(eqx.filter(field, trainable(field)))
+    return rates[model] | {path: 0.0 for path in paths if path.rpartition("/")[-1] in step.frozen}
 
 
 def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
@@ -130,8 +128,3 @@ def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
         return how if model == "hybrid" else replace(how, outputs="motion")
 
     return next((name for name in among if training(name) == training(recipe)), recipe)
-
-
-def epoch_factor(size: int) -> float:
-    """√(1000 / N): an epoch of few windows has few gradient steps, so small N are trained for more epochs."""
-    return (REFERENCE / size) ** 0.5

@@ -54,16 +54,13 @@ def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mappi
     return {label: dict(zip(QUANTITIES, values, strict=True)) for label, values in found.items()}
 
 
-def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]) -> list[Test]:
+def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]):
     """Test all runs of a model by `score` with a fold's arguments; `theta` is what `parameters` found."""
-
-    def one(run: int) -> Test:
+    for run in range(len(trained)):
         columns = {"model": trained.model, "mode": trained.mode, "recipe": trained.recipe, **theta[run]}
         columns |= {"n_train": trained.size(run), "seed": trained.seeds[run], "epochs": int(trained.epochs[run])}
         status = STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED])
-        return scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
-
-    return list(map(one, range(len(trained))))
+        yield scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
 
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:
@@ -96,11 +93,9 @@ def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajecto
 
     def one(run):
         field, indices = run
-        body = body_of(field)
         if len(indices):
-            return intervals(body, covariance_of(field, windows[indices], error=objective.error))
-        size = ravel_parameters(body)[0].size
-        return intervals(body, jnp.zeros((size, size)))
+            return intervals(body_of(field), covariance_of(field, windows[indices], error=objective.error))
+        return intervals(body_of(field), jnp.zeros((ravel_parameters(body_of(field))[0].size,) * 2))
 
     return jax.lax.map(one, (fields, picked))
 
@@ -133,5 +128,5 @@ def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Seque
     def rms(part, steps: int) -> float:
         return float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float))))
 
-    pairs = [(own, other, steps) for own, other in zip(errors, baseline, strict=True) for steps in horizons]
-    return float(np.mean([rms(own, steps) / rms(other, steps) for own, other, steps in pairs]))
+    pairs = zip(errors, baseline, strict=True)
+    return float(np.mean([rms(own, steps) / rms(other, steps) for own, other in pairs for steps in horizons]))

@@ -1,6 +1,6 @@
 """Train and test in every fold."""
 
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import groupby
@@ -8,7 +8,6 @@ from typing import Any
 
 import jax
 import numpy as np
-from jaxtyping import Float
 
 from experiments.real_flight import scoring, train
 from experiments.real_flight.folds import Fold, hold_out_validation, make_folds, require_windows
@@ -31,28 +30,20 @@ class Outputs:
     """What an experiment found.
 
     Attributes:
-        rows: one per test; see `rows`.
-        errors: of each row, by its tags: RMS and mean over windows of the error at every step.
+        tests: rows (see `rows`), each with its errors at every step.
         choices: of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
         trained: by number of the fold, model and mode.
     """
 
     folds: list[Fold]
-    rows: list[dict[str, Any]] = field(default_factory=list)
-    errors: dict[tuple[Any, ...], Float[np.ndarray, "2 4 t"]] = field(default_factory=dict)
+    tests: list[Test] = field(default_factory=list)
     choices: dict[str, dict[str, float]] = field(default_factory=dict)
     trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)
 
     @property
     def table(self) -> Results:
         """The table of results."""
-        return Results(self.rows, TAGS)
-
-    def add(self, tests: Iterable[Test]) -> None:
-        """Add the rows and errors of some tests."""
-        for row, errors in tests:
-            self.rows.append(row)
-            self.errors[tuple(row[tag] for tag in TAGS)] = errors
+        return Results([row for row, _ in self.tests], TAGS)
 
 
 def run_folds(experiment: Experiment) -> Outputs:
@@ -116,11 +107,11 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
     score = partial(scoring.score, windows=test, config=config, fold=fold.name)
 
     def add(trained: TrainedModel, theta: list[dict[str, Any]]) -> None:
-        outputs.add(scoring.score_model(score, trained, theta))
+        outputs.tests.extend(scoring.score_model(score, trained, theta))
         outputs.trained[number, trained.model, trained.mode] = trained
 
     baselines = {"hold": HoldState(), "thrust": thrust_baseline(vehicle)}
-    outputs.add(score(baseline, model=model, mode="nominal") for model, baseline in baselines.items())
+    outputs.tests.extend(score(baseline, model=model, mode="nominal") for model, baseline in baselines.items())
     adapted: TrainedModel | None = None
     for model in config.models:
         first = source.trained(model, equivalent_recipe(model, chosen, config.tried), config.seeds)
@@ -133,7 +124,7 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
         for mode in ("fine_tuned", "scratch") if model in FROM_SCRATCH else ("fine_tuned",):
             adapted = train.adapt(experiment, name, mode, start, target(chosen), config.n)
             add(adapted, parameters(adapted, target(chosen)))
-    outputs.add(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))
+    outputs.tests.extend(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))
 
 
 def _linear_baselines(

@@ -13,17 +13,16 @@ from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
 from rich.console import Console
 
 import hybrid_jax
-from experiments.real_flight.claims import verdicts
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
 from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
 from experiments.real_flight.logs import LogSet, load_logs
 from experiments.real_flight.models import thrust_baseline, untrained
 from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import QUANTITIES, TAGS, pooled
+from experiments.real_flight.report import choice_tables, parameter_tables
+from experiments.real_flight.rows import QUANTITIES, TAGS, pooled, verdicts
 from experiments.real_flight.scoring import parameters, scores
 from experiments.real_flight.study import each_fold, run_folds
-from experiments.real_flight.tables import choice_tables, parameter_tables
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
