@@ -1,7 +1,7 @@
 """From the command line to the report: python -m experiments.real_flight --help."""
 
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -78,13 +78,12 @@ def run(config: RealFlightConfig, console: Console) -> None:
 
 def prepare(config: RealFlightConfig, console: Console) -> Experiment:
     """Load the vehicle and all logs, and check them."""
-    config.require_flights()
+    named = {"source": config.source, "target": config.target, "test": config.test}
+    path, folders = config.vehicle, {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:
         path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
-    else:
-        named = {"source": config.source, "target": config.target, "test": config.test}
-        path, folders = config.vehicle, {name: folder for name, folder in named.items() if folder is not None}
-    assert path is not None
+    if path is None or "source" not in folders:
+        raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
     before, after, chooses_lag = load_vehicle_models(path, config)
     # The time constant may not be chosen on flights, or manoeuvres, that models are tested on.
     if chooses_lag and "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
@@ -103,7 +102,9 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
         chosen = choose_lag(logs["source"], before, config)
         console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
         logs = {name: each.with_lag(chosen) for name, each in logs.items()}
-    print_failed_checks(logs, console)
+    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        line = f"{flight}: {check['name']}: {check['suggestion']}"  # the report holds the whole table
+        console.print(line, highlight=False, soft_wrap=True, style="yellow")
     return Experiment(config, before, after, logs, dt, stages_of(config, console))
 
 
@@ -116,13 +117,6 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
     return before, after, LAG in learn
 
 
-def print_failed_checks(logs: Mapping[str, LogSet], console: Console) -> None:
-    """Print one line per failed check; the report holds the whole table."""
-    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
-        line = f"{flight}: {check['name']}: {check['suggestion']}"
-        console.print(line, highlight=False, soft_wrap=True, style="yellow")
-
-
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
     """Choose the rotors' time constant [s] on the source's flights.
 
@@ -132,9 +126,8 @@ def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) ->
     baseline = thrust_baseline(model)
 
     def error(logs: list[FlightLog]) -> float:
-        known, unknown = (
-            cut_windows(part, INTERVAL_STEPS).windows for part in (logs[: len(train)], logs[len(train) :])
-        )
+        parts = logs[: len(train)], logs[len(train) :]
+        known, unknown = (cut_windows(part, INTERVAL_STEPS).windows for part in parts)
         field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
         return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
 

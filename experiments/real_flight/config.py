@@ -128,14 +128,7 @@ class RealFlightConfig(Run):
         if self.learn is not None:
             check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in PATHS):
-            raise ValueError(
-                "--simulated makes its own logs: leave out --vehicle, --columns, --source, --target and --test"
-            )
-
-    def require_flights(self) -> None:
-        """Refuse a configuration without flights; apart from the other checks, as presets have no paths."""
-        if not self.simulated and (self.vehicle is None or self.source is None):
-            raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
+            raise ValueError(f"--simulated makes its own logs: leave out {', '.join(f'--{name}' for name in PATHS)}")
 
     @property
     def longest(self) -> int:

@@ -2,6 +2,7 @@
 
 import gzip
 import io
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -43,11 +44,7 @@ class LogSet:
 
 
 def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float, config: RealFlightConfig) -> LogSet:
-    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s].
-
-    Raises:
-        ValueError: file, row, field and what to do, in one line.
-    """
+    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s]."""
     try:
         found = windows.load_logs(folder, columns=config.columns, polynomial=config.polynomial)
     except ValueError as error:
@@ -63,9 +60,6 @@ def require_distinct(sets: Sequence[LogSet], config: RealFlightConfig) -> None:
     """Refuse a flight that occurs twice, whatever its files are called: it could be in training and test.
 
     Source and test may share flights where each is tested by models trained on other manoeuvres.
-
-    Raises:
-        ValueError: both files, and what to do.
     """
     shared = config.target is None and config.folds_by == "manoeuvre"
     first: dict[tuple[str, str], str] = {}
@@ -78,11 +72,7 @@ def require_distinct(sets: Sequence[LogSet], config: RealFlightConfig) -> None:
 
 
 def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightLog, list[str]]:
-    """Apply the configured changes to a log; also return one line per change.
-
-    Raises:
-        ValueError: the flight, the option and why it cannot be applied, in one line.
-    """
+    """Apply the configured changes to a log; also return one line per change."""
     steps: dict[str, tuple[Any, Callable[[FlightLog, Any], tuple[FlightLog, str]]]] = {
         "in-flight": (cleaning.in_flight or None, lambda log, _: in_flight(log)),
         "resample": (cleaning.resample, lambda log, dt: resample(log, dt, cleaning.longest_gap)),
@@ -132,14 +122,8 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
 
 
 def vehicle_toml(vehicle: Vehicle) -> str:
-    """The text of a vehicle file."""
-
-    def text(value) -> str:
-        if isinstance(value, tuple):
-            return f"[{', '.join(map(text, value))}]"
-        return f'"{value}"' if isinstance(value, str) else repr(value)
-
-    return "[vehicle]\n" + "".join(f"{name} = {text(value)}\n" for name, value in asdict(vehicle).items())
+    """The text of a vehicle file; the numbers, names and lists of JSON are those of TOML as well."""
+    return "[vehicle]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items())
 
 
 def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:

@@ -1,6 +1,6 @@
 """Train and test in every fold."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import groupby
@@ -23,6 +23,9 @@ from hybrid_jax.flights.windows import count_windows, cut_windows
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
 FROM_SCRATCH = ("hybrid",)  # models that are trained from scratch too, to show what the source is worth
+
+
+Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 
 
 @dataclass(frozen=True)
@@ -54,56 +57,45 @@ def run_folds(experiment: Experiment) -> Outputs:
     source = Fold("source", *hold_out_validation(logs["source"].logs, config), []) if "target" in logs else None
     require_windows(outputs.folds, source, config)
     # With a target, all folds share the models of the source; else each fold has its own.
-    shared = Source(experiment, "source", source) if source else None
-    for number, fold in each_fold(outputs.folds):
-        _run_fold(experiment, outputs, number, shared or Source(experiment, f"fold {number}", fold))
+    shared = source_of(experiment, "source", source) if source else None
+    for number, fold in enumerate(outputs.folds):
+        jax.clear_caches()  # a program of a sweep takes hundreds of memory maps, and Linux gives a process 65 530
+        _run_fold(experiment, outputs, number, shared or source_of(experiment, f"fold {number}", fold))
     return outputs
 
 
-def each_fold(folds: Sequence[Fold]) -> Iterator[tuple[int, Fold]]:
-    """Iterate over the folds; compiled programs of the previous fold are freed.
-
-    A program of a sweep takes hundreds of memory maps, and Linux gives a process 65 530.
-    """
-    for number, fold in enumerate(folds):
-        jax.clear_caches()
-        yield number, fold
-
-
-class Source:
+def source_of(experiment: Experiment, name: str, fold: Fold) -> Source:
     """Data of the flights before the change, by recipe, and models trained on them; each is made once."""
+    data = cache(partial(train.training_data, experiment, fold))
 
-    def __init__(self, experiment: Experiment, name: str, fold: Fold):
-        self.data: Callable[[str], TrainingData] = cache(partial(train.training_data, experiment, fold))
+    @cache
+    def trained(model: str, recipe: str, seeds: int, prefix: str = "") -> TrainedModel:
+        return train.train_on_source(experiment, f"{prefix}{name}", model, recipe, data(recipe), seeds)
 
-        @cache
-        def trained(model: str, recipe: str, seeds: int, prefix: str = "") -> TrainedModel:
-            return train.train_on_source(experiment, f"{prefix}{name}", model, recipe, self.data(recipe), seeds)
-
-        self.trained: Callable[..., TrainedModel] = trained
+    return data, trained
 
 
 def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Source) -> None:
     """Choose a recipe, train every model, adapt it if there is a target, and test."""
     config, fold, name = experiment.config, outputs.folds[number], f"fold {number}"
-    adapts = "target" in experiment.logs
+    adapts, (source_data, source_model) = "target" in experiment.logs, source
     vehicle = experiment.after if adapts else experiment.before
     windows = {RECIPES[recipe].window for recipe in config.tried}
     capacity = max(count_windows(each.train, steps) for each in outputs.folds for steps in windows)
 
     @cache
     def target(recipe: str) -> TrainingData:
-        return train.training_data(experiment, fold, recipe, source.data(recipe), capacity)
+        return train.training_data(experiment, fold, recipe, source_data(recipe), capacity)
 
     def candidate(recipe: str) -> TrainedModel:
-        found = source.trained("hybrid", recipe, min(CHOICE_SEEDS, config.seeds), "choice ")
+        found = source_model("hybrid", recipe, min(CHOICE_SEEDS, config.seeds), "choice ")
         if not adapts:
             return found
         start = train.transfer(experiment, found)
         return train.adapt(experiment, f"choice {name}", "fine_tuned", start, target(recipe), [max(config.n)])
 
     chosen = _choose_recipe(experiment, outputs, fold, candidate)
-    data, test = source.data(chosen), cut_windows(fold.test, config.longest).windows
+    data, test = source_data(chosen), cut_windows(fold.test, config.longest).windows
     score = partial(scoring.score, windows=test, config=config, fold=fold.name)
 
     def add(trained: TrainedModel, theta: list[dict[str, Any]]) -> None:
@@ -114,7 +106,7 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
     outputs.tests.extend(score(baseline, model=model, mode="nominal") for model, baseline in baselines.items())
     adapted: TrainedModel | None = None
     for model in config.models:
-        first = source.trained(model, equivalent_recipe(model, chosen, config.tried), config.seeds)
+        first = source_model(model, equivalent_recipe(model, chosen, config.tried), config.seeds)
         if not adapts:
             first = train.refit(experiment, name, fold, data, first) if config.refit else first
             add(first, parameters(first, data))
@@ -128,10 +120,7 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
 
 
 def _linear_baselines(
-    experiment: Experiment,
-    score: Callable[..., Test],
-    source: TrainingData,
-    target: tuple[TrainedModel, TrainingData] | None,
+    experiment: Experiment, score: Callable[..., Test], source: TrainingData, target: Any
 ) -> Iterator[Test]:
     """Test linear residuals of the rigid body, fitted to all source windows and to those of each run on the target."""
     before, after = (rigid_body_of(model) for model in (experiment.before, experiment.after))

@@ -13,6 +13,7 @@ from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
 from rich.console import Console
 
 import hybrid_jax
+from experiments.real_flight import study
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
 from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
@@ -22,7 +23,7 @@ from experiments.real_flight.recipes import RECIPES
 from experiments.real_flight.report import choice_tables, parameter_tables
 from experiments.real_flight.rows import QUANTITIES, TAGS, pooled, verdicts
 from experiments.real_flight.scoring import parameters, scores
-from experiments.real_flight.study import each_fold, run_folds
+from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
@@ -229,11 +230,15 @@ def test_folds_of_real_flights_share_no_sample(name, by, count):
         assert not (train | validation) & test
 
 
-def test_programs_of_the_previous_fold_are_freed():
+def test_programs_of_the_previous_fold_are_freed(monkeypatch):
     """Otherwise many folds need more memory maps than Linux gives a process."""
     kept, twice = [], jax.jit(lambda x: 2 * x)
-    for number, _ in each_fold(make_folds(LOGS, None, CONFIG)):
+
+    def run_fold(experiment, outputs, number, source):
         twice(np.zeros(number + 3)).block_until_ready()  # another program for each shape
         kept.append(len(jax.devices()[0].client.live_executables()))
+
+    monkeypatch.setattr(study, "_run_fold", run_fold)
+    run_folds(Experiment(CONFIG, MODEL, MODEL, {"source": LogSet("source", LOGS, [])}, DT, None))
     assert len(kept) > 1
     assert kept[-1] <= kept[0]
