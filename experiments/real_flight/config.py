@@ -4,7 +4,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from experiments.real_flight.recipes import Model, RecipeName
+from experiments.real_flight.models import Model, RecipeName
 from experiments.runner.options import Count, NotNegative, Positive, Run, check_numbers, distinct
 from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned

@@ -13,7 +13,7 @@ from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
 from experiments.real_flight.models import thrust_baseline
-from experiments.real_flight.rows import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
+from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
 from experiments.reporting.plots import COLOURS, STYLE, legend_below, tick_errors
@@ -113,24 +113,25 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     windows = windows[:PIECES]
     fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
     fields["thrust", "nominal"] = thrust_baseline(experiment.after)
-    inputs = windows.x0, windows.u, windows.dt
-    states = {cell: np.asarray(rollout_batch(field, *inputs)) for cell, field in fields.items()}
     truth = np.concatenate([windows.x0[:1], *windows.x])
     time = begin + dt * np.arange(len(truth))
+    # Each prediction ends in a gap of its line.
+    at = time[:: config.longest][: len(windows), None] + dt * np.arange(config.longest + 2)
+    gap, states = np.full((len(windows), 1, 13), np.nan), {}
+    for cell, field in fields.items():
+        predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
+        states[cell] = np.concatenate([windows.x0[:, None], predicted, gap], axis=1)
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
-    places = [*range(*VELOCITY.indices(13)), *range(*BODY_RATES.indices(13))]
-    for axes, place, name in zip(panels.flat, places, ("vx", "vy", "vz", "ωx", "ωy", "ωz"), strict=True):
+    names = ("vx", "vy", "vz", "ωx", "ωy", "ωz")
+    for axes, place, name in zip(panels.flat, range(VELOCITY.start, BODY_RATES.stop), names, strict=True):
         axes.plot(time, truth[:, place], color="black", linewidth=1.6, label="measured")
         low, high = truth[:, place].min(), truth[:, place].max()
         room = 0.5 * (high - low) or 1.0
-        for (model, mode), predicted in states.items():
-            label: str | None = cell_name(model, mode)
-            for piece, (x0, x) in enumerate(zip(windows.x0, predicted, strict=True)):
-                at = time[piece * config.longest :][: config.longest + 1]
-                axes.plot(at, [x0[place], *x[:, place]], color=MODEL_COLOURS[model], linewidth=1.2, label=label)
-                axes.plot(at[:1], x0[place], ".", color="black", markersize=4)
-                label = None
+        for cell, pieces in states.items():
+            style = {"color": MODEL_COLOURS[cell[0]], "linewidth": 1.2, "label": cell_name(*cell)}
+            axes.plot(at.ravel(), pieces[..., place].ravel(), **style)
+        axes.plot(at[:, 0], windows.x0[:, place], ".", color="black", markersize=4)
         axes.set(title=f"{name} [{'m/s' if name[0] == 'v' else 'rad/s'}]", ylim=(low - room, high + room))
     for axes in panels[1]:
         axes.set_xlabel("time in flight [s]")

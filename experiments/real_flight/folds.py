@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Int
 
 from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.recipes import RECIPES
+from experiments.real_flight.models import RECIPES
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.splits import flight_of, folds, hold_out, manoeuvre_of
 from hybrid_jax.flights.windows import count_windows, require_length

@@ -1,26 +1,146 @@
-"""The models of a real vehicle before training."""
+"""The models of a real vehicle before training, and the recipes that train them: stages as data."""
 
-from dataclasses import replace
-from typing import Any
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
 
 import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-from experiments.real_flight.recipes import Recipe
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
+Model = Literal["hybrid", "no_physics", "physics_only"]
+Physics = Literal["multirotor", "torque_off", "frozen_rates"]
+RecipeName = Literal["staged", "turning", "short", "torque_off", "frozen_rates"]
+
+REFERENCE = 1000  # N for which a recipe states the epochs of an adaptation
 NETWORK, ORDER = range(2)  # uses of a seed: weights of the network, order of the minibatches
+NETWORK_ALONE = 5e-3  # rate of a network without physics in stages that train physics alone
+
+
+@dataclass(frozen=True)
+class Step:
+    """One stage of training, as `hybrid_jax.training.stages.Stage`."""
+
+    physics: float  # Adam's learning rate; 0 freezes that part
+    residual: float
+    steps: int  # the first intervals of each window
+    epochs: int
+    patience: int = 20
+    frozen: tuple[str, ...] = ()  # names of physical parameters that are not trained
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """A way to train every model.
+
+    Attributes:
+        about: description for the report.
+        window: intervals per window, for training and validation.
+        source: stages on the source's flights.
+        adaptation, scratch: stages on N windows of the target, from the source's model and from the nominal vehicle.
+        physics: of the hybrid and of physics-only.
+        learn: learned names of `multirotor.SHAPES`; if empty, those of the vehicle.
+        outputs: of a hybrid's network.
+        position: factor on the scale of position errors in the loss. Position is the integral of velocity and adds no
+            information; where an estimator's two disagree, a smaller scale would cause wrong accelerations.
+        huber: errors above this multiple of the baseline's error count linearly.
+    """
+
+    about: str
+    window: int
+    source: tuple[Step, ...]
+    adaptation: tuple[Step, ...]
+    scratch: tuple[Step, ...]
+    physics: Physics = "multirotor"
+    learn: tuple[str, ...] = ()
+    outputs: Literal["accelerations", "angular_acceleration", "motion"] = "motion"
+    position: float = 1.0
+    huber: float = 1.0
+
+
+_SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))
+# The gain of the velocity estimate is a property of the estimator, which no change of the vehicle affects. So is its
+# lag, but flights after the change determine that single number better than the source does.
+_ESTIMATOR = ("velocity_gain",)
+# A load on a cable comes with the change; fitted to flights without one, the pull would absorb aerodynamic moments.
+CHANGE = ("cable_pull",)
+_ADAPTATION = (
+    Step(1e-2, 0, 10, 80, 30, _ESTIMATOR),
+    Step(3e-3, 3e-3, 10, 80, 30, _ESTIMATOR),
+    Step(1e-3, 1e-3, 25, 60, 20, _ESTIMATOR),
+)
+_SCRATCH = (Step(2e-2, 0, 10, 120, 40), Step(5e-3, 5e-3, 10, 160, 40), Step(1e-3, 1e-3, 25, 60, 20))
+# For manoeuvres other than those trained on: short training limits overfitting of the rotation, while thrust and drag,
+# which transfer to all manoeuvres, are identified within a few steps.
+_BRIEF = (Step(2e-2, 0, 10, 20), Step(0, 2e-3, 25, 5), Step(0, 1e-3, 50, 5))
+
+_STAGED = Recipe(
+    "physics, then all on 10 steps, then all on 25; the network adds to accelerations alone",
+    *(25, _SOURCE, _ADAPTATION, _SCRATCH), outputs="accelerations", position=10.0,
+)  # fmt: skip
+_TURNING = "physics, then all on 10 steps, then all on 25; the network adds to the angular acceleration alone"
+_SHORT = "physics, then all on 10 steps; the network adds to accelerations alone"
+_CAREFUL = Recipe(
+    "physics on 10 steps, then the network alone for a few epochs on 25 and 50; it adds to the angular acceleration",
+    *(50, _BRIEF, _BRIEF, _BRIEF),
+    outputs="angular_acceleration",
+    position=10.0,
+    # Where one manoeuvre is far more aggressive than the others, squared errors of it would dominate the loss.
+    huber=0.2,
+)
+
+RECIPES: Mapping[str, Recipe] = {
+    "staged": _STAGED,
+    "turning": replace(_STAGED, about=_TURNING, outputs="angular_acceleration"),
+    "short": replace(_STAGED, about=_SHORT, source=_SOURCE[:2], adaptation=_ADAPTATION[:2], scratch=_SCRATCH[:2]),
+    "torque_off": replace(
+        _CAREFUL,
+        about=f"the rotors' torque is not used; {_CAREFUL.about}",
+        physics="torque_off",
+        learn=("k", "drag", "aerodynamic_moment", "rate_damping", "velocity_gain"),
+    ),
+    "frozen_rates": replace(
+        _CAREFUL,
+        about=f"of physics thrust and drag alone; {_CAREFUL.about}",
+        physics="frozen_rates",
+        learn=("k", "drag", "velocity_gain"),
+    ),
+}
+
+
+def rates_of(step: Step, model: str, field: AbstractVectorField) -> dict[str, float]:
+    """The learning rate of each group of a field's parameters; 0 for those that the step freezes."""
+    rates = {
+        "hybrid": {"physics": step.physics, "residual": step.residual},
+        # It has no physics to train first, and gets as many epochs.
+        "no_physics": {"residual": step.residual or NETWORK_ALONE},
+        "physics_only": {"": step.physics},
+    }
+    paths = named_leaves(eqx.filter(field, trainable(field)))
+    return rates[model] | {path: 0.0 for path in paths if path.rpartition("/")[-1] in step.frozen}
+
+
+def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
+    """The first of some recipes that trains a model in the same way; only a hybrid depends on `outputs`."""
+
+    def training(name: str) -> Recipe:
+        how = replace(RECIPES[name], about="")
+        return how if model == "hybrid" else replace(how, outputs="motion")
+
+    return next((name for name in among if training(name) == training(recipe)), recipe)
 
 
 def rigid_body_of(model: VehicleModel) -> Multirotor:

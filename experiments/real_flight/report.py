@@ -11,9 +11,10 @@ import numpy as np
 from rich.console import Console
 
 import hybrid_jax
+from experiments.real_flight import scoring
 from experiments.real_flight.figures import make_figures
-from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import QUANTITIES, SUM, TAGS, cell_name, cells, least, pooled, score_labels, verdicts
+from experiments.real_flight.models import RECIPES
+from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, least, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment
 from experiments.reporting import report
@@ -51,7 +52,7 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
     """Write models, figures and, last, the report; print its main tables."""
     out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
     save_models(out / "models", experiment, outputs)
-    claims, nominal = verdicts(rows), named_parameters(experiment.before.physics())
+    claims, nominal = scoring.verdicts(rows), named_parameters(experiment.before.physics())
     main = [*score_tables(rows, experiment.dt), *([verdict_table(claims, "Hypotheses")] if claims else [])]
     records = [record for logs in experiment.logs.values() for record in logs.records]
     more = [*fold_tables(rows), *choice_tables(outputs.choices), *parameter_tables(rows, nominal), *log_tables(records)]

@@ -11,10 +11,8 @@ import numpy as np
 
 from experiments.real_flight import scoring, train
 from experiments.real_flight.folds import Fold, hold_out_validation, make_folds, require_windows
-from experiments.real_flight.models import rigid_body_of, thrust_baseline
-from experiments.real_flight.recipes import RECIPES, equivalent_recipe
-from experiments.real_flight.rows import TAGS, least
-from experiments.real_flight.scoring import Test, linear_residuals, parameters, relative_error
+from experiments.real_flight.models import RECIPES, equivalent_recipe, rigid_body_of, thrust_baseline
+from experiments.real_flight.scoring import TAGS, Test, least, linear_residuals, parameters, relative_error
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from hybrid_jax.dynamics.baselines import HoldState

@@ -9,11 +9,11 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
+from experiments.real_flight import models
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.folds import Fold, evenly_spaced, sampled_indices
 from experiments.real_flight.logs import LogSet
-from experiments.real_flight.models import ORDER, key_of, move_to_vehicle, objective_of, untrained
-from experiments.real_flight.recipes import CHANGE, RECIPES, REFERENCE, Step, rates_of
+from experiments.real_flight.models import CHANGE, ORDER, RECIPES, REFERENCE, Step
 from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
@@ -89,7 +89,7 @@ def training_data(
     how, config = RECIPES[recipe], experiment.config
     validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, config.validation)
     train = cut_windows(fold.train, how.window, 1 if source else config.stride)
-    loss = source.objective if source else objective_of(experiment.before, train.windows, how)
+    loss = source.objective if source else models.objective_of(experiment.before, train.windows, how)
     return TrainingData(train, validation, loss, capacity or len(train))
 
 
@@ -97,7 +97,7 @@ def train_on_source(
     experiment: Experiment, name: str, model: str, recipe: str, data: TrainingData, seeds: int, best_epochs: Any = ()
 ) -> TrainedModel:
     """Train a model on all windows before the change, one run per seed; `best_epochs` is that of `in_stages`."""
-    fields = untrained(model, experiment.before, RECIPES[recipe], experiment.config.hidden, seeds)
+    fields = models.untrained(model, experiment.before, RECIPES[recipe], experiment.config.hidden, seeds)
     start = TrainedModel(model, "source_only", recipe, fields, range(seeds), [np.arange(len(data.train))] * seeds)
     frozen = CHANGE if "target" in experiment.logs else ()
     steps = [replace(step, frozen=(*step.frozen, *frozen)) for step in RECIPES[recipe].source]
@@ -120,7 +120,7 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
 
 def transfer(experiment: Experiment, source: TrainedModel) -> TrainedModel:
     """Move a source model to the vehicle after the change, without training."""
-    return replace(source, mode="zero_shot", fields=move_to_vehicle(source.fields, experiment.after.vehicle))
+    return replace(source, mode="zero_shot", fields=models.move_to_vehicle(source.fields, experiment.after.vehicle))
 
 
 def adapt(
@@ -133,7 +133,7 @@ def adapt(
     config, how = experiment.config, RECIPES[start.recipe]
     fields, steps = start.fields, how.adaptation
     if mode == "scratch":
-        fields, steps = untrained(start.model, experiment.after, how, config.hidden, len(start)), how.scratch
+        fields, steps = models.untrained(start.model, experiment.after, how, config.hidden, len(start)), how.scratch
     seeds = [seed for _ in sizes for seed in start.seeds]
     subsets = [sampled_indices(data.train.sizes, size, config.draw, s) for size in sizes for s in start.seeds]
     begin = TrainedModel(start.model, mode, start.recipe, lane(fields, np.array(seeds)), seeds, subsets)
@@ -173,7 +173,7 @@ def in_stages(
 
 def _run_configs(start: TrainedModel, fields: Any, step: Step, factor: float) -> RunConfig:
     longest, one = max(map(len, start.subsets)), lane(fields, 0)
-    rates = rates_by_group(one, rates_of(step, start.model, one))
+    rates = rates_by_group(one, models.rates_of(step, start.model, one))
 
     def configure(run: int) -> RunConfig:
         # An epoch of few windows has few gradient steps, so small N are trained for more epochs.
@@ -191,7 +191,7 @@ def _start_states(fields: Any, seeds: Counts, number, validation: Trajectories, 
 
     def one(run):
         field, seed = run
-        state = fitting.start(field, jax.random.fold_in(key_of(seed, ORDER), number))
+        state = fitting.start(field, jax.random.fold_in(models.key_of(seed, ORDER), number))
         return judged(state, validation, settings)
 
     return jax.lax.map(one, (fields, seeds))

@@ -10,8 +10,15 @@ from recorded import CONFIG, LOGS
 
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.folds import make_folds
-from experiments.real_flight.models import move_to_vehicle, objective_of, physics_of, untrained
-from experiments.real_flight.recipes import RECIPES, equivalent_recipe, rates_of
+from experiments.real_flight.models import (
+    RECIPES,
+    equivalent_recipe,
+    move_to_vehicle,
+    objective_of,
+    physics_of,
+    rates_of,
+    untrained,
+)
 from experiments.real_flight.scoring import body_of
 from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel

@@ -18,11 +18,9 @@ from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
 from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
 from experiments.real_flight.logs import LogSet, load_logs
-from experiments.real_flight.models import thrust_baseline, untrained
-from experiments.real_flight.recipes import RECIPES
+from experiments.real_flight.models import RECIPES, thrust_baseline, untrained
 from experiments.real_flight.report import choice_tables, parameter_tables
-from experiments.real_flight.rows import QUANTITIES, TAGS, pooled, verdicts
-from experiments.real_flight.scoring import parameters, scores
+from experiments.real_flight.scoring import QUANTITIES, TAGS, parameters, pooled, scores, verdicts
 from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results

@@ -16,7 +16,7 @@ from experiments.real_flight.__main__ import LISTS, load_vehicle_models, main, p
 from experiments.real_flight.config import PRESETS, Cleaning, RealFlightConfig
 from experiments.real_flight.folds import make_folds
 from experiments.real_flight.logs import clean, load_logs, require_distinct, vehicle_toml
-from experiments.real_flight.rows import QUANTITIES
+from experiments.real_flight.scoring import QUANTITIES
 from experiments.runner.command import read
 from hybrid_jax.dynamics.vehicle_file import LAG
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
