@@ -23,7 +23,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import evaluate, sweep
 from hybrid_jax.training.fitting import STOPPED, FitState

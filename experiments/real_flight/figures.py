@@ -19,8 +19,7 @@ from experiments.real_flight.train import Experiment, TrainedModel
 from experiments.reporting.plots import COLOURS, STYLE, legend_below, tick_errors
 from experiments.reporting.results import Results
 from hybrid_jax.flights.log import segments
-from hybrid_jax.flights.splits import flight_of
-from hybrid_jax.flights.windows import cut_windows, require_length
+from hybrid_jax.flights.windows import cut_windows, flight_of, require_length
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 

@@ -9,8 +9,7 @@ from jaxtyping import Int
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.models import RECIPES
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.splits import flight_of, folds, hold_out, manoeuvre_of
-from hybrid_jax.flights.windows import count_windows, require_length
+from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.trajectories import Trajectories
 
 FOLDS, VALIDATION_SHARE = 3, 0.2

@@ -16,7 +16,7 @@ from hybrid_jax.flights import windows
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.log import COLUMNS, FlightLog, gaps, repeats, segments
-from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.flights.windows import flight_of
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE, Domain

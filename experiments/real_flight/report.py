@@ -26,7 +26,7 @@ from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_ta
 from experiments.runner.environment import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.flights.consistency import FAILS
-from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.flights.windows import flight_of
 
 NOTES = (
     "Validation flights stop every training and are not among the N windows.",

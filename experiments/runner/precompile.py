@@ -8,8 +8,7 @@ import jax
 import numpy as np
 
 from hybrid_jax.runtime import cores
-from hybrid_jax.sim.flight import DT
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.trajectories import Trajectories
 

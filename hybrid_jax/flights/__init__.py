@@ -24,8 +24,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.consistency import Check, check_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.splits import folds, hold_out
-from hybrid_jax.flights.windows import LogWindows, cut_windows, load_log, load_logs, load_windows
+from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_log, load_logs, load_windows
 
 __all__ = [
     "Check",

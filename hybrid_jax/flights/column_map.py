@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
-from hybrid_jax.flights.flight_csv import MAX_ROWS, flight_log, read_table
+from hybrid_jax.flights.flight_csv import flight_log, read_table
 from hybrid_jax.flights.log import FlightLog, wrong_norms
 from hybrid_jax.vehicle import from_table, names_of, read_tables, require_known
 
@@ -107,13 +107,13 @@ def load_column_map(path: str | Path) -> ColumnMap:
     return from_table(ColumnMap, parts, str(path))
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_ROWS) -> FlightLog:
+def read_mapped(path: str | Path, column_map: ColumnMap) -> FlightLog:
     """Read one flight of a CSV file, plain or gzip, into the library's units and frames.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
-    table = read_table(path, column_map.names, delimiter=column_map.format.delimiter, max_rows=max_rows)
+    table = read_table(path, column_map.names, delimiter=column_map.format.delimiter)
     stated, parts, begin = column_map.quantities, {}, 0
     for name, scales in SCALES.items():
         end = begin + len(stated[name].columns)
@@ -128,20 +128,15 @@ def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_
 def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
     fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
-        row = int(np.abs(values).max(axis=1).argmax())
         # Yaw may be counted over turns, tilt may not.
-        if np.abs(values[:, :2]).max() > 2 * math.pi:
-            raise ValueError(
-                f"{origin}: row {row + 2}, field {fields}: roll or pitch above 2π; "
-                'are the angles degrees? set [attitude] unit = "deg"'
-            )
+        for row in np.flatnonzero((np.abs(values[:, :2]) > 2 * math.pi).any(axis=1))[:1]:
+            advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
+            raise ValueError(f"{origin}: row {row + 2}, field {fields}: {advice}")
         return from_euler(values)
     q = np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
     for row, norm in wrong_norms(q):
-        raise ValueError(
-            f"{origin}: row {row + 2}, field {fields}: norm is {norm:.4g}, not 1; "
-            "cut out samples without an attitude, or name the four quaternion columns"
-        )
+        advice = "cut out samples without an attitude, or name the four quaternion columns"
+        raise ValueError(f"{origin}: row {row + 2}, field {fields}: norm is {norm:.4g}, not 1; {advice}")
     return q
 
 
@@ -152,11 +147,8 @@ def _check(name: str, stated: Columns) -> None:
     named = isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)
     if not named or len(columns) != count:
         raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")
-    numbers = isinstance(stated.polynomial, tuple) and all(
-        isinstance(c, int | float) and math.isfinite(c) for c in stated.polynomial
-    )
-    if not numbers or bool(stated.polynomial) != (stated.unit == "command"):
-        raise ValueError(
-            f"[{name}]: polynomial must be numbers c0, c1, … if and only if the unit is command, "
-            f"got {stated.polynomial!r} for {stated.unit}"
-        )
+    given = stated.polynomial
+    numbers = isinstance(given, tuple) and all(isinstance(c, int | float) and math.isfinite(c) for c in given)
+    if not numbers or bool(given) != (stated.unit == "command"):
+        what = "polynomial must be numbers c0, c1, … if and only if the unit is command"
+        raise ValueError(f"[{name}]: {what}, got {given!r} for {stated.unit}")

@@ -1,7 +1,11 @@
-"""From recorded logs to training windows: `load_windows` takes a folder of logs there in one call."""
+"""From recorded logs to training windows: reading folders, splitting by flight or manoeuvre, cutting.
 
+Windows of one flight overlap and share wind, battery and payload, so a split of windows would leak into the test.
+"""
+
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,10 +18,14 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mappe
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
-from hybrid_jax.flights.splits import SUFFIXES, flight_of
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
+
+Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
+SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of log files
+_SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg)$", re.IGNORECASE)
+_RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
 
 @dataclass(frozen=True)
@@ -120,6 +128,56 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
     return log
+
+
+def flight_of(log: FlightLog) -> str:
+    """The name of a flight's file, without folder and `SUFFIXES`."""
+    return _SUFFIX.sub("", Path(log.name).name)
+
+
+def manoeuvre_of(log: FlightLog) -> str:
+    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are both "chirp".
+
+    A number counts as that of a run after a separator or after "run", "flight", "take" or "log"; "figure8" has none.
+    """
+    return _RUN.sub("", flight_of(log)) or flight_of(log)
+
+
+def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
+    """Split flights into those of other names and those of the given names.
+
+    Raises:
+        ValueError: an unknown name, or one side is empty.
+    """
+    known = sorted({of(log) for log in logs})
+    for name in names:
+        if name not in known:
+            raise ValueError(f"names: no flight is called {name!r}, only {', '.join(known)}")
+    split = [log for log in logs if of(log) not in names], [log for log in logs if of(log) in names]
+    if not all(split):
+        found = f"{len(split[0])} flights for training and {len(split[1])} held out"
+        raise ValueError(f"names: {found}; each side needs one")
+    return split
+
+
+def folds(
+    logs: Sequence[FlightLog], count: int | None = None, of: Callable[[FlightLog], str] = flight_of, seed: int = 0
+) -> list[Split]:
+    """Make splits in which each flight is held out once, together with all flights of its name.
+
+    Args:
+        count: number of splits; by default one per name.
+        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
+
+    Raises:
+        ValueError: count is less than 2 or more than the number of names.
+    """
+    names = sorted({of(log) for log in logs})
+    count = len(names) if count is None else count
+    if not 2 <= count <= len(names):
+        raise ValueError(f"count must be from 2 to the {len(names)} different names of the flights, got {count}")
+    dealt = np.random.default_rng(seed).permutation(np.array(names, object))
+    return [hold_out(logs, list(dealt[i::count]), of) for i in range(count)]
 
 
 def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:

@@ -26,9 +26,8 @@ with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
 
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain  # noqa: E402
-from hybrid_jax.sim.flight import Flights, fly, gone_wrong  # noqa: E402
+from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402  # noqa: E402
 from hybrid_jax.sim.quadrotor import Quadrotor  # noqa: E402
-from hybrid_jax.sim.record import SplitSpec, make_dataset  # noqa: E402
 
 __all__ = [
     "EXTERNAL_FORCE",

@@ -26,7 +26,7 @@ from experiments.reporting.report import load_report
 from experiments.runner.precompile import placeholder
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.vehicle import IRIS
 
 EXPERIMENTS = ("param_shift", "external_force")

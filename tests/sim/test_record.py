@@ -6,10 +6,9 @@ import pytest
 
 from experiments import make_flights
 from hybrid_jax.io.datasets import content_hash, load_dataset
-from hybrid_jax.sim import record as recording
+from hybrid_jax.sim import flight as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.flight import Flights, fly, gone_wrong
-from hybrid_jax.sim.record import SplitSpec, Tally, cut, make_dataset
+from hybrid_jax.sim.flight import Flights, SplitSpec, Tally, cut, fly, gone_wrong, make_dataset
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 
