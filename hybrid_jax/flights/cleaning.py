@@ -7,7 +7,7 @@ from scipy import signal
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import GAP, FlightLog, at_rest, even_segments, repeats, runs_of, segments
-from hybrid_jax.flights.motor_response import respond
+from hybrid_jax.flights.readings import respond
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import Vehicle
 

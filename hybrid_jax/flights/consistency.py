@@ -13,8 +13,7 @@ from jaxtyping import Float
 from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.log import COLUMNS, FlightLog, at_rest, gaps, repeats, sound_intervals
-from hybrid_jax.flights.motor_response import moving_mean, respond
-from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle
+from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 

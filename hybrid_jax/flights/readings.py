@@ -1,4 +1,10 @@
-"""Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake."""
+"""Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake.
+
+From angular acceleration and motors `respond` estimates the order of the motors, their direction of spin and their lag.
+"""
+
+from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -7,12 +13,20 @@ from scipy.spatial.transform import Rotation
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
 from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import Vehicle
 
 NOTHING = "nothing to correct"  # the reading of the unchanged log
 LATE = 0.1  # delay or advance of a velocity that is tried [s]
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
 FLIPS = dict(zip("xyz", 1 - 2 * np.eye(3), strict=True))
+
+LONGEST_LAG = 0.1  # s, either way
+# Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
+# and offsets of the centre of mass, which motors counteract and would appear to cause.
+FAST, SLOW = 0.03, 0.2  # s
+YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
+ORDERS = np.array(list(permutations(range(4))))
 
 Vectors = Float[np.ndarray, "n 3"]
 Readings = dict[str, tuple[Vectors, Vectors]]
@@ -102,3 +116,78 @@ def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
 def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
     """Means of adjacent samples."""
     return 0.5 * (values[1:] + values[:-1])
+
+
+class Response(NamedTuple):
+    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
+
+    order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
+    yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
+    lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
+    correlations: list[float]  # of roll and pitch at that order and lag, of yaw (its size) at its best lag near it
+    as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
+
+
+def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
+    """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
+    reach = round(LONGEST_LAG / log.dt)
+    torque, squares = _quick(log, vehicle)
+    if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
+        return None
+    arms = np.asarray(vehicle.rotor_positions)
+    # Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row.
+    mix = np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
+    table = np.stack([correlations(torque, squares, mix, lag) for lag in range(-reach, reach + 1)])
+    # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
+    score = table[..., 0] + table[..., 1]
+    at, best = np.unravel_index(score.argmax(), score.shape)
+    near = round(YAW_LEAD / log.dt)
+    around = table[max(0, at - near) : at + near + 1, best, 2]
+    yaw = around[np.abs(around).argmax()]
+    sign = -1 if yaw < 0 else 1
+    found = [*table[at, best, :2].tolist(), float(abs(yaw))]
+    lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
+    return Response(tuple(ORDERS[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+
+
+def correlations(
+    torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n 4"], mix: Float[np.ndarray, "3 4"], lag: int
+) -> Float[np.ndarray, "24 3"]:
+    """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
+    ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
+    cross, spread = ahead.T @ behind, behind.T @ behind
+    shared = np.einsum("aj,aoj->oa", mix, cross[:, ORDERS])
+    variance = np.einsum("ai,oij,aj->oa", mix, spread[ORDERS[:, :, None], ORDERS[:, None, :]], mix)
+    return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
+
+
+def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
+    """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
+    fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
+    sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
+    if len(sound) < fast + slow:
+        return np.zeros((0, 3)), np.zeros((0, 4))
+    middle = 0.5 * (omega[1:] + omega[:-1])
+    torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(middle, inertia * middle)
+    bands = []
+    for values in (torque, log.u[:-1] ** 2):
+        smooth = moving_mean(values, fast)
+        trend = moving_mean(smooth, slow)
+        bands.append(smooth[slow // 2 :][: len(trend)] - trend)
+    whole = moving_mean(sound[:, None].astype(float), fast + slow - 1) > 1 - 1e-9
+    return np.where(whole, bands[0], 0.0), np.where(whole, bands[1], 0.0)
+
+
+def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
+    """The mean of each `width` consecutive rows."""
+    total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+    return (total[width:] - total[:-width]) / width
+
+
+def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
+    """Sub-sample position of the peak, −0.5 … 0.5, by a parabola through the maximum and its neighbours."""
+    if not 0 < at < len(score) - 1:
+        return 0.0
+    left, top, right = score[at - 1 : at + 2]
+    curve = left - 2 * top + right
+    return float(0.5 * (left - right) / curve) if curve < 0 else 0.0

@@ -4,6 +4,7 @@ A dataset holds windows in splits of disjoint flights, with statistics and confi
 """
 
 import zlib
+from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -30,8 +31,6 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of
 
 # Bounds of a sound flight of the Iris; those of other vehicles are scaled.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
-
-
 RECIPE = 1  # increment when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
 LOW = (0.5, 0.2)  # m, mean altitudes over a window below which ground effect adds at least 0.4 % and 2.6 % of thrust
@@ -119,16 +118,6 @@ class SplitSpec:
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
 
-@dataclass
-class Tally:
-    """Numbers of flights and windows made for a split, and of those rejected."""
-
-    flights: int = 0
-    dropped_flights: int = 0
-    windows: int = 0
-    rejected_windows: int = 0
-
-
 def make_dataset(
     domain: Domain, splits: Mapping[str, SplitSpec], seed: int, progress: Callable[[float], None] = lambda share: None
 ) -> Dataset:
@@ -153,57 +142,51 @@ def make_dataset(
     metadata = {
         "config": configuration(domain, splits, seed),
         "versions": versions("jax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax"),
-        "tallies": {name: asdict(tally) for name, tally in tallies.items()},
+        "tallies": {name: dict(tally) for name, tally in tallies.items()},
         "statistics": {name: survey(split) for name, split in windows.items()},
     }
     return Dataset(windows, metadata)
 
 
-def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Trajectories, Tally]:
+def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Trajectories, Counter[str]]:
     """Shuffled, non-overlapping windows of as many flights as needed."""
     key_flights, key_order = jax.random.split(key)
-    tally, parts = Tally(), []
-    while tally.windows < SPARE * spec.windows:
-        flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally.flights))
+    tally, parts = Counter[str](), []
+    while tally["windows"] < SPARE * spec.windows:
+        flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally["flights"]))
         parts += cut(flights, spec.steps, tally, domain.nominal)
         if not parts:
-            raise ValueError(f"domain {domain.name}: none of {tally.flights} flights stayed in bounds")
+            raise ValueError(f"domain {domain.name}: none of {tally['flights']} flights stayed in bounds")
     windows = concatenate(parts)
     order = np.asarray(jax.random.permutation(key_order, len(windows)))[: spec.windows]
     return windows[order], tally
 
 
-def cut(flights: Flights, steps: int, tally: Tally, vehicle: Vehicle = IRIS) -> list[Trajectories]:
-    """The valid windows of the valid flights (float32). Counts flights and windows in the tally."""
-    parts = []
-    wrong = gone_wrong(flights.states, vehicle)
+def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IRIS) -> list[Trajectories]:
+    """The valid windows of the valid flights (float32); the tally counts flights, windows and those of them dropped."""
+    parts, wrong = [], gone_wrong(flights.states, vehicle)
+    tally.update(flights=len(wrong), dropped_flights=int(wrong.sum()))
     for states, inputs, lowest in zip(*(leaf[~wrong] for leaf in flights[:3]), strict=True):
         windows = windows_of(states.astype(np.float32), inputs.astype(np.float32), DT, steps=steps)
         # With a rotor below ground, the model of ground effect does not apply.
         reach = steps * np.arange(len(windows))[:, None] + np.arange(steps + 1)
         sound = (lowest[reach] >= 0).all(axis=1)
         parts.append(windows[sound])
-        tally.windows += int(sound.sum())
-        tally.rejected_windows += int((~sound).sum())
-    tally.flights += len(wrong)
-    tally.dropped_flights += int(wrong.sum())
+        tally.update(windows=int(sound.sum()), rejected_windows=int((~sound).sum()))
     return parts
 
 
 def survey(windows: Trajectories) -> dict[str, float]:
     """Speeds, tilts, altitudes …: percentiles over all states and shares in [0, 1], by name and unit."""
     x = np.asarray(windows.x)
-    altitude, q = x[..., POSITION][..., 2], x[..., QUATERNION]
+    altitude, q, rates = x[..., POSITION][..., 2], x[..., QUATERNION], np.abs(x[..., BODY_RATES])
     height = altitude.mean(axis=1)
-    rates = np.abs(x[..., BODY_RATES])
     channels = {
         "speed [m/s]": np.linalg.norm(x[..., VELOCITY], axis=-1),
         "tilt [deg]": np.degrees(np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))),
         "altitude [m]": altitude,
         "distance from home [m]": np.linalg.norm(x[..., POSITION][..., :2], axis=-1),
-        "|roll rate| [rad/s]": rates[..., 0],
-        "|pitch rate| [rad/s]": rates[..., 1],
-        "|yaw rate| [rad/s]": rates[..., 2],
+        **{f"|{axis} rate| [rad/s]": rates[..., i] for i, axis in enumerate(("roll", "pitch", "yaw"))},
         "rotor speed [rad/s]": np.asarray(windows.u),
     }
     return {f"windows below {limit} m": float((height < limit).mean()) for limit in LOW} | {
