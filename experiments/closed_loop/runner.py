@@ -23,8 +23,8 @@ from hybrid_jax.control import (
     sample,
 )
 from hybrid_jax.io.archive import Arrays
+from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.forces import Wrench
-from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.state import POSITION, STATE_SIZE
 from hybrid_jax.sweep.lanes import LaneMap, stack
 

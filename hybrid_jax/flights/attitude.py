@@ -15,7 +15,6 @@ Quaternions = Float[np.ndarray, "n 4"]
 # Matrices from a frame to the library's: world z up, body forward-left-up.
 WORLDS = {"ENU": np.eye(3), "NED": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])}
 BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
-VELOCITY_FRAMES = ("world", "body")
 
 
 @dataclass(frozen=True)
@@ -27,7 +26,7 @@ class Frames:
     velocity: str  # world or body
 
     def __post_init__(self):
-        for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", VELOCITY_FRAMES)):
+        for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", ("world", "body"))):
             if getattr(self, name) not in tuple(known):
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 

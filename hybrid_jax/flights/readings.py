@@ -167,8 +167,8 @@ def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], 
     sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
     if len(sound) < fast + slow:
         return np.zeros((0, 3)), np.zeros((0, 4))
-    middle = 0.5 * (omega[1:] + omega[:-1])
-    torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(middle, inertia * middle)
+    mean = middle(omega)
+    torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(mean, inertia * mean)
     bands = []
     for values in (torque, log.u[:-1] ** 2):
         smooth = moving_mean(values, fast)

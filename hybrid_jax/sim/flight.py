@@ -19,9 +19,8 @@ from hybrid_jax import checks
 from hybrid_jax.io.datasets import Dataset, versions
 from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sim import pilot
-from hybrid_jax.sim.domain import Domain
+from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
-from hybrid_jax.sim.quadrotor import CHUNK, Quadrotor
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import IRIS, Vehicle

@@ -11,8 +11,8 @@ from mujoco import mjx
 
 from experiments.render import picture
 from hybrid_jax.sim import check_versions
+from hybrid_jax.sim.domain import build_model, traced_model
 from hybrid_jax.sim.forces import parameters_of
-from hybrid_jax.sim.quadrotor import build_model, traced_model
 from hybrid_jax.vehicle import IRIS
 
 OTHER = replace(
