@@ -83,9 +83,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
     done = f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
-    if len(log) < all_samples:
-        done += f"; {all_samples - len(log)} repeated samples left out"
-    return FlightLog(log.t, x, u, log.name), done
+    return FlightLog(log.t, x, u, log.name), f"{done}; {all_samples - len(log)} repeated samples left out"
 
 
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:

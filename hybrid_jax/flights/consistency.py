@@ -18,6 +18,7 @@ from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
+GROUND = "cut it out: in_flight(log), or --cleaning.in-flight"
 MORE_FLIGHT = "check on a flight with more motion"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
 THRUST = "v̇ against thrust along body z"
@@ -69,7 +70,8 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         _compare(log, "dp/dt against v", readings.velocities(log), LEAST_MOTION["velocity"]),
         _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
         _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
-        *_thrust(log, vehicle),
+        _at_most("time on the ground", float(at_rest(log).mean()), "share of samples", 0.01, GROUND),
+        _thrust(log, vehicle),
         _columns(log),
         *_motors(log, vehicle),
     ]
@@ -84,24 +86,18 @@ def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Che
     return Check(name, value, unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
-def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
-    """Check time on the ground, and in flight the mean specific force along body z over k Σu² / m."""
-    name, resting = "specific force over thrust per mass", at_rest(log)
-    flying = sound_intervals(log) & ~resting[:-1]
-    advice = "cut it out: in_flight(log), or --cleaning.in-flight"
-    ground = _at_most("time on the ground", float(resting.mean()), "share of samples", 0.01, advice)
+def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
+    """Check the mean specific force along body z in flight, over k Σu² / m."""
+    flying, name = sound_intervals(log) & ~at_rest(log)[:-1], "specific force over thrust per mass"
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
         still = "the motors stand still: check a log in flight"
-        return [ground, Check(name, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)]
+        return Check(name, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
-    return [
-        ground,
-        _check(name, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle)),
-    ]
+    return _check(name, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
 
 
 def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:

@@ -6,6 +6,7 @@ msg/versioned/VehicleLocalPosition.msg). Each topic has its own time stamps; all
 
 import contextlib
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,11 +29,7 @@ LOST = 5  # an interval above this multiple of a topic's median, or of dt, is a 
 
 
 def read_ulog(
-    path: str | Path,
-    *,
-    dt: float = 0.01,
-    motor_order: tuple[int, int, int, int] = (0, 1, 2, 3),
-    polynomial: tuple[float, ...] = (),
+    path: str | Path, *, dt: float = 0.01, motor_order: Sequence[int] = (0, 1, 2, 3), polynomial: Sequence[float] = ()
 ) -> FlightLog:
     """Read one flight at intervals of dt [s]; where a topic has a gap, the log has one too.
 
@@ -116,9 +113,9 @@ def _motors(data, path, order, polynomial) -> tuple[Float[np.ndarray, " n"], Flo
         if topic not in data:
             continue
         t, values = _samples(data, path, topic, tuple(field.format(motor) for motor in order), "timestamp")
+        if topic == RPM and np.abs(values).max() > 0:
+            return t, np.abs(values) * np.pi / 30
         if topic == RPM:
-            if np.abs(values).max() > 0:
-                return t, np.abs(values) * np.pi / 30
             continue  # ESCs without telemetry report zero
         if not polynomial:
             raise ValueError(f"{path}: has only motor commands ({topic}); give the polynomial that maps them to rad/s")
