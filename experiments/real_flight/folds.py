@@ -65,20 +65,16 @@ def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> 
 def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlightConfig) -> None:
     """Refuse, before anything is trained, flights that are too short; with a source, folds hold flights to adapt to."""
     longest = max(RECIPES[name].window for name in config.tried)
-    for fold in (*([source] if source else []), *folds):
+    for fold in filter(None, (source, *folds)):
         require_length(fold.train, longest)
         require_length(fold.validation, longest)
     for fold in folds:
         require_length(fold.test, config.longest)
         if len(config.tried) > 1:
             require_length(fold.validation, config.longest)
-        if source:
-            _require_size(max(config.n), count_windows(fold.train, longest))
-
-
-def _require_size(size: int, count: int) -> None:
-    if size > count:
-        raise ValueError(f"--n {size}: the training flights have only {count} windows; give a smaller --n")
+        size, count = max(config.n), count_windows(fold.train, longest)
+        if source and size > count:
+            raise ValueError(f"--n {size}: the training flights have only {count} windows; give a smaller --n")
 
 
 def evenly_spaced(windows: Trajectories, count: int) -> Trajectories:
@@ -90,9 +86,8 @@ def sampled_indices(sizes: Sequence[int], size: int, draw: str, seed: int) -> In
     """Sample the indices of the training windows of one run, from flights of so many windows each.
 
     Random draws are of any windows; smaller sizes are prefixes of larger ones. Contiguous draws are consecutive windows
-    of one flight, or where no flight is that long, whole flights and a part of another.
+    of one flight, or where no flight is that long, whole flights and a part of another. There are as many windows.
     """
-    _require_size(size, sum(sizes))
     if draw == "random":
         return np.random.default_rng(seed).permutation(sum(sizes))[:size]
     starts, left = np.cumsum([0, *sizes]), np.array(sizes)

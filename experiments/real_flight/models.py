@@ -182,13 +182,19 @@ def move_to_vehicle(fields: Any, vehicle: Vehicle) -> Any:
     """Move stacked fields to another vehicle, such as one with a payload; θ_p keeps its values in SI units."""
 
     def one(field):
-        return jax.tree.map(lambda node: with_vehicle(node, vehicle) if is_body(node) else node, field, is_leaf=is_body)
+        return jax.tree.map(
+            lambda node: with_vehicle(node, vehicle) if _is_body(node) else node, field, is_leaf=_is_body
+        )
 
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(fields))
 
 
-def is_body(node: Any) -> bool:
-    """Whether a node of a field's tree is a multirotor."""
+def body_of(field: Any) -> Any:
+    """The multirotor inside a field, which holds all that its physics learns; None without one."""
+    return next(filter(_is_body, jax.tree.leaves(field, is_leaf=_is_body)), None)
+
+
+def _is_body(node: Any) -> bool:
     return isinstance(node, Multirotor)
 
 

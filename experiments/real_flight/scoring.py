@@ -23,7 +23,7 @@ from jaxtyping import Int
 
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
 from experiments.real_flight.folds import non_overlapping
-from experiments.real_flight.models import is_body
+from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names
 from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate
@@ -32,7 +32,6 @@ from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training.channels import ChannelLoss
@@ -87,20 +86,17 @@ def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequ
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:
     """Estimate θ_p of each run, and its intervals if enough of its training windows share no sample."""
-    if not any(map(is_body, jax.tree.leaves(trained.fields, is_leaf=is_body))):
+    if body_of(trained.fields) is None:
         return [{} for _ in trained.seeds]
-    short = _short(data)
-    spacing = -(-short.horizon // data.train.stride)
-    learned = ravel_parameters(trained.run(0))[0].size
-    found: list[dict[str, Any]] = []
+    short, found = _short(data), []
+    spacing, learned = -(-short.horizon // data.train.stride), ravel_parameters(trained.run(0))[0].size
     # Runs of one size share a program; rounding the number of windows lets sizes and folds share one too.
     for _, group in groupby(range(len(trained)), lambda run: len(trained.subsets[run])):
         runs = list(group)
         own = [non_overlapping(trained.subsets[run], data.train.sizes, spacing) for run in runs]
         most = min(map(len, own)) // ROUND * ROUND
         picked = stack([each[np.linspace(0, len(each) - 1, most).round().astype(int)] for each in own])
-        bounded = most > learned
-        of = lane(trained.fields, np.array(runs))
+        of, bounded = lane(trained.fields, np.array(runs)), most > learned
         ends = jax.device_get(_intervals(of, picked if bounded else picked[:, :0], short, data.objective))
         for run in range(len(runs)):
             theta = {name: at.value[run] for name, at in ends.items()}
@@ -114,17 +110,12 @@ def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajecto
     """θ_p of each run and its intervals, of no width without windows."""
 
     def one(run):
-        field, indices = run
+        (field, indices), body = run, body_of(run[0])
         if len(indices):
-            return intervals(body_of(field), covariance_of(field, windows[indices], error=objective.error))
-        return intervals(body_of(field), jnp.zeros((ravel_parameters(body_of(field))[0].size,) * 2))
+            return intervals(body, covariance_of(field, windows[indices], error=objective.error))
+        return intervals(body, jnp.zeros((ravel_parameters(body)[0].size,) * 2))
 
     return jax.lax.map(one, (fields, picked))
-
-
-def body_of(field: AbstractVectorField) -> Multirotor:
-    """Return the multirotor inside a field, which holds all that its physics learns."""
-    return next(filter(is_body, jax.tree.leaves(field, is_leaf=is_body)))
 
 
 def linear_residuals(
@@ -146,12 +137,9 @@ def _short(data: TrainingData) -> Trajectories:
 
 def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:
     """Average RMSE over that of a baseline, over quantities and horizons; recipes are chosen by it."""
-
-    def rms(part, steps: int) -> float:
-        return float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float))))
-
-    pairs = zip(errors, baseline, strict=True)
-    return float(np.mean([rms(own, steps) / rms(other, steps) for own, other in pairs for steps in horizons]))
+    ends = [[part[:, steps - 1] for part in found for steps in horizons] for found in (errors, baseline)]
+    own, other = ([np.sqrt(np.mean(np.square(end, dtype=float))) for end in each] for each in ends)
+    return float(np.mean(np.divide(own, other)))
 
 
 def cells(rows: Results) -> dict[Cell, Results]:

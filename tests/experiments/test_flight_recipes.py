@@ -12,6 +12,7 @@ from experiments.real_flight.config import LEARN
 from experiments.real_flight.folds import make_folds
 from experiments.real_flight.models import (
     RECIPES,
+    body_of,
     equivalent_recipe,
     move_to_vehicle,
     objective_of,
@@ -19,7 +20,6 @@ from experiments.real_flight.models import (
     rates_of,
     untrained,
 )
-from experiments.real_flight.scoring import body_of
 from hybrid_jax.dynamics.kinematics import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import cut_windows
