@@ -8,8 +8,14 @@ from pathlib import Path
 from rich.console import Console
 
 from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
-from experiments.real_flight.folds import evenly_spaced, hold_out_validation
-from experiments.real_flight.logs import LogSet, load_logs, require_distinct, write_logs
+from experiments.real_flight.logs import (
+    LogSet,
+    evenly_spaced,
+    hold_out_validation,
+    load_logs,
+    require_distinct,
+    write_logs,
+)
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.report import failed_checks, write_report
 from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
@@ -56,15 +62,11 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def split_lists(arguments: Sequence[str]) -> list[str]:
     """Split comma-separated values, such as 10,50, of the options that take several values."""
-    words: list[str] = []
-    option = ""
+    words, option = [], ""
     for word in arguments:
-        named = word.startswith("--")
-        option, _, value = word.partition("=") if named else (option, "", word)
-        if option not in LISTS or word == option:
-            words.append(word)
-        else:
-            words += [*([option] if named else []), *value.split(",")]
+        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
+        several = option in LISTS and word != option
+        words += [option] * word.startswith("--") + value.split(",") if several else [word]
     return words
 
 

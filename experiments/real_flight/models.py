@@ -44,31 +44,20 @@ class Step:
 
 @dataclass(frozen=True)
 class Recipe:
-    """A way to train every model.
+    """A way to train every model."""
 
-    Attributes:
-        about: description for the report.
-        window: intervals per window, for training and validation.
-        source: stages on the source's flights.
-        adaptation, scratch: stages on N windows of the target, from the source's model and from the nominal vehicle.
-        physics: of the hybrid and of physics-only.
-        learn: learned names of `multirotor.SHAPES`; if empty, those of the vehicle.
-        outputs: of a hybrid's network.
-        position: factor on the scale of position errors in the loss. Position is the integral of velocity and adds no
-            information; where an estimator's two disagree, a smaller scale would cause wrong accelerations.
-        huber: errors above this multiple of the baseline's error count linearly.
-    """
-
-    about: str
-    window: int
-    source: tuple[Step, ...]
-    adaptation: tuple[Step, ...]
-    scratch: tuple[Step, ...]
-    physics: Physics = "multirotor"
-    learn: tuple[str, ...] = ()
-    outputs: Literal["accelerations", "angular_acceleration", "motion"] = "motion"
+    about: str  # for the report
+    window: int  # intervals per window, for training and validation
+    source: tuple[Step, ...]  # stages on the source's flights
+    adaptation: tuple[Step, ...]  # stages on N windows of the target, from the source's model
+    scratch: tuple[Step, ...]  # the same from the nominal vehicle
+    physics: Physics = "multirotor"  # of the hybrid and of physics-only
+    learn: tuple[str, ...] = ()  # names of `multirotor.SHAPES`; if empty, those of the vehicle
+    outputs: Literal["accelerations", "angular_acceleration", "motion"] = "motion"  # of a hybrid's network
+    # Factor on the scale of position errors in the loss. Position is the integral of velocity and adds no information;
+    # where an estimator's two disagree, a smaller scale would cause wrong accelerations.
     position: float = 1.0
-    huber: float = 1.0
+    huber: float = 1.0  # errors above this multiple of the baseline's error count linearly
 
 
 _SOURCE = (Step(2e-2, 0, 10, 20), Step(5e-3, 5e-3, 10, 30), Step(1e-3, 2e-3, 25, 20), Step(3e-4, 5e-4, 25, 10))

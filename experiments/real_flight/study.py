@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from experiments.real_flight import scoring, train
-from experiments.real_flight.folds import Fold, hold_out_validation, make_folds, require_windows
+from experiments.real_flight.logs import Fold, hold_out_validation, make_folds, require_windows
 from experiments.real_flight.models import RECIPES, equivalent_recipe, rigid_body_of, thrust_baseline
 from experiments.real_flight.scoring import TAGS, Test, least, linear_residuals, parameters, relative_error
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
@@ -20,7 +20,6 @@ from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
-FROM_SCRATCH = ("hybrid",)  # models that are trained from scratch too, to show what the source is worth
 
 
 Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
@@ -28,18 +27,13 @@ Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 
 @dataclass(frozen=True)
 class Outputs:
-    """What an experiment found.
-
-    Attributes:
-        tests: rows (see `rows`), each with its errors at every step.
-        choices: of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
-        trained: by number of the fold, model and mode.
-    """
+    """What an experiment found."""
 
     folds: list[Fold]
     tests: list[Test] = field(default_factory=list)
+    # Of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
     choices: dict[str, dict[str, float]] = field(default_factory=dict)
-    trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)
+    trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)  # by number of fold, model, mode
 
     @property
     def table(self) -> Results:
@@ -111,7 +105,8 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
             continue
         start = train.transfer(experiment, first)
         add(start, parameters(first, data))
-        for mode in ("fine_tuned", "scratch") if model in FROM_SCRATCH else ("fine_tuned",):
+        # The hybrid alone is trained from scratch too, to show what the source is worth.
+        for mode in ("fine_tuned", "scratch") if model == "hybrid" else ("fine_tuned",):
             adapted = train.adapt(experiment, name, mode, start, target(chosen), config.n)
             add(adapted, parameters(adapted, target(chosen)))
     outputs.tests.extend(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))

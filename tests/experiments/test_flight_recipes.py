@@ -9,7 +9,7 @@ import pytest
 from recorded import CONFIG, LOGS
 
 from experiments.real_flight.config import LEARN
-from experiments.real_flight.folds import make_folds
+from experiments.real_flight.logs import make_folds
 from experiments.real_flight.models import (
     RECIPES,
     body_of,
