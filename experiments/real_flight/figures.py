@@ -172,8 +172,7 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
     adapted = [each for each in drawn if (*each, 0) not in found]
     for model, mode in drawn:
         own = {n: pooled(found[model, mode, n], label, quantity) for n in (0, *sizes) if (model, mode, n) in found}
-        style: dict[str, Any] = {"color": MODEL_COLOURS[model], "linestyle": DASHES[mode]}
-        style["label"] = cell_name(model, mode)
+        style: Any = {"color": MODEL_COLOURS[model], "linestyle": DASHES[mode], "label": cell_name(model, mode)}
         if 0 in own:
             axes.axhline(own[0].mean(), linewidth=1.2, **style)
             continue

@@ -21,7 +21,7 @@ from hybrid_jax.flights.log import COLUMNS, FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.files import write_atomic
-from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sim.flight import DT, fly, gone_wrong
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, Vehicle
@@ -121,7 +121,12 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
     vehicle = folder / "vehicle.toml"
     write_atomic(vehicle, vehicle_toml(IRIS))
     for name, (domain, count) in FLIGHTS.items():
-        for index, content in enumerate(_flights(domain, count, seed)):
+        # Flights that fail are left out, so more are simulated; a chunk of them is simulated in any case.
+        found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
+        times = DT * np.arange(found.states.shape[1])
+        held = [*range(len(times) - 1), -1]  # a sample holds the inputs of the interval after it; the last are repeated
+        for index, i in enumerate(np.flatnonzero(~gone_wrong(found.states))[:count]):
+            content = csv_of(times, np.asarray(found.states[i]), np.asarray(found.inputs[i])[held])
             write_atomic(folder / name / f"flight_{index:02d}.csv.gz", content)
     return vehicle, {name: folder / name for name in FLIGHTS}
 
@@ -136,16 +141,6 @@ def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:
     text = io.StringIO()
     np.savetxt(text, np.column_stack([t, x, u]), "%.9g", ",", header=",".join(COLUMNS), comments="")
     return gzip.compress(text.getvalue().encode(), mtime=0)
-
-
-def _flights(domain: Domain, count: int, seed: int) -> list[bytes]:
-    # Flights that fail are left out, so more are simulated; a chunk of them is simulated in any case.
-    found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
-    sound = np.flatnonzero(~gone_wrong(found.states))[:count]
-    states, inputs = np.asarray(found.states), np.asarray(found.inputs)
-    times = DT * np.arange(states.shape[1])
-    # Each sample of a log holds the inputs of the interval that follows it; the last inputs are repeated.
-    return [csv_of(times, states[i], inputs[i][[*range(len(times) - 1), -1]]) for i in sound]
 
 
 @dataclass(frozen=True)

@@ -7,7 +7,6 @@ from typing import Any, Literal
 import equinox as eqx
 import jax
 import numpy as np
-from jaxtyping import PRNGKeyArray
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates
@@ -22,7 +21,6 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 Model = Literal["hybrid", "no_physics", "physics_only"]
-Physics = Literal["multirotor", "torque_off", "frozen_rates"]
 RecipeName = Literal["staged", "turning", "short", "torque_off", "frozen_rates"]
 
 REFERENCE = 1000  # N for which a recipe states the epochs of an adaptation
@@ -51,7 +49,7 @@ class Recipe:
     source: tuple[Step, ...]  # stages on the source's flights
     adaptation: tuple[Step, ...]  # stages on N windows of the target, from the source's model
     scratch: tuple[Step, ...]  # the same from the nominal vehicle
-    physics: Physics = "multirotor"  # of the hybrid and of physics-only
+    physics: Literal["multirotor", "torque_off", "frozen_rates"] = "multirotor"  # of the hybrid and of physics-only
     learn: tuple[str, ...] = ()  # names of `multirotor.SHAPES`; if empty, those of the vehicle
     outputs: Literal["accelerations", "angular_acceleration", "motion"] = "motion"  # of a hybrid's network
     # Factor on the scale of position errors in the loss. Position is the integral of velocity and adds no information;
@@ -144,8 +142,9 @@ def thrust_baseline(model: VehicleModel) -> AbstractVectorField:
 
 def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:
     """f_p of a recipe at its nominal values."""
-    off = recipe.physics == "torque_off"
-    terms = replace(model.terms, torque_gain=(0.0, 0.0, 0.0)) if off else model.terms
+    terms = model.terms
+    if recipe.physics == "torque_off":
+        terms = replace(terms, torque_gain=(0.0, 0.0, 0.0))
     body = multirotor(model.vehicle, recipe.learn or model.learn, terms)
     return FrozenRates(body) if recipe.physics == "frozen_rates" else body
 
@@ -161,7 +160,8 @@ def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds
     def build(seed):
         if name == "physics_only":
             return physics
-        network = zero_output(make_residual(key_of(seed, NETWORK), hidden=hidden, **options))
+        key = jax.random.fold_in(jax.random.key(seed), NETWORK)
+        network = zero_output(make_residual(key, hidden=hidden, **options))
         return Hybrid(Kinematics() if name == "no_physics" else physics, network)
 
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(np.arange(seeds)))
@@ -170,12 +170,11 @@ def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds
 def move_to_vehicle(fields: Any, vehicle: Vehicle) -> Any:
     """Move stacked fields to another vehicle, such as one with a payload; θ_p keeps its values in SI units."""
 
-    def one(field):
-        return jax.tree.map(
-            lambda node: with_vehicle(node, vehicle) if _is_body(node) else node, field, is_leaf=_is_body
-        )
+    def move(node):
+        return with_vehicle(node, vehicle) if _is_body(node) else node
 
-    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(one))(fields))
+    moved = eqx.filter_vmap(lambda field: jax.tree.map(move, field, is_leaf=_is_body))
+    return jax.device_get(eqx.filter_jit(moved)(fields))
 
 
 def body_of(field: Any) -> Any:
@@ -192,8 +191,3 @@ def objective_of(model: VehicleModel, windows: Trajectories, recipe: Recipe) -> 
     position, *others = channels_from(thrust_baseline(model), windows)  # in the state's order
     position = replace(position, scale=recipe.position * position.scale)
     return ChannelLoss((position, *others), recipe.huber)
-
-
-def key_of(seed, purpose: int) -> PRNGKeyArray:
-    """The key of one use of a seed."""
-    return jax.random.fold_in(jax.random.key(seed), purpose)

@@ -118,11 +118,9 @@ def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajecto
     return jax.lax.map(one, (fields, picked))
 
 
-def linear_residuals(
-    base: AbstractVectorField, data: TrainingData, subsets: Sequence[np.ndarray], test_base: AbstractVectorField
-) -> list[AbstractVectorField]:
+def linear_residuals(base: Any, data: TrainingData, subsets: Sequence[np.ndarray], test_base: Any) -> list[Hybrid]:
     """Fit a linear residual of `base` to each subset of the training windows, of one size; add it to `test_base`."""
-    fitted = jax.device_get(_linear_residuals(base, _short(data), stack(list(subsets)), data.validation))
+    fitted = jax.device_get(_linear_residuals(base, _short(data), stack(subsets), data.validation))
     return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 
 
@@ -155,7 +153,7 @@ def cell_name(model: str, mode: str, n_train: int = 0) -> str:
 
 def score_labels(rows: Results) -> list[str]:
     """The labels of the scores, such as "10" and "sum"."""
-    return list(rows[0]["scores"]) if len(rows) else []
+    return list(rows[0]["scores"])
 
 
 def pooled(rows: Results, label: str, quantity: str) -> np.ndarray:

@@ -26,8 +26,6 @@ from hybrid_jax.training.objective import Settings
 from hybrid_jax.training.stages import cut, judged, rates_by_group
 from hybrid_jax.trajectories import Trajectories, concatenate
 
-Counts = Int[np.ndarray, " runs"]
-
 
 @dataclass(frozen=True)
 class Experiment:
@@ -63,7 +61,7 @@ class TrainedModel:
     subsets: Sequence[Int[np.ndarray, " n"]]  # indices of the training windows
     val_loss: Any = ()  # at the best epoch of the last stage
     epochs: Any = ()  # over all stages
-    best_epochs: Sequence[Counts] = ()  # of each stage
+    best_epochs: Sequence[np.ndarray] = ()  # of each stage
     status: Any = ()  # of the last stage
 
     def run(self, index: int) -> AbstractVectorField:
@@ -185,12 +183,12 @@ def _run_configs(start: TrainedModel, fields: Any, step: Step, factor: float) ->
 
 
 @eqx.filter_jit
-def _start_states(fields: Any, seeds: Counts, number, validation: Trajectories, settings: Settings) -> FitState:
+def _start_states(fields: Any, seeds, number, validation: Trajectories, settings: Settings) -> FitState:
     """The state of each run at the start of a stage, with the validation error of its field."""
 
     def one(run):
         field, seed = run
-        state = fitting.start(field, jax.random.fold_in(models.key_of(seed, ORDER), number))
+        state = fitting.start(field, jax.random.fold_in(jax.random.fold_in(jax.random.key(seed), ORDER), number))
         return judged(state, validation, settings)
 
     return jax.lax.map(one, (fields, seeds))

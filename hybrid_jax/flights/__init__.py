@@ -1,9 +1,6 @@
 """Recorded flights: read logs, check them, clean them and cut them into training windows.
 
-    import hybrid_jax as hj
-
-    vehicle = hj.load_vehicle("vehicle.toml")
-    windows = hj.load_windows("flights/", vehicle, steps=10)  # one CSV or ULog file per flight
+    windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one CSV or ULog file per flight
 
 Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
 

@@ -75,10 +75,9 @@ class ColumnMap:
     def __post_init__(self):
         for name, stated in self.quantities.items():
             _check(name, stated)
-        for name, stated in self.quantities.items():
-            for column in stated.columns:
-                if self.names.count(column) > 1:
-                    raise ValueError(f"[{name}]: column {column!r} is named twice")
+        for column in self.names:
+            if self.names.count(column) > 1:
+                raise ValueError(f"columns: {column!r} is named twice")
 
     @property
     def quantities(self) -> dict[str, Columns]:

@@ -57,7 +57,7 @@ def flight_errors(
     check_attitudes(windows, "windows")
     # The last part is padded, so that all parts share one program.
     chunk = min(chunk, len(windows))
-    parts = [np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk)]
+    parts = (np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk))
     found = [jax.device_get(_errors(field, windows[part], solver)) for part in parts]
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
 

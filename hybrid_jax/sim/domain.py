@@ -53,18 +53,16 @@ def traced_model(p: Parameters) -> mjx.Model:
         model = mjx.put_model(build_model(IRIS))
     thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
     ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
-    replaced = model.tree_replace(
-        {
-            "opt.gravity": jnp.array([0.0, 0.0, -1.0]) * p.gravity,
-            "body_mass": model.body_mass.at[1].set(p.mass),
-            "body_subtreemass": model.body_subtreemass.at[:].set(p.mass),
-            "body_inertia": model.body_inertia.at[1].set(p.inertia),
-            "site_pos": p.rotor_positions,
-            "actuator_gear": thrust + ratio[:, None] * reaction,
-            "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
-        }
-    )
-    return cast(mjx.Model, replaced)
+    replaced: dict[str, Any] = {
+        "opt.gravity": jnp.array([0.0, 0.0, -1.0]) * p.gravity,
+        "body_mass": model.body_mass.at[1].set(p.mass),
+        "body_subtreemass": model.body_subtreemass.at[:].set(p.mass),
+        "body_inertia": model.body_inertia.at[1].set(p.inertia),
+        "site_pos": p.rotor_positions,
+        "actuator_gear": thrust + ratio[:, None] * reaction,
+        "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
+    }
+    return cast(mjx.Model, model.tree_replace(replaced))
 
 
 class Quadrotor(eqx.Module):
@@ -78,9 +76,8 @@ class Quadrotor(eqx.Module):
         wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
         applied = sum(wrenches, jnp.zeros_like(x, shape=6))
         model = traced_model(self.parameters)
-        data = mjx.make_data(model).replace(
-            qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=jnp.stack([jnp.zeros_like(applied), applied])
-        )
+        forces = jnp.stack([jnp.zeros_like(applied), applied])
+        data = mjx.make_data(model).replace(qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=forces)
         turning = quaternion_derivative(x[QUATERNION], x[BODY_RATES])
         return jnp.concatenate([x[VELOCITY], turning, mjx.forward(model, data).qacc])
 
@@ -123,9 +120,8 @@ class Quadrotor(eqx.Module):
             x = self.step(x, held, t, dt)
             return (x, t + dt), x
 
-        return jax.lax.map(
-            lambda flight: jax.lax.scan(advance, (flight[0], flight[2]), flight[1])[1], (x0, u, t0), batch_size=chunk
-        )
+        flown = jax.lax.map(lambda each: jax.lax.scan(advance, each[0], each[1]), ((x0, t0), u), batch_size=chunk)
+        return flown[1]
 
 
 @dataclass(frozen=True)

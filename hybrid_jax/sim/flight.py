@@ -95,9 +95,8 @@ def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], st
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
     """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed."""
-    scale = pilot.scale_of(vehicle)
-    place, altitude = states[..., POSITION][..., :2], states[..., POSITION][..., 2]
-    far = np.linalg.norm(place, axis=-1) > MAX_DISTANCE * scale.length
+    scale, altitude = pilot.scale_of(vehicle), states[..., POSITION][..., 2]
+    far = np.linalg.norm(states[..., POSITION][..., :2], axis=-1) > MAX_DISTANCE * scale.length
     fast = np.linalg.norm(states[..., VELOCITY], axis=-1) > MAX_SPEED * scale.speed
     outside = (altitude > MAX_ALTITUDE * scale.length) | (altitude < 0)
     return (far | fast | outside | ~np.isfinite(states).all(axis=-1)).any(axis=1)

@@ -82,8 +82,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
     """A random plan of `steps` decisions."""
     key_targets, key_dither = jax.random.split(key)
     target, limit = _draw_waypoints(key_targets, steps, scale)
-    turn = 1 / scale.time**2
-    hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, turn])
+    hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, 1 / scale.time**2])
 
     def follow(carry, waypoint):
         place, rate = carry

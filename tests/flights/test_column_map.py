@@ -80,7 +80,7 @@ def test_mapped_log_is_the_same_flight(flight, mapped, changes, motors):
         ([(', unit = "mm"', "")], ("[position]", "unit: must be given")),
         ([('["u", "v", "w"]', '["u", "v"]')], ("[velocity]", "3 names")),
         ([('["u", "v", "w"]', '"uvw"')], ("[velocity]", "list of 3")),
-        ([('["u", "v", "w"]', '["u", "v", "u"]')], ("[velocity]", "'u' is named twice")),
+        ([('["u", "v", "w"]', '["u", "v", "u"]')], ("'u' is named twice",)),
         ([("position =", "place =")], ("'place'", "must be one of frames, time")),
         ([('unit = "deg/s"', 'unit = "deg/s", sign = 1')], ("[body_rates]", "'sign'", "must be one of")),
         ([('"rpm"', '"command"')], ("[motors]", "polynomial")),
