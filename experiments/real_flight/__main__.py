@@ -80,8 +80,8 @@ def run(config: RealFlightConfig, console: Console) -> None:
 
 def prepare(config: RealFlightConfig, console: Console) -> Experiment:
     """Load the vehicle and all logs, and check them."""
-    named = {"source": config.source, "target": config.target, "test": config.test}
-    path, folders = config.vehicle, {name: folder for name, folder in named.items() if folder is not None}
+    path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
+    folders = {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:
         path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
     if path is None or "source" not in folders:

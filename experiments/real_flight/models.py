@@ -130,14 +130,9 @@ def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
     return next((name for name in among if training(name) == training(recipe)), recipe)
 
 
-def rigid_body_of(model: VehicleModel) -> Multirotor:
-    """The vehicle at its nominal values, with nothing to learn."""
-    return multirotor(model.vehicle, (), model.terms)
-
-
 def thrust_baseline(model: VehicleModel) -> AbstractVectorField:
     """Nominal thrust with frozen body rates: the baseline that errors are compared with."""
-    return FrozenRates(rigid_body_of(model))
+    return FrozenRates(multirotor(model.vehicle, (), model.terms))
 
 
 def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:

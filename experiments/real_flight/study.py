@@ -1,6 +1,6 @@
 """Train and test in every fold."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import groupby
@@ -11,11 +11,12 @@ import numpy as np
 
 from experiments.real_flight import scoring, train
 from experiments.real_flight.logs import Fold, hold_out_validation, make_folds, require_windows
-from experiments.real_flight.models import RECIPES, equivalent_recipe, rigid_body_of, thrust_baseline
+from experiments.real_flight.models import RECIPES, equivalent_recipe, thrust_baseline
 from experiments.real_flight.scoring import TAGS, Test, least, linear_residuals, parameters, relative_error
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from hybrid_jax.dynamics.baselines import HoldState
+from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows
 
@@ -112,11 +113,9 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
     outputs.tests.extend(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))
 
 
-def _linear_baselines(
-    experiment: Experiment, score: Callable[..., Test], source: TrainingData, target: Any
-) -> Iterator[Test]:
+def _linear_baselines(experiment: Experiment, score: Callable[..., Test], source: TrainingData, target: Any):
     """Test linear residuals of the rigid body, fitted to all source windows and to those of each run on the target."""
-    before, after = (rigid_body_of(model) for model in (experiment.before, experiment.after))
+    before, after = (multirotor(each.vehicle, (), each.terms) for each in (experiment.before, experiment.after))
     now, mode = (after, "zero_shot") if target else (before, "source_only")
     (field,) = linear_residuals(before, source, [np.arange(len(source.train))], now)
     yield score(field, model="linear_residual", mode=mode)

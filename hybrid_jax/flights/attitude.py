@@ -78,7 +78,6 @@ def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values
     if len(t) == 1:
         return values[np.searchsorted(at, t, side="right") - 1]
     area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(at)[:, None], axis=0)])
-    # The last value is held beyond its sample.
     end = max(t[-1], at[-1]) + 1.0
     area = np.concatenate([area, area[-1:] + values[-1:] * (end - at[-1])])
     mean = np.diff(interpolate(t, np.append(at, end), area), axis=0) / np.diff(t)[:, None]

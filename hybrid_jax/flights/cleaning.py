@@ -143,8 +143,6 @@ def choose_time_constant(
 ) -> tuple[float, list[float]]:
     """Choose the time constant [s] for `lag_motors` with the smallest error; also return the error of each candidate.
 
-    For logs that record commands, not rotor speeds.
-
     Args:
         error: prediction error of a model fitted to logs to which a candidate was applied.
 

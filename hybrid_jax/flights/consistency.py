@@ -82,7 +82,6 @@ def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) 
 
 
 def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
-    """A check that fails where there is advice."""
     return Check(name, value, unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 

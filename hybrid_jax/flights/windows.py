@@ -30,14 +30,11 @@ _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORE
 
 @dataclass(frozen=True)
 class LogWindows:
-    """Windows of several flights in float32, and the number of windows of each flight.
-
-    Windows are ordered by flight; `stride` is the number of samples between the starts of two.
-    """
+    """Windows of several flights in float32, ordered by flight."""
 
     windows: Trajectories
-    sizes: list[int]
-    stride: int
+    sizes: list[int]  # windows of each flight
+    stride: int  # samples between the starts of two
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -226,5 +223,4 @@ def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
 
 
 def _intervals(log: FlightLog) -> list[int]:
-    """Count the intervals of each segment."""
     return [part.stop - part.start - 1 for part in segments(log)]
