@@ -120,10 +120,7 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
-    """Choose the rotors' time constant [s] on the source's flights.
-
-    For each candidate, physics is fitted to training flights and predicts the validation flights.
-    """
+    """Choose the rotors' time constant [s]: physics fitted to the source's training flights predicts the others."""
     train, validation = hold_out_validation(source.logs, config)
     baseline = thrust_baseline(model)
 

@@ -10,9 +10,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
 # By default, the effects that a real vehicle adds to a rigid body; mass is weighed, not learned.
-LEARN = (
-    "Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull",
-)  # fmt: skip
+LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull")
 NANODRONE_STEPS = 50
 ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "staged")
 PATHS = ("source", "target", "test", "vehicle", "columns")

@@ -67,8 +67,7 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
             weights = own.numbers("windows")
             errors = np.array([curves_of[tuple(row[tag] for tag in TAGS)] for row in own])
             by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
-        curves = zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True)
-        for axes, mean, std in curves:
+        for axes, mean, std in zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True):
             time, low = experiment.dt * np.arange(1, len(mean) + 1), np.maximum(mean - std, 0.5 * mean)
             axes.plot(time, mean, DASHES[mode], color=MODEL_COLOURS[model], label=cell_name(*cell))
             axes.fill_between(time, low, mean + std, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)

@@ -33,8 +33,6 @@ NOTES = (
     "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
     "not account for errors of the model.",
 )
-
-
 VERDICTS = {"ok": "ok", "fails": "FAILS", "cannot tell": "?"}
 SHORT = {
     "repeated samples": "repeats",
@@ -80,14 +78,11 @@ def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
     flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
     of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
     recipes = "\n".join(f"- recipe **{recipe}**: {RECIPES[recipe].about}" for recipe in config.tried)
-    trained = (
-        f"Models are trained on the source's flights, then on N windows of the target's ({config.draw}), and predict "
-        if "target" in logs
-        else "Models are trained on flights and predict "
-    )
+    adapted = f"the source's flights, then on N windows of the target's ({config.draw}),"
     return f"""# {name}
 
-{trained}held-out flights, open loop from every sample with the recorded rotor speeds.
+Models are trained on {adapted if "target" in logs else "flights"} and predict \
+held-out flights, open loop from every sample with the recorded rotor speeds.
 {flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outputs.folds)} folds by \
 {config.folds_by}; {len(outputs.tests)} tests, {config.seeds} seeds.
 

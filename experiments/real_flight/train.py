@@ -79,9 +79,9 @@ class TrainedModel:
 def training_data(
     experiment: Experiment, fold: Fold, recipe: str, source: TrainingData | None = None, capacity: int = 0
 ) -> TrainingData:
-    """Cut the windows of a fold; the loss is scaled by its training windows.
+    """Cut the windows of a fold; after a change a window starts at every sample.
 
-    After a change, `source` are the data before it: its loss is used, and a window starts at every sample.
+    The loss is scaled by the training windows, or is that of `source`, the data before a change.
     """
     how, config = RECIPES[recipe], experiment.config
     validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, config.validation)
@@ -123,10 +123,7 @@ def transfer(experiment: Experiment, source: TrainedModel) -> TrainedModel:
 def adapt(
     experiment: Experiment, name: str, mode: str, start: TrainedModel, data: TrainingData, sizes: Sequence[int]
 ) -> TrainedModel:
-    """Train a model on N windows after the change, one run for each size and seed, in this order.
-
-    "fine_tuned" starts from the fields of `start`, "scratch" from untrained ones.
-    """
+    """Train on N windows after the change, from `start` or ("scratch") anew: a run for each size and, in it, seed."""
     config, how = experiment.config, RECIPES[start.recipe]
     fields, steps = start.fields, how.adaptation
     if mode == "scratch":

@@ -78,7 +78,6 @@ def accelerations(log: FlightLog) -> Readings:
     """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
-
     frd = attitude.as_matrix() @ BODIES["FRD"].T
     ned = quaternion_of(Rotation.from_matrix(WORLDS["NED"] @ frd))
     stated = {
