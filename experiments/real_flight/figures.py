@@ -82,9 +82,8 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
 @mpl.rc_context(STYLE)
 def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
     """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
-    found = cells(rows)
+    found, labels = cells(rows), score_labels(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    labels = score_labels(rows)
     figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)
     for label, line in zip(labels, panels, strict=True):
@@ -139,10 +138,7 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
 
 @mpl.rc_context(STYLE)
 def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> Figure:
-    """Output of a network on test flights in ṗ, v̇ and ω̇ against speed: median and quartiles of equal bins.
-
-    Derivatives that no network changes have no panel.
-    """
+    """Output of a network on test flights, in those of ṗ, v̇ and ω̇ that it changes, against speed: quartiles of bins."""
     windows = cut_windows(outputs.folds[0].test, 1).windows
     x, residuals = windows.x0, {}
     for mode, trained in hybrids.items():

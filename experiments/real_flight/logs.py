@@ -26,8 +26,7 @@ from hybrid_jax.sim.flight import DT, fly, gone_wrong
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS, Vehicle
 
-# Of --simulated: the domains and the numbers of flights.
-FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}
+FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}  # of --simulated: domains, numbers of flights
 SECONDS = 8.0
 FOLDS, VALIDATION_SHARE = 3, 0.2
 GROUP_BY = {"flight": flight_of, "manoeuvre": manoeuvre_of}

@@ -72,7 +72,6 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
     """Choose a recipe, train every model, adapt it if there is a target, and test."""
     config, fold, name = experiment.config, outputs.folds[number], f"fold {number}"
     adapts, (source_data, source_model) = "target" in experiment.logs, source
-    vehicle = experiment.after if adapts else experiment.before
     windows = {RECIPES[recipe].window for recipe in config.tried}
     capacity = max(count_windows(each.train, steps) for each in outputs.folds for steps in windows)
 
@@ -95,7 +94,7 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
         outputs.tests.extend(scoring.score_model(score, trained, theta))
         outputs.trained[number, trained.model, trained.mode] = trained
 
-    baselines = {"hold": HoldState(), "thrust": thrust_baseline(vehicle)}
+    baselines = {"hold": HoldState(), "thrust": thrust_baseline(experiment.after if adapts else experiment.before)}
     outputs.tests.extend(score(baseline, model=model, mode="nominal") for model, baseline in baselines.items())
     adapted: TrainedModel | None = None
     for model in config.models:
@@ -106,8 +105,7 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
             continue
         start = train.transfer(experiment, first)
         add(start, parameters(first, data))
-        # The hybrid alone is trained from scratch too, to show what the source is worth.
-        for mode in ("fine_tuned", "scratch") if model == "hybrid" else ("fine_tuned",):
+        for mode in ("fine_tuned", "scratch") if model == "hybrid" else ("fine_tuned",):  # what the source is worth
             adapted = train.adapt(experiment, name, mode, start, target(chosen), config.n)
             add(adapted, parameters(adapted, target(chosen)))
     outputs.tests.extend(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))

@@ -41,7 +41,7 @@ class Experiment:
 
 @dataclass(frozen=True)
 class TrainingData:
-    """Windows to train on and to stop by, and the loss; training windows are padded to `capacity`."""
+    """Windows to train on and to stop by, and the loss; padded to `capacity`, training windows share a program."""
 
     train: LogWindows
     validation: Trajectories
@@ -102,10 +102,9 @@ def train_on_source(
 
 
 def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, first: TrainedModel) -> TrainedModel:
-    """Train a source model again, on the validation flights as well.
+    """Train a source model again, on the validation flights as well, which can then select nothing.
 
-    Each stage ends after as many epochs as were best in the first training, and its last field counts: the validation
-    windows are trained on, so they can select nothing.
+    Each stage ends after as many epochs as were best in the first training, and its last field counts.
     """
     more = cut_windows(fold.validation, RECIPES[first.recipe].window, experiment.config.stride)
     both = concatenate([data.train.windows, more.windows])
@@ -143,7 +142,6 @@ def in_stages(
     """
     fields, finals = start.fields, []
     settings = Settings(experiment.config.batch_size, objective=data.objective)
-    # Repeated up to the capacity, so that folds share one program; no run samples the padding.
     train = data.train.windows[np.arange(data.capacity) % len(data.train)]
     for number, step in enumerate(steps):
         runs = _run_configs(start, fields, step, experiment.config.epochs)
