@@ -32,8 +32,7 @@ from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.flight import DT
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.sweep import hosts
 from hybrid_jax.trajectories import split
 from hybrid_jax.vehicle import IRIS

@@ -8,14 +8,14 @@ from typing import Literal
 
 from rich.console import Console
 
+from experiments.render import picture
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from experiments.runner.progress import Line
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
 from hybrid_jax.sim.domain import DOMAINS, Domain
-from hybrid_jax.sim.record import SplitSpec, configuration, make_dataset
-from hybrid_jax.sim.render import picture
+from hybrid_jax.sim.flight import SplitSpec, configuration, make_dataset
 
 
 @dataclass(frozen=True)

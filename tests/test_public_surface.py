@@ -23,8 +23,7 @@ from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sim.flight import fly
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec, fly
 from hybrid_jax.training.loss import residual_norm
 from hybrid_jax.trajectories import check, concatenate, split, windows_of
 

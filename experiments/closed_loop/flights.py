@@ -31,9 +31,8 @@ from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path
 from hybrid_jax.io.models import describe
 from hybrid_jax.runtime import cores
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, Wrench
-from hybrid_jax.sim.quadrotor import Quadrotor
 from hybrid_jax.state import POSITION, STATE_SIZE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, stack

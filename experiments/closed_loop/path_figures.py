@@ -14,9 +14,9 @@ from experiments.closed_loop.claims import THREE
 from experiments.closed_loop.figures import COLOURS_OF, floor_note
 from experiments.closed_loop.flights import DRAW_EVERY, PATHS, Flown
 from experiments.closed_loop.results import DOMAINS, EXTERNAL_FORCE, KNOWN, REFERENCES, Agent
+from experiments.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from experiments.reporting.plots import STYLE, legend_below, tick_errors
 from hybrid_jax.control import Controller, sample
-from hybrid_jax.sim.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from hybrid_jax.state import POSITION
 from hybrid_jax.vehicle import IRIS
 

@@ -29,8 +29,7 @@ from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, cores
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sim.flight import DT
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import stack

@@ -1,12 +1,39 @@
-"""The command line: python -m experiments.real_flight --help."""
+"""From the command line to the report: python -m experiments.real_flight --help."""
 
 import sys
 from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
 
-from experiments.real_flight.config import PRESETS
-from experiments.real_flight.experiment import NAME, run
+from rich.console import Console
+
+from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
+from experiments.real_flight.logs import (
+    LogSet,
+    evenly_spaced,
+    hold_out_validation,
+    load_logs,
+    require_distinct,
+    write_logs,
+)
+from experiments.real_flight.models import thrust_baseline
+from experiments.real_flight.report import failed_checks, write_report
+from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
+from experiments.real_flight.study import run_folds
+from experiments.real_flight.train import Experiment
 from experiments.runner import command
+from experiments.runner.stages import stages_of
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, learned_by_field, vehicle_model_of
+from hybrid_jax.flights.cleaning import choose_time_constant
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.windows import cut_windows, require_common_interval
+from hybrid_jax.sweep import hosts
+from hybrid_jax.vehicle import read_tables
 
+NAME = "real_flight"
+LAG_WINDOWS = 300  # windows that physics is fitted to for each candidate of the rotors' time constant
 ABOUT = "How well does a model of your own vehicle predict flights that it was not trained on?"
 GUIDE = """\
 real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--test FOLDER], or --simulated.
@@ -35,16 +62,75 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def split_lists(arguments: Sequence[str]) -> list[str]:
     """Split comma-separated values, such as 10,50, of the options that take several values."""
-    words: list[str] = []
-    option = ""
+    words, option = [], ""
     for word in arguments:
-        named = word.startswith("--")
-        option, _, value = word.partition("=") if named else (option, "", word)
-        if option not in LISTS or word == option:
-            words.append(word)
-        else:
-            words += [*([option] if named else []), *value.split(",")]
+        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
+        several = option in LISTS and word != option
+        words += [option] * word.startswith("--") + value.split(",") if several else [word]
     return words
+
+
+def run(config: RealFlightConfig, console: Console) -> None:
+    """Run the experiment from the logs to the report."""
+    experiment = prepare(config, console)
+    results = run_folds(experiment)
+    if hosts.is_main_process():
+        write_report(NAME, experiment, results, Console())
+
+
+def prepare(config: RealFlightConfig, console: Console) -> Experiment:
+    """Load the vehicle and all logs, and check them."""
+    path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
+    folders = {name: folder for name, folder in named.items() if folder is not None}
+    if config.simulated:
+        path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
+    if path is None or "source" not in folders:
+        raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
+    before, after, chooses_lag = load_vehicle_models(path, config)
+    # The time constant may not be chosen on flights, or manoeuvres, that models are tested on.
+    if chooses_lag and "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
+        raise ValueError(
+            f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "
+            f"give --target, or state {LAG} under [terms]"
+        )
+    logs: dict[str, LogSet] = {}
+    for name, folder in folders.items():
+        model = before if name == "source" else after
+        time_constant = 0.0 if chooses_lag else model.terms.motor_time_constant
+        logs[name] = load_logs(name, folder, model.vehicle, time_constant, config)
+    require_distinct(list(logs.values()), config)
+    dt = require_common_interval([log for each in logs.values() for log in each.logs], "--cleaning.resample ")
+    if chooses_lag:
+        chosen = choose_lag(logs["source"], before, config)
+        console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
+        logs = {name: each.with_lag(chosen) for name, each in logs.items()}
+    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        line = f"{flight}: {check['name']}: {check['suggestion']}"  # the report holds the whole table
+        console.print(line, highlight=False, soft_wrap=True, style="yellow")
+    return Experiment(config, before, after, logs, dt, stages_of(config, console))
+
+
+def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
+    """Read the vehicle of the source, that of target and test, and whether the rotors' time constant is chosen."""
+    tables = read_tables(path)
+    before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
+    learn = config.learn or (before.learn if "learn" in tables else LEARN)
+    before, after = (replace(each, learn=learned_by_field(learn)) for each in (before, after))
+    return before, after, LAG in learn
+
+
+def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
+    """Choose the rotors' time constant [s]: physics fitted to the source's training flights predicts the others."""
+    train, validation = hold_out_validation(source.logs, config)
+    baseline = thrust_baseline(model)
+
+    def error(logs: list[FlightLog]) -> float:
+        parts = logs[: len(train)], logs[len(train) :]
+        known, unknown = (cut_windows(part, INTERVAL_STEPS).windows for part in parts)
+        field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
+        return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
+
+    return choose_time_constant([*train, *validation], error)[0]
 
 
 if __name__ == "__main__":

@@ -4,17 +4,14 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
-from experiments.real_flight.recipes import Model, RecipeName
+from experiments.real_flight.models import Model, RecipeName
 from experiments.runner.options import Count, NotNegative, Positive, Run, check_numbers, distinct
 from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
 # By default, the effects that a real vehicle adds to a rigid body; mass is weighed, not learned.
-LEARN = (
-    "Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull",
-)  # fmt: skip
+LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull")
 NANODRONE_STEPS = 50
-MAX_WINDOWS = 10_000_000
 ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "staged")
 PATHS = ("source", "target", "test", "vehicle", "columns")
 
@@ -121,21 +118,12 @@ class RealFlightConfig(Run):
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):
             distinct(f"--{name}", tuple(map(str, getattr(self, name))))
-        if max(self.n) > MAX_WINDOWS:
-            raise ValueError(f"--n must be at most {MAX_WINDOWS}, got {max(self.n)}")
         if min(self.n) < self.batch_size:
             raise ValueError(f"--n must each be at least --batch-size {self.batch_size}, got {self.n}")
         if self.learn is not None:
             check_learned(self.learn)
         if self.simulated and any(getattr(self, name) for name in PATHS):
-            raise ValueError(
-                "--simulated makes its own logs: leave out --vehicle, --columns, --source, --target and --test"
-            )
-
-    def require_flights(self) -> None:
-        """Refuse a configuration without flights; apart from the other checks, as presets have no paths."""
-        if not self.simulated and (self.vehicle is None or self.source is None):
-            raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
+            raise ValueError(f"--simulated makes its own logs: leave out {', '.join(f'--{name}' for name in PATHS)}")
 
     @property
     def longest(self) -> int:

@@ -9,17 +9,17 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
 from experiments.real_flight.models import thrust_baseline
-from experiments.real_flight.rows import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
+from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, STYLE, legend_below
+from experiments.reporting.plots import COLOURS, STYLE, legend_below, tick_errors
 from experiments.reporting.results import Results
-from hybrid_jax.flights.splits import flight_of
-from hybrid_jax.flights.windows import cut_windows, longest_segment
+from hybrid_jax.flights.log import segments
+from hybrid_jax.flights.windows import cut_windows, flight_of, require_length
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
@@ -57,25 +57,23 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     figure = Figure(figsize=(9.5, 7.2), layout="constrained")
     panels = figure.subplots(2, 2, sharex=True)
     most = max(outputs.table["n_train"])
+    curves_of = {tuple(row[tag] for tag in TAGS): errors[kind] for row, errors in outputs.tests}
     for cell, group in cells(outputs.table).items():
         model, mode, n = cell
         if n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
             continue
         by_seed = []  # over the test windows of all folds
         for own in group.group("seed").values():
-            weights, errors = (
-                own.numbers("windows"),
-                np.array([outputs.errors[tuple(row[tag] for tag in TAGS)][kind] for row in own]),
-            )
+            weights = own.numbers("windows")
+            errors = np.array([curves_of[tuple(row[tag] for tag in TAGS)] for row in own])
             by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
-        curves = zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True)
-        for axes, mean, std in curves:
+        for axes, mean, std in zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True):
             time, low = experiment.dt * np.arange(1, len(mean) + 1), np.maximum(mean - std, 0.5 * mean)
             axes.plot(time, mean, DASHES[mode], color=MODEL_COLOURS[model], label=cell_name(*cell))
             axes.fill_between(time, low, mean + std, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
     for axes, (name, unit) in zip(panels.flat, QUANTITIES.items(), strict=True):
         axes.set(yscale="log", title=name.replace("_", " ").capitalize(), ylabel=f"{measure} [{unit}]")
-        _tick(axes)
+        tick_errors(axes.yaxis, *axes.get_ylim())
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
     return legend_below(figure, "Error against horizon", "mean over seeds; band: ± one standard deviation")
@@ -84,9 +82,8 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
 @mpl.rc_context(STYLE)
 def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
     """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
-    found = cells(rows)
+    found, labels = cells(rows), score_labels(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    labels = score_labels(rows)
     figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
     panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)
     for label, line in zip(labels, panels, strict=True):
@@ -107,29 +104,31 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
 def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Figure:
     """Velocity and body rates of a part of one test flight, and predictions that restart from it at intervals."""
     config, dt = experiment.config, experiment.dt
-    log, begin, windows = longest_segment(outputs.folds[0].test, config.longest)
+    log = require_length(outputs.folds[0].test, config.longest)[0]
+    part = max(segments(log), key=lambda part: part.stop - part.start)
+    begin, windows = log.t[part.start] - log.t[0], cut_windows([log[part]], config.longest, config.longest).windows
     windows = windows[:PIECES]
     fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
     fields["thrust", "nominal"] = thrust_baseline(experiment.after)
-    states = {
-        cell: np.asarray(rollout_batch(field, windows.x0, windows.u, windows.dt)) for cell, field in fields.items()
-    }
     truth = np.concatenate([windows.x0[:1], *windows.x])
     time = begin + dt * np.arange(len(truth))
+    # Each prediction ends in a gap of its line.
+    at = time[:: config.longest][: len(windows), None] + dt * np.arange(config.longest + 2)
+    gap, states = np.full((len(windows), 1, 13), np.nan), {}
+    for cell, field in fields.items():
+        predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
+        states[cell] = np.concatenate([windows.x0[:, None], predicted, gap], axis=1)
     figure = Figure(figsize=(12, 6), layout="constrained")
     panels = figure.subplots(2, 3, sharex=True)
-    places = [*range(*VELOCITY.indices(13)), *range(*BODY_RATES.indices(13))]
-    for axes, place, name in zip(panels.flat, places, ("vx", "vy", "vz", "ωx", "ωy", "ωz"), strict=True):
+    names = ("vx", "vy", "vz", "ωx", "ωy", "ωz")
+    for axes, place, name in zip(panels.flat, range(VELOCITY.start, BODY_RATES.stop), names, strict=True):
         axes.plot(time, truth[:, place], color="black", linewidth=1.6, label="measured")
         low, high = truth[:, place].min(), truth[:, place].max()
         room = 0.5 * (high - low) or 1.0
-        for (model, mode), predicted in states.items():
-            label: str | None = cell_name(model, mode)
-            for piece, (x0, x) in enumerate(zip(windows.x0, predicted, strict=True)):
-                at = time[piece * config.longest :][: config.longest + 1]
-                axes.plot(at, [x0[place], *x[:, place]], color=MODEL_COLOURS[model], linewidth=1.2, label=label)
-                axes.plot(at[:1], x0[place], ".", color="black", markersize=4)
-                label = None
+        for cell, pieces in states.items():
+            style = {"color": MODEL_COLOURS[cell[0]], "linewidth": 1.2, "label": cell_name(*cell)}
+            axes.plot(at.ravel(), pieces[..., place].ravel(), **style)
+        axes.plot(at[:, 0], windows.x0[:, place], ".", color="black", markersize=4)
         axes.set(title=f"{name} [{'m/s' if name[0] == 'v' else 'rad/s'}]", ylim=(low - room, high + room))
     for axes in panels[1]:
         axes.set_xlabel("time in flight [s]")
@@ -139,26 +138,23 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
 
 @mpl.rc_context(STYLE)
 def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> Figure:
-    """Output of a network on test flights in ṗ, v̇ and ω̇ against speed: median and quartiles of equal bins.
-
-    Derivatives that no network changes have no panel.
-    """
+    """Output of a network on test flights, in those of ṗ, v̇ and ω̇ that it changes, against speed: quartiles of bins."""
     windows = cut_windows(outputs.folds[0].test, 1).windows
-    x, u, residuals = windows.x0, windows.u[:, 0], {}
+    x, residuals = windows.x0, {}
     for mode, trained in hybrids.items():
-        residuals[cell_name("hybrid", mode)] = np.asarray(jax.jit(jax.vmap(_largest(trained).residual))(x, u))
+        network = jax.jit(jax.vmap(_largest(trained).residual))
+        residuals[cell_name("hybrid", mode)] = np.asarray(network(x, windows.u[:, 0]))
     every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
     figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
-    panels = figure.subplots(1, max(len(parts), 1), squeeze=False)[0][: len(parts)]
-    for axes, (name, part) in zip(panels, parts.items(), strict=True):
+    for column, (name, part) in enumerate(parts.items(), 1):
+        axes = figure.add_subplot(1, len(parts), column)
         for colour, (label, residual) in zip(COLOURS.values(), residuals.items(), strict=False):
             size = np.linalg.norm(residual[:, part], axis=1)
             _draw_bins(axes, np.linalg.norm(x[:, VELOCITY], axis=1), size, colour, label)
         axes.set(xlabel="speed [m/s]", ylabel=f"added to {name}", ylim=(0, None))
-    return legend_below(
-        figure, "Output of the network against speed", "median over the samples of a bin; band: quartiles"
-    )
+    meaning = "median over the samples of a bin; band: quartiles"
+    return legend_below(figure, "Output of the network against speed", meaning)
 
 
 def _largest(trained: TrainedModel) -> Any:
@@ -171,11 +167,7 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
     adapted = [each for each in drawn if (*each, 0) not in found]
     for model, mode in drawn:
         own = {n: pooled(found[model, mode, n], label, quantity) for n in (0, *sizes) if (model, mode, n) in found}
-        style: dict[str, Any] = {
-            "color": MODEL_COLOURS[model],
-            "linestyle": DASHES[mode],
-            "label": cell_name(model, mode),
-        }
+        style: Any = {"color": MODEL_COLOURS[model], "linestyle": DASHES[mode], "label": cell_name(model, mode)}
         if 0 in own:
             axes.axhline(own[0].mean(), linewidth=1.2, **style)
             continue
@@ -185,14 +177,7 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
         at, means = [n * factor for n in own], [values.mean() for values in own.values()]
         axes.errorbar(at, means, spread, capsize=2, marker="o", markersize=3.5, **style)
     axes.set_yscale("log")
-    _tick(axes)
-
-
-def _tick(axes: Axes) -> None:
-    """Plain numbers at 1, 2 and 5 of each decade."""
-    axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-    axes.yaxis.set_minor_formatter(NullFormatter())
+    tick_errors(axes.yaxis, *axes.get_ylim())
 
 
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:

@@ -1,40 +1,59 @@
 """Write the report, rows, figures and models of an experiment on recorded flights."""
 
+import math
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 from rich.console import Console
 
 import hybrid_jax
-from experiments.real_flight.claims import verdicts
+from experiments.real_flight import scoring
 from experiments.real_flight.figures import make_figures
-from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import TAGS
+from experiments.real_flight.models import RECIPES
+from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, least, pooled, score_labels
 from experiments.real_flight.study import Outputs
-from experiments.real_flight.tables import page_tables, score_tables
 from experiments.real_flight.train import Experiment
 from experiments.reporting import report
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.plots import save_figures
-from experiments.reporting.tables import print_tables
+from experiments.reporting.results import Results
+from experiments.reporting.stats import spread
+from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
 from experiments.runner.environment import environment
-from hybrid_jax.flights.splits import flight_of
+from hybrid_jax.adaptation.uncertainty import named_parameters
+from hybrid_jax.flights.consistency import FAILS
+from hybrid_jax.flights.windows import flight_of
 
 NOTES = (
     "Validation flights stop every training and are not among the N windows.",
     "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
     "not account for errors of the model.",
 )
+VERDICTS = {"ok": "ok", "fails": "FAILS", "cannot tell": "?"}
+SHORT = {
+    "repeated samples": "repeats",
+    "dp/dt against v": "dp/dt, v",
+    "q̇ against ω": "q̇, ω",
+    "v̇ against thrust along body z": "v̇, thrust",
+    "specific force over thrust per mass": "force / thrust",
+    "motor order against roll and pitch": "motor order",
+    "spin against yaw": "spin",
+    "lag of the gyro behind the motors": "gyro lag",
+}
 
 
 def write_report(name: str, experiment: Experiment, outputs: Outputs, console: Console) -> None:
     """Write models, figures and, last, the report; print its main tables."""
     out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
     save_models(out / "models", experiment, outputs)
-    claims = verdicts(rows)
+    claims, nominal = scoring.verdicts(rows), named_parameters(experiment.before.physics())
     main = [*score_tables(rows, experiment.dt), *([verdict_table(claims, "Hypotheses")] if claims else [])]
     records = [record for logs in experiment.logs.values() for record in logs.records]
-    more = page_tables(rows, outputs.choices, experiment.before, records)
+    more = [*fold_tables(rows), *choice_tables(outputs.choices), *parameter_tables(rows, nominal), *log_tables(records)]
     parts = ("train", "validation", "test")
     extra = {
         "vehicle": {"before": asdict(experiment.before), "after": asdict(experiment.after)},
@@ -59,16 +78,13 @@ def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
     flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
     of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
     recipes = "\n".join(f"- recipe **{recipe}**: {RECIPES[recipe].about}" for recipe in config.tried)
-    trained = (
-        f"Models are trained on the source's flights, then on N windows of the target's ({config.draw}), and predict "
-        if "target" in logs
-        else "Models are trained on flights and predict "
-    )
+    adapted = f"the source's flights, then on N windows of the target's ({config.draw}),"
     return f"""# {name}
 
-{trained}held-out flights, open loop from every sample with the recorded rotor speeds.
+Models are trained on {adapted if "target" in logs else "flights"} and predict \
+held-out flights, open loop from every sample with the recorded rotor speeds.
 {flights} flights ({of}{"; simulated" if config.simulated else ""}), in {len(outputs.folds)} folds by \
-{config.folds_by}; {len(outputs.rows)} tests, {config.seeds} seeds.
+{config.folds_by}; {len(outputs.tests)} tests, {config.seeds} seeds.
 
 - **hybrid**: a multirotor that learns {", ".join(experiment.before.learn)} (or what its recipe says), plus a small \
 network of body-frame inputs
@@ -85,10 +101,106 @@ def save_models(folder: Path, experiment: Experiment, outputs: Outputs) -> None:
     """Save every trained model, with what is known about it."""
     scores = {tuple(row[tag] for tag in TAGS): row["scores"] for row in outputs.table}
     for (number, model, mode), trained in outputs.trained.items():
-        fold = outputs.folds[number].name
         for run, seed in enumerate(trained.seeds):
-            n = trained.size(run)
-            about = {"tested_on": fold, "model": model, "mode": mode, "n_train": n, "seed": seed}
-            about |= {"dt": experiment.dt, "scores": scores[fold, model, mode, n, seed]}
-            name = f"fold{number}-{model}-{mode}-{n}-seed{seed}.npz"
+            tags = (outputs.folds[number].name, model, mode, trained.size(run), seed)
+            about = dict(zip(("tested_on", *TAGS[1:]), tags, strict=True))
+            about |= {"dt": experiment.dt, "scores": scores[tags]}
+            name = f"fold{number}-{model}-{mode}-{trained.size(run)}-seed{seed}.npz"
             hybrid_jax.save(folder / name, trained.run(run), about)
+
+
+def score_tables(rows: Results, dt: float) -> list[Table]:
+    """Make a table per horizon: a line per model, mode and N, over the test windows of all folds."""
+    titles = {label: f"RMSE at step {label} ({int(label) * dt:.3g} s)" for label in score_labels(rows) if label != SUM}
+    if SUM in score_labels(rows):
+        titles[SUM] = "Mean error of steps 1 to 50, summed"
+    named, of = {cell_name(*cell): group for cell, group in cells(rows).items()}, mean_over_seeds(rows)
+    return [tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label)) for label, at in titles.items()]
+
+
+def fold_tables(rows: Results) -> list[Table]:
+    """With several folds, make a table of baselines and best hybrids in each, at each horizon."""
+    folds, found = rows.unique("fold"), cells(rows)
+    if len(folds) < 2:
+        return []
+    most = max(n for _, _, n in found)
+    kept = [cell for cell in found if cell[0] in ("hold", "thrust") or (cell[0] == "hybrid" and cell[2] in (0, most))]
+    lines = [
+        (fold, cell_name(*cell), label, *(text(found[cell].where(fold=fold)) for text in _errors(label).values()))
+        for fold in folds
+        for cell in kept
+        for label in score_labels(rows)
+    ]
+    return [Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_errors("")), lines)]
+
+
+def parameter_tables(rows: Results, nominal: Mapping[str, Any]) -> list[Table]:
+    """Make a table of θ_p: nominal value, mean over folds and seeds, spread, and mean 95 % interval."""
+    found = cells(rows.where(lambda row: bool(row["theta"])))
+    most = max((n for _, _, n in found), default=0)
+    kept = {cell: group for cell, group in found.items() if cell[1] != "scratch" and cell[2] in (0, most)}
+    names = dict.fromkeys(name for group in kept.values() for row in group for name in row["theta"])
+    lines = []
+    for name in names:
+        stated = f"{float(nominal[name]):.3g}" if name in nominal else EMPTY
+        lines.append((name, stated, *(_parameter(rows, name) for rows in kept.values())))
+    title = "Physical parameters, SI units (mean ± std over folds and seeds; mean ends of the 95 % intervals)"
+    return [Table(title, ("", "nominal", *(cell_name(*cell) for cell in kept)), lines)] if lines else []
+
+
+def choice_tables(choices: Mapping[str, Mapping[str, float]]) -> list[Table]:
+    """Make a table of the recipes tried in each fold: validation error over that of the baseline."""
+    if not choices:
+        return []
+    lines = [(fold, *(f"{error:.3f}" for error in errors.values()), least(errors)) for fold, errors in choices.items()]
+    title = "Recipes: error on validation flights over that of thrust with frozen rates; the smallest is chosen"
+    return [Table(title, ("tested on", *next(iter(choices.values())), "chosen"), lines)]
+
+
+def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
+    """Make tables of the logs: length, gaps, changes, every check, and what would repair the failed ones."""
+    lines, verdicts = [], []
+    for record in records:
+        name = f"{record['folder']}/{record['flight']}"
+        counts = (str(record[key]) for key in ("gaps", "repeated_samples", "used_samples"))
+        length = (str(record["samples"]), f"{record['seconds']:.1f}", f"{record['dt']:g}")
+        lines.append((name, *length, *counts, "; ".join(record["done"]) or "none"))
+        verdicts.append((name, *(f"{VERDICTS[c['verdict']]} {_value(c)}".strip() for c in record["checks"])))
+    failed = [(flight, c["name"], _value(c), c["suggestion"]) for flight, c in failed_checks(records)]
+    header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
+    names = [str(SHORT.get(check["name"], check["name"])) for check in records[0]["checks"]]
+    tables = [Table("Logs", header, lines), Table("Consistency of the raw logs", ("flight", *names), verdicts)]
+    advice = Table("Failed checks, and how to repair them", ("flight", "check", "value", "suggestion"), failed)
+    return [*tables, advice] if failed else tables
+
+
+def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mapping[str, Any]]]:
+    """The checks that failed, each with its flight."""
+    named = [(f"{record['folder']}/{record['flight']}", check) for record in records for check in record["checks"]]
+    return [(flight, check) for flight, check in named if check["verdict"] == FAILS]
+
+
+def _errors(label: str) -> dict[str, Callable[[Results], str]]:
+    """The columns of a score: the error in each quantity."""
+
+    def text(quantity: str, rows: Results) -> str:
+        return spread_text(spread(pooled(rows, label, quantity)), ".4g", ".2g")
+
+    return {f"{name.replace('_', ' ')} [{unit}]": partial(text, name) for name, unit in QUANTITIES.items()}
+
+
+def _parameter(rows: Results, name: str) -> str:
+    having = rows.where(lambda row: name in row["theta"])  # the recipe of another fold may not learn it
+    if not len(having):
+        return EMPTY
+    values = having.numbers(f"theta.{name}", missing=math.nan)
+    text = f"{values.mean():.3g}" + (f" ± {values.std(ddof=1):.1g}" if len(values) > 1 else "")
+    ends = [(row["theta_interval"] or {}).get(name) for row in having]
+    known = np.array([end for end in ends if end is not None and None not in end], float)
+    text += f" [{known[:, 0].mean():.3g}, {known[:, 1].mean():.3g}]" if len(known) else ""
+    folds, all_folds = (len(group.unique("fold")) for group in (having, rows))
+    return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
+
+
+def _value(check: Mapping[str, Any]) -> str:
+    return f"{check['value']:.2g}{' ms' * (check['unit'] == 'ms')}" if math.isfinite(check["value"]) else ""

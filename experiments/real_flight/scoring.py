@@ -1,5 +1,16 @@
-"""Test models on held-out flights, and estimate their physical parameters."""
+"""Test models on held-out flights: the table of results, one row for each model tested in one fold, and hypotheses.
 
+Columns:
+
+- fold: the flights tested on; model, mode: of MODELS and MODES; n_train: target windows trained on, 0 if none; seed.
+- recipe: how the model was trained, empty for a baseline; val_loss, epochs, status: of its training.
+- windows: number of test windows.
+- scores: "10", "50", … (RMSE after so many intervals) and "sum" → quantity → error in the units of QUANTITIES.
+- theta: learned physical parameters by name in SI units, None for a model without; theta_interval: their 95 % intervals
+  [low, high], None without intervals.
+"""
+
+import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby
 from typing import Any
@@ -11,15 +22,16 @@ import numpy as np
 from jaxtyping import Int
 
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
-from experiments.real_flight.folds import non_overlapping
-from experiments.real_flight.models import is_body
-from experiments.real_flight.rows import QUANTITIES, SUM
+from experiments.real_flight.logs import non_overlapping
+from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
+from experiments.reporting import names
+from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate
+from experiments.reporting.results import Results
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.dynamics.multirotor import Multirotor
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training.channels import ChannelLoss
@@ -27,9 +39,18 @@ from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
 from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories
 
+QUANTITIES = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
+BASELINES = (names.LINEAR_RESIDUAL, names.THRUST, names.HOLD)
+MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
+MODES = (names.FINE_TUNED, names.SCRATCH, names.ZERO_SHOT, names.SOURCE_ONLY, names.NOMINAL)
+TAGS = ("fold", "model", "mode", "n_train", "seed")
+OWN_LABELS = {names.LINEAR_RESIDUAL: "rigid body + linear residual", names.SOURCE_ONLY: "trained", names.NOMINAL: ""}
+SUM = "sum"  # label of the nanodrone protocol's score; other labels are numbers of intervals
 INTERVAL_STEPS = 10  # length of the windows that intervals of θ_p come from: short, so that many are independent
 ROUND = 25  # their number is a multiple of it
 
+Cell = tuple[str, str, int]  # model, mode, n_train
+Cells = Mapping[Cell, Results]
 Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step: RMS and mean over windows, (2, 4, t)
 
 
@@ -54,34 +75,28 @@ def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mappi
     return {label: dict(zip(QUANTITIES, values, strict=True)) for label, values in found.items()}
 
 
-def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]) -> list[Test]:
+def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequence[Mapping[str, Any]]):
     """Test all runs of a model by `score` with a fold's arguments; `theta` is what `parameters` found."""
-
-    def one(run: int) -> Test:
+    for run in range(len(trained)):
         columns = {"model": trained.model, "mode": trained.mode, "recipe": trained.recipe, **theta[run]}
         columns |= {"n_train": trained.size(run), "seed": trained.seeds[run], "epochs": int(trained.epochs[run])}
         status = STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED])
-        return scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
-
-    return list(map(one, range(len(trained))))
+        yield scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
 
 
 def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]]:
     """Estimate θ_p of each run, and its intervals if enough of its training windows share no sample."""
-    if not any(map(is_body, jax.tree.leaves(trained.fields, is_leaf=is_body))):
+    if body_of(trained.fields) is None:
         return [{} for _ in trained.seeds]
-    short = _short(data)
-    spacing = -(-short.horizon // data.train.stride)
-    learned = ravel_parameters(trained.run(0))[0].size
-    found: list[dict[str, Any]] = []
+    short, found = _short(data), []
+    spacing, learned = -(-short.horizon // data.train.stride), ravel_parameters(trained.run(0))[0].size
     # Runs of one size share a program; rounding the number of windows lets sizes and folds share one too.
     for _, group in groupby(range(len(trained)), lambda run: len(trained.subsets[run])):
         runs = list(group)
         own = [non_overlapping(trained.subsets[run], data.train.sizes, spacing) for run in runs]
         most = min(map(len, own)) // ROUND * ROUND
         picked = stack([each[np.linspace(0, len(each) - 1, most).round().astype(int)] for each in own])
-        bounded = most > learned
-        of = lane(trained.fields, np.array(runs))
+        of, bounded = lane(trained.fields, np.array(runs)), most > learned
         ends = jax.device_get(_intervals(of, picked if bounded else picked[:, :0], short, data.objective))
         for run in range(len(runs)):
             theta = {name: at.value[run] for name, at in ends.items()}
@@ -95,26 +110,17 @@ def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajecto
     """θ_p of each run and its intervals, of no width without windows."""
 
     def one(run):
-        field, indices = run
-        body = body_of(field)
+        (field, indices), body = run, body_of(run[0])
         if len(indices):
             return intervals(body, covariance_of(field, windows[indices], error=objective.error))
-        size = ravel_parameters(body)[0].size
-        return intervals(body, jnp.zeros((size, size)))
+        return intervals(body, jnp.zeros((ravel_parameters(body)[0].size,) * 2))
 
     return jax.lax.map(one, (fields, picked))
 
 
-def body_of(field: AbstractVectorField) -> Multirotor:
-    """Return the multirotor inside a field, which holds all that its physics learns."""
-    return next(filter(is_body, jax.tree.leaves(field, is_leaf=is_body)))
-
-
-def linear_residuals(
-    base: AbstractVectorField, data: TrainingData, subsets: Sequence[np.ndarray], test_base: AbstractVectorField
-) -> list[AbstractVectorField]:
+def linear_residuals(base: Any, data: TrainingData, subsets: Sequence[np.ndarray], test_base: Any) -> list[Hybrid]:
     """Fit a linear residual of `base` to each subset of the training windows, of one size; add it to `test_base`."""
-    fitted = jax.device_get(_linear_residuals(base, _short(data), stack(list(subsets)), data.validation))
+    fitted = jax.device_get(_linear_residuals(base, _short(data), stack(subsets), data.validation))
     return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 
 
@@ -129,9 +135,86 @@ def _short(data: TrainingData) -> Trajectories:
 
 def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:
     """Average RMSE over that of a baseline, over quantities and horizons; recipes are chosen by it."""
+    ends = [[part[:, steps - 1] for part in found for steps in horizons] for found in (errors, baseline)]
+    own, other = ([np.sqrt(np.mean(np.square(end, dtype=float))) for end in each] for each in ends)
+    return float(np.mean(np.divide(own, other)))
 
-    def rms(part, steps: int) -> float:
-        return float(np.sqrt(np.mean(np.square(part[:, steps - 1], dtype=float))))
 
-    pairs = [(own, other, steps) for own, other in zip(errors, baseline, strict=True) for steps in horizons]
-    return float(np.mean([rms(own, steps) / rms(other, steps) for own, other, steps in pairs]))
+def cells(rows: Results) -> dict[Cell, Results]:
+    """Group rows over folds and seeds, in the order of MODELS, MODES and n_train."""
+    return rows.sort(model=MODELS, mode=MODES, n_train=None, seed=None).group("model", "mode", "n_train")
+
+
+def cell_name(model: str, mode: str, n_train: int = 0) -> str:
+    """Label a model, what was done with it, and with how many windows."""
+    words = [(names.LABELS | OWN_LABELS).get(key, key) for key in (model, mode)]
+    return ", ".join(filter(None, [*words, f"N = {n_train}" if n_train else ""]))
+
+
+def score_labels(rows: Results) -> list[str]:
+    """The labels of the scores, such as "10" and "sum"."""
+    return list(rows[0]["scores"])
+
+
+def pooled(rows: Results, label: str, quantity: str) -> np.ndarray:
+    """Compute the error of each seed over the test windows of all folds together."""
+    power = 1 if label == SUM else 2  # means are averaged as they are, root mean squares as squares
+
+    def one(own: Results) -> float:
+        weights, errors = own.numbers("windows"), own.numbers(f"scores.{label}.{quantity}")
+        return float((weights @ errors**power / weights.sum()) ** (1 / power))
+
+    return np.array([one(own) for own in rows.sort(seed=None).group("seed").values()])
+
+
+def least(errors: Mapping[str, float]) -> str:
+    """The name with the smallest finite error, the first of equal ones."""
+    return min(errors, key=lambda name: (not math.isfinite(errors[name]), errors[name]))
+
+
+def verdicts(rows: Results) -> list[Verdict]:
+    """Evaluate each hypothesis that the rows can answer, on the mean over seeds with folds pooled."""
+    found = cells(rows)
+    sizes = sorted({n for _, _, n in found} - {0})
+    mode, most = ("fine_tuned", sizes[-1]) if sizes else ("source_only", 0)
+    best = ("hybrid", mode, most)
+    if best not in found:
+        return []
+    baselines = [cell for cell in found if cell[0] in BASELINES]
+    rivals = [(model, mode, most) for model in ("no_physics", "physics_only")]
+    claims = [
+        _better("F1", best, baselines, "every simple baseline"),
+        _better("F2", best, rivals, "no-physics and physics-only"),
+    ]
+    if sizes:
+        few, scratch = (("hybrid", mode, sizes[0]) for mode in ("fine_tuned", "scratch"))
+        claims += [
+            _better("F3", few, [scratch], "the same model from scratch"),
+            _better("F4", few, [("hybrid", "zero_shot", 0)], "the source's model as it is"),
+        ]
+    return evaluate(claims, found)
+
+
+def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cells]:
+    """Claim that a cell has a smaller error than each of the others, in every quantity and at every horizon."""
+
+    def predicate(found: Cells) -> tuple[bool, str]:
+        known = [found[other] for other in others if other in found]
+        if not known:
+            raise Inconclusive("none of these was run")
+        ratios = {
+            f"{'summed' if label == SUM else f'step {label}'} {quantity}": max(
+                _ratio(found[cell], other, label, quantity) for other in known
+            )
+            for label in score_labels(found[cell])
+            for quantity in QUANTITIES
+        }
+        words = ", ".join(f"{where} {ratio:.3f}" for where, ratio in ratios.items())
+        return all(ratio < 1 for ratio in ratios.values()), f"error over that of the best of them: {words}"
+
+    return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", predicate)
+
+
+def _ratio(rows: Results, others: Results, label: str, quantity: str) -> float:
+    own, other = (float(np.mean(pooled(group, label, quantity))) for group in (rows, others))
+    return own / other if math.isfinite(own) else math.inf

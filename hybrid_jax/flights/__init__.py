@@ -1,22 +1,11 @@
 """Recorded flights: read logs, check them, clean them and cut them into training windows.
 
-    import hybrid_jax as hj
+    windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one CSV or ULog file per flight
 
-    vehicle = hj.load_vehicle("vehicle.toml")
-    windows = hj.load_windows("flights/", vehicle, steps=10)  # one CSV or ULog file per flight
-
-`load_windows` joins steps that can be taken one by one. Split by flight before cutting, since windows of one flight
-share samples, wind and battery:
-
-    from hybrid_jax.flights import cut_windows, hold_out, load_logs
+Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
 
     train, test = hold_out(load_logs("flights/"), ["flight_07"])
     windows = cut_windows(train, steps=10).windows
-
-- log, flight_csv, column_map, ulog: reading; attitude: frames.
-- consistency, readings, motor_response: checks of a log against itself and the vehicle.
-- segments, cleaning: gaps, resampling, filtering, delays of the motors.
-- splits, windows, scores: flights for training and test, windows, prediction errors.
 """
 
 from hybrid_jax.flights.cleaning import (
@@ -32,8 +21,7 @@ from hybrid_jax.flights.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.consistency import Check, check_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.splits import folds, hold_out
-from hybrid_jax.flights.windows import LogWindows, cut_windows, load_log, load_logs, load_windows
+from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_log, load_logs, load_windows
 
 __all__ = [
     "Check",

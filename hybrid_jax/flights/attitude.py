@@ -15,7 +15,6 @@ Quaternions = Float[np.ndarray, "n 4"]
 # Matrices from a frame to the library's: world z up, body forward-left-up.
 WORLDS = {"ENU": np.eye(3), "NED": np.array([[0.0, 1, 0], [1, 0, 0], [0, 0, -1]])}
 BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
-VELOCITY_FRAMES = ("world", "body")
 
 
 @dataclass(frozen=True)
@@ -27,8 +26,8 @@ class Frames:
     velocity: str  # world or body
 
     def __post_init__(self):
-        for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", VELOCITY_FRAMES)):
-            if getattr(self, name) not in known:
+        for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", ("world", "body"))):
+            if getattr(self, name) not in tuple(known):
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
 
@@ -79,7 +78,6 @@ def mean_of_held(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values
     if len(t) == 1:
         return values[np.searchsorted(at, t, side="right") - 1]
     area = np.concatenate([np.zeros((1, values.shape[1])), np.cumsum(values[:-1] * np.diff(at)[:, None], axis=0)])
-    # The last value is held beyond its sample.
     end = max(t[-1], at[-1]) + 1.0
     area = np.concatenate([area, area[-1:] + values[-1:] * (end - at[-1])])
     mean = np.diff(interpolate(t, np.append(at, end), area), axis=0) / np.diff(t)[:, None]

@@ -6,9 +6,8 @@ import numpy as np
 from scipy import signal
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import lagged, respond
-from hybrid_jax.flights.segments import GAP, at_rest, even_segments, repeats, runs_of, segments
+from hybrid_jax.flights.log import GAP, FlightLog, at_rest, even_segments, repeats, runs_of, segments
+from hybrid_jax.flights.readings import respond
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import Vehicle
 
@@ -16,9 +15,7 @@ TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
-    """Resample each segment at multiples of dt [s].
-
-    States are interpolated linearly, attitudes spherically; motor values are means over each interval.
+    """Resample each segment at multiples of dt [s]: states linearly, attitudes spherically, motors as means.
 
     Args:
         longest_gap: interpolate across gaps and repeated samples up to this long [s].
@@ -34,7 +31,10 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
         # The tolerance keeps the last sample despite rounded times.
         first, last = np.ceil(piece.t[0] / dt - 1e-6), np.floor(piece.t[-1] / dt + 1e-6)
         if last > first:
-            parts.append(_sampled(piece, np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])))
+            t = np.clip(dt * np.arange(first, last + 1), piece.t[0], piece.t[-1])
+            x = interpolate(t, piece.t, piece.x)
+            x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
+            parts.append(FlightLog(t, x, mean_of_held(t, piece.t, piece.u), log.name))
     if not parts:
         raise ValueError(f"{log.name}: no segment without gaps is as long as dt = {dt} s")
     # Without last samples of segments that would make a gap too short to be recognised as one.
@@ -43,12 +43,6 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
     t, x, u = (np.concatenate([getattr(part, name) for part in parts]) for name in ("t", "x", "u"))
     done = f"resampled {len(log)} samples to {len(t)} at {dt} s in {len(parts)} segments"
     return FlightLog(t, x, u, log.name), f"{done}, bridging gaps up to {longest_gap} s"
-
-
-def _sampled(piece: FlightLog, t) -> FlightLog:
-    x = interpolate(t, piece.t, piece.x)
-    x[:, QUATERNION] = interpolate_attitude(t, piece.t, piece.x[:, QUATERNION])
-    return FlightLog(t, x, mean_of_held(t, piece.t, piece.u), piece.name)
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
@@ -89,9 +83,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
     done = f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"
-    if len(log) < all_samples:
-        done += f"; {all_samples - len(log)} repeated samples left out"
-    return FlightLog(log.t, x, u, log.name), done
+    return FlightLog(log.t, x, u, log.name), f"{done}; {all_samples - len(log)} repeated samples left out"
 
 
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
@@ -107,25 +99,31 @@ def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
         inside = (piece.t - lag >= piece.t[0] - 1e-9) & (piece.t + log.dt - lag <= end + 1e-9)
         if inside.sum() > 1:
             at = np.append(piece.t[inside], piece.t[inside][-1] + log.dt) - lag
-            parts.append((piece[inside], mean_of_held(at, piece.t, piece.u)[:-1]))
+            parts.append((piece.t[inside], piece[inside].x, mean_of_held(at, piece.t, piece.u)[:-1]))
     if not parts:
         raise ValueError(f"{log.name}: no segment without gaps is longer than the lag of {lag} s")
-    t, x = (np.concatenate([getattr(piece, name) for piece, _ in parts]) for name in ("t", "x"))
-    done = f"motors shifted by {1000 * lag:.1f} ms, {len(log) - len(t)} samples cut"
-    return FlightLog(t, x, np.concatenate([u for _, u in parts]), log.name), done
+    t, x, u = map(np.concatenate, zip(*parts, strict=True))
+    return FlightLog(t, x, u, log.name), f"motors shifted by {1000 * lag:.1f} ms, {len(log) - len(t)} samples cut"
 
 
 def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
-    """Replace motor values u by rotor speeds w with τ ẇ = u − w, averaged over each interval.
+    """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium.
 
     Raises:
         ValueError: the time constant is negative, or samples are not evenly spaced.
     """
     if not 0 <= time_constant < np.inf:
         raise ValueError(f"time_constant must be a number of seconds of at least 0, got {time_constant!r}")
-    even_segments(log)
-    lagging = FlightLog(log.t, log.x, lagged(log, time_constant), log.name)
-    return lagging, f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
+    parts, u = even_segments(log), log.u.copy()
+    if time_constant > 0:
+        step = log.dt / time_constant
+        kept = np.exp(-step)
+        for part in parts:
+            held = log.u[part]
+            speed, _ = signal.lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
+            u[part] = held + (speed - held) * (1 - kept) / step
+    done = f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
+    return FlightLog(log.t, log.x, u, log.name), done
 
 
 def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
@@ -144,8 +142,6 @@ def choose_time_constant(
     logs: Sequence[FlightLog], error: Callable[[list[FlightLog]], float], candidates: Sequence[float] = TIME_CONSTANTS
 ) -> tuple[float, list[float]]:
     """Choose the time constant [s] for `lag_motors` with the smallest error; also return the error of each candidate.
-
-    For logs that record commands, not rotor speeds.
 
     Args:
         error: prediction error of a model fitted to logs to which a candidate was applied.

@@ -15,15 +15,14 @@ Motors in unit "command" need polynomial = [c0, c1, …]: rad/s = c0 + c1 comman
 import math
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
-from hybrid_jax.flights.flight_csv import MAX_ROWS, flight_log, read_table
-from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
-from hybrid_jax.vehicle import read_tables
+from hybrid_jax.flights.flight_csv import flight_log, read_table
+from hybrid_jax.flights.log import FlightLog, wrong_norms
+from hybrid_jax.vehicle import from_table, read_tables, require_known
 
 SCALES = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -46,33 +45,49 @@ class Columns:
 
 
 @dataclass(frozen=True)
+class Format:
+    """How the numbers stand in the file."""
+
+    delimiter: str = ","
+
+    def __post_init__(self):
+        if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
+            raise ValueError(f"delimiter must be one character, got {self.delimiter!r}")
+
+
+@dataclass(frozen=True)
 class ColumnMap:
-    """The meaning of the columns of a CSV log; `quantities` has one entry for each key of `SCALES`.
+    """The meaning of the columns of a CSV log: the tables of the TOML file, with a quantity for each key of `SCALES`.
 
     Raises:
         ValueError: the table, the key and what was expected, in one line.
     """
 
     frames: Frames
-    quantities: dict[str, Columns]
-    delimiter: str = ","
+    time: Columns
+    position: Columns
+    attitude: Columns
+    velocity: Columns
+    body_rates: Columns
+    motors: Columns
+    format: Format = Format()
 
     def __post_init__(self):
-        for name, scales in SCALES.items():
-            if name not in self.quantities:
-                raise ValueError(f"[{name}]: is missing; give its columns and unit")
-            _check(name, self.quantities[name], scales)
         for name, stated in self.quantities.items():
-            for column in stated.columns:
-                if self.names.count(column) > 1:
-                    raise ValueError(f"[{name}]: column {column!r} is named twice")
-        if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
-            raise ValueError(f"[format]: delimiter must be one character, got {self.delimiter!r}")
+            _check(name, stated)
+        for column in self.names:
+            if self.names.count(column) > 1:
+                raise ValueError(f"columns: {column!r} is named twice")
+
+    @property
+    def quantities(self) -> dict[str, Columns]:
+        """The columns of each quantity, in the order of `SCALES`."""
+        return {name: getattr(self, name) for name in SCALES}
 
     @property
     def names(self) -> list[str]:
         """All columns, in the order of `SCALES`."""
-        return [column for name in SCALES for column in self.quantities[name].columns]
+        return [column for stated in self.quantities.values() for column in stated.columns]
 
 
 def load_column_map(path: str | Path) -> ColumnMap:
@@ -81,22 +96,23 @@ def load_column_map(path: str | Path) -> ColumnMap:
     Raises:
         ValueError: file, table, key and what was expected, in one line.
     """
-    tables = read_tables(path)
-    try:
-        return _column_map(tables)
-    except ValueError as error:
-        raise ValueError(f"{path}: {error}") from error
-    except TypeError as error:
-        raise ValueError(f"{path}: a value of the wrong type: {error}") from error
+    tables, parts = read_tables(path), {}
+    require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise ValueError(f"{path}: [{name}]: must be a table, got {table!r}")
+        kind = {"frames": Frames, "format": Format}.get(name, Columns)
+        parts[name] = from_table(kind, table, f"{path}: [{name}]")
+    return from_table(ColumnMap, parts, str(path))
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_ROWS) -> FlightLog:
+def read_mapped(path: str | Path, column_map: ColumnMap) -> FlightLog:
     """Read one flight of a CSV file, plain or gzip, into the library's units and frames.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
-    table = read_table(path, column_map.names, delimiter=column_map.delimiter, max_rows=max_rows)
+    table = read_table(path, column_map.names, delimiter=column_map.format.delimiter)
     stated, parts, begin = column_map.quantities, {}, 0
     for name, scales in SCALES.items():
         end = begin + len(stated[name].columns)
@@ -111,58 +127,27 @@ def read_mapped(path: str | Path, column_map: ColumnMap, *, max_rows: int = MAX_
 def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
     fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
-        row = int(np.abs(values).max(axis=1).argmax())
         # Yaw may be counted over turns, tilt may not.
-        if np.abs(values[:, :2]).max() > 2 * math.pi:
-            raise ValueError(
-                f"{origin}: row {row + 2}, field {fields}: roll or pitch above 2π; "
-                'are the angles degrees? set [attitude] unit = "deg"'
-            )
+        for row in np.flatnonzero((np.abs(values[:, :2]) > 2 * math.pi).any(axis=1))[:1]:
+            advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
+            raise ValueError(f"{origin}: row {row + 2}, field {fields}: {advice}")
         return from_euler(values)
     q = np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
-    with np.errstate(over="ignore"):
-        norm = np.linalg.norm(q, axis=1)
-    for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
-        raise ValueError(
-            f"{origin}: row {row + 2}, field {fields}: norm is {norm[row]:.4g}, not 1; "
-            "cut out samples without an attitude, or name the four quaternion columns"
-        )
+    for row, norm in wrong_norms(q):
+        advice = "cut out samples without an attitude, or name the four quaternion columns"
+        raise ValueError(f"{origin}: row {row + 2}, field {fields}: norm is {norm:.4g}, not 1; {advice}")
     return q
 
 
-def _column_map(tables: dict[str, Any]) -> ColumnMap:
-    known = {"frames": (("world", "body", "velocity"), ())}
-    known |= dict.fromkeys(SCALES, (("columns", "unit"), ("polynomial",))) | {"format": ((), ("delimiter",))}
-    for name, table in {"frames": {}, **tables}.items():
-        if name not in known:
-            raise ValueError(f"[{name}]: no such table; known are {', '.join(known)}")
-        if not isinstance(table, dict):
-            raise ValueError(f"[{name}]: must be a table, got {table!r}")
-        needed, allowed = known[name]
-        for key in needed:
-            if key not in table:
-                raise ValueError(f"[{name}]: {key} is missing")
-        for key in table:
-            if key not in needed + allowed:
-                raise ValueError(f"[{name}]: {key}: no such key; known are {', '.join(needed + allowed)}")
-    quantities = {}
-    for name in filter(tables.__contains__, SCALES):
-        lists = {key: tables[name].get(key, []) for key in ("columns", "polynomial")}
-        if not all(isinstance(value, list) for value in lists.values()):
-            raise ValueError(f"[{name}]: columns and polynomial must be lists, got {lists}")
-        quantities[name] = Columns(tuple(lists["columns"]), tables[name]["unit"], tuple(lists["polynomial"]))
-    return ColumnMap(Frames(**tables["frames"]), quantities, tables.get("format", {}).get("delimiter", ","))
-
-
-def _check(name: str, stated: Columns, scales: dict[str, float]) -> None:
-    if not isinstance(stated.unit, str) or stated.unit not in scales:
-        raise ValueError(f"[{name}]: unit must be one of {', '.join(scales)}, got {stated.unit!r}")
-    count = COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
-    if len(stated.columns) != count or not all(isinstance(column, str) for column in stated.columns):
-        raise ValueError(f"[{name}]: columns must be {count} names for unit {stated.unit}, got {list(stated.columns)}")
-    numbers = [isinstance(c, int | float) and math.isfinite(c) for c in stated.polynomial]
-    if bool(numbers) != (stated.unit == "command") or not all(numbers):
-        raise ValueError(
-            f"[{name}]: polynomial must be numbers c0, c1, … if and only if the unit is command, "
-            f"got {list(stated.polynomial)} for {stated.unit}"
-        )
+def _check(name: str, stated: Columns) -> None:
+    if stated.unit not in tuple(SCALES[name]):
+        raise ValueError(f"[{name}]: unit must be one of {', '.join(SCALES[name])}, got {stated.unit!r}")
+    columns, count = stated.columns, COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
+    named = isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)
+    if not named or len(columns) != count:
+        raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")
+    given = stated.polynomial
+    numbers = isinstance(given, tuple) and all(isinstance(c, int | float) and math.isfinite(c) for c in given)
+    if not numbers or bool(given) != (stated.unit == "command"):
+        what = "polynomial must be numbers c0, c1, … if and only if the unit is command"
+        raise ValueError(f"[{name}]: {what}, got {given!r} for {stated.unit}")

@@ -3,7 +3,7 @@
 Where they disagree, common mistakes are undone one at a time, and the one that resolves the disagreement is suggested.
 """
 
-from collections.abc import Callable
+import math
 from dataclasses import dataclass, replace
 from itertools import combinations
 
@@ -12,16 +12,16 @@ from jaxtyping import Float
 
 from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.log import COLUMNS, FlightLog
-from hybrid_jax.flights.motor_response import respond
-from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, smoother
-from hybrid_jax.flights.segments import at_rest, gaps, repeats, sound_intervals
+from hybrid_jax.flights.log import COLUMNS, FlightLog, at_rest, gaps, repeats, sound_intervals
+from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
+GROUND = "cut it out: in_flight(log), or --cleaning.in-flight"
 MORE_FLIGHT = "check on a flight with more motion"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
+THRUST = "v̇ against thrust along body z"
 MAX_SAMPLES = 100_000  # the middle of longer logs is checked
 
 LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
@@ -29,6 +29,7 @@ LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
 KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
+SPAN = 0.05  # s of moving average on both sides of an equation
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
@@ -37,8 +38,6 @@ OPPOSED = -0.1  # correlation
 NOISE = 0.2  # share of the least motion below which two readings count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
-
-Law = Callable[[Vectors, Vectors, float], str]  # two records and the least motion → suggestion, empty if it holds
 
 
 @dataclass(frozen=True)
@@ -61,20 +60,6 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
-    slope, turn, push = readings.velocities(log), readings.rates(log), readings.accelerations(log)
-    exact = _axes_agree, _one_scale  # of kinematics alone: wind and drag separate v̇ from thrust
-    return [
-        *_samples(log),
-        _compare(log, "dp/dt against v", slope, KINEMATICS_LIMIT, LEAST_MOTION["velocity"], *exact),
-        _compare(log, "q̇ against ω", turn, KINEMATICS_LIMIT, LEAST_MOTION["rates"], *exact),
-        _compare(log, "v̇ against thrust along body z", push, THRUST_LIMIT, LEAST_MOTION["acceleration"]),
-        *_thrust(log, vehicle),
-        _columns(log),
-        *_motors(log, vehicle),
-    ]
-
-
-def _samples(log: FlightLog) -> list[Check]:
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
     clock = "the time is in ms or µs: declare its unit"
     split = "windows and filters stop at each; resample(log, dt, longest_gap) bridges short ones"
@@ -82,32 +67,39 @@ def _samples(log: FlightLog) -> list[Check]:
         _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
         _at_most("gaps", lost, "share of intervals", 0.01, split),
         _at_most("repeated samples", stale, "share of samples", 0.01, split),
+        _compare(log, "dp/dt against v", readings.velocities(log), LEAST_MOTION["velocity"]),
+        _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
+        _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
+        _at_most("time on the ground", float(at_rest(log).mean()), "share of samples", 0.01, GROUND),
+        _thrust(log, vehicle),
+        _columns(log),
+        *_motors(log, vehicle),
     ]
 
 
 def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) -> Check:
-    return Check(name, value, unit, limit, *((OK, NOTHING) if value <= limit else (FAILS, suggestion)))
+    return _check(name, value, unit, limit, suggestion if value > limit else "")
 
 
-def _thrust(log: FlightLog, vehicle: Vehicle) -> list[Check]:
-    """Check time on the ground, and in flight the mean specific force along body z over k Σu² / m."""
-    name, resting = "specific force over thrust per mass", at_rest(log)
-    flying = sound_intervals(log) & ~resting[:-1]
-    advice = "cut it out: in_flight(log), or --cleaning.in-flight"
-    ground = _at_most("time on the ground", float(resting.mean()), "share of samples", 0.01, advice)
+def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
+    return Check(name, value, unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
+
+
+def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
+    """Check the mean specific force along body z in flight, over k Σu² / m."""
+    flying, name = sound_intervals(log) & ~at_rest(log)[:-1], "specific force over thrust per mass"
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
         still = "the motors stand still: check a log in flight"
-        return [ground, Check(name, float("nan"), "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)]
+        return Check(name, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
-    verdict = (OK, NOTHING) if fits else (FAILS, _thrust_suggestion(ratio, log, vehicle))
-    return [ground, Check(name, ratio, "ratio", THRUST_RATIO_LIMIT, *verdict)]
+    return _check(name, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
 
 
-def _thrust_suggestion(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
+def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
     if ratio <= 0:
         return "body z points down: correct the frames first"
     for unit, factor in (("rpm", np.pi / 30), ("rev/s", 2 * np.pi), ("deg/s", np.pi / 180)):
@@ -127,23 +119,19 @@ def _columns(log: FlightLog) -> Check:
     alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
     problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
-    verdict = (FAILS, f"{'; '.join(problems)}: name the measured columns") if problems else (OK, NOTHING)
-    return Check("columns", float(len(problems)), "suspect", 0.0, *verdict)
+    advice = f"{'; '.join(problems)}: name the measured columns"
+    return _at_most("columns", float(len(problems)), "suspect", 0.0, advice)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     found, limit = respond(log, vehicle), 1000 * log.dt
     order, spin, gyro = "motor order against roll and pitch", "spin against yaw", "lag of the gyro behind the motors"
     if found is None or sum(found.correlations[:2]) < 2 * ORDER_LIMIT:
-        value = float("nan") if found is None else min(found.correlations[:2])
-        return [
-            Check(order, value, "correlation", ORDER_LIMIT, UNKNOWN, MORE_FLIGHT),
-            Check(spin, float("nan"), "correlation", 0.0, UNKNOWN, MORE_FLIGHT),
-            Check(gyro, float("nan"), "ms", limit, UNKNOWN, MORE_FLIGHT),
-        ]
+        value = math.nan if found is None else min(found.correlations[:2])
+        correlated = (order, value, "correlation", ORDER_LIMIT), (spin, math.nan, "correlation", 0.0)
+        return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (gyro, math.nan, "ms", limit))]
     columns = " ".join(f"u{motor}" for motor in found.order)
-    right, advice = found.order == (0, 1, 2, 3), f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}"
-    ordered = (OK, NOTHING) if right else (FAILS, advice)
+    advice = f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}"
     yaw = found.yaw_sign * found.correlations[2]
     if sum(vehicle.spin):
         turning = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
@@ -155,28 +143,30 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: delay_motors(log, {found.lag:.4f})"
     shift += ", or lag_motors if they are commands" if late else ""
     return [
-        Check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, *ordered),
+        _check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if found.order == (0, 1, 2, 3) else advice),
         Check(spin, yaw, "correlation", YAW_LIMIT, *turning),
         replace(_at_most(gyro, abs(lag), "ms", limit, shift), value=lag),
     ]
 
 
-def _compare(log: FlightLog, name: str, pairs: Readings, limit: float, least: float, *laws: Law) -> Check:
-    """Compare two records under every reading and by further laws."""
-    smooth = smoother(log)
-    pairs = {reading: (smooth(a), smooth(b)) for reading, (a, b) in pairs.items()}
+def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
+    """Compare two records under every reading; kinematics hold for each axis, v̇ is moved by wind and drag as well."""
+    sound, limit = sound_intervals(log)[:, None].astype(float), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
+    width = min(max(1, round(SPAN / log.dt)), len(sound))
+    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
+    pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:
-        return Check(name, float("nan"), "relative error", limit, UNKNOWN, MORE_FLIGHT)
+        return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value = _relative_error(a, b)
     advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
-    for law in laws:
-        advice = advice or law(a, b, least)
-    return Check(name, value, "relative error", limit, *((FAILS, advice) if advice else (OK, NOTHING)))
+    if name != THRUST:
+        advice = advice or _axes_apart(a, b, least) or _other_scale(a, b)
+    return _check(name, value, "relative error", limit, advice)
 
 
 def _nearer(pairs: Readings, limit: float, least: float) -> str:
-    """Find the reading under which the records agree best; empty if that is the unchanged log."""
+    """The reading under which the records agree best; empty if that is the unchanged log."""
     left = {reading: a - b for reading, (a, b) in pairs.items()}
     own = left[NOTHING]
     # Any improvement counts if two readings differ by more than noise: an axis with little motion contributes little.
@@ -185,17 +175,18 @@ def _nearer(pairs: Readings, limit: float, least: float) -> str:
     return best if nearer and _relative_error(*pairs[best]) <= limit else ""
 
 
-def _axes_agree(a: Vectors, b: Vectors, least: float) -> str:
+def _axes_apart(a: Vectors, b: Vectors, least: float) -> str:
     pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
     moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
     apart = [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]
     return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
 
 
-def _one_scale(a: Vectors, b: Vectors, least: float) -> str:
+def _other_scale(a: Vectors, b: Vectors) -> str:
     gain = float((a * b).sum() / (b * b).sum())
-    message = f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
-    return "" if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT else message
+    if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
+        return ""
+    return f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
 
 
 def _size(values: Float[np.ndarray, "n d"]) -> float:

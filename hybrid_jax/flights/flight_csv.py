@@ -3,6 +3,7 @@
 The header names the columns. Their order is free, and other columns are ignored.
 """
 
+import contextlib
 import gzip
 import io
 import zlib
@@ -103,13 +104,11 @@ def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) ->
         if line.count(delimiter) != commas:
             found = f"{line.count(delimiter) + 1} fields" if line.strip() else "a blank line"
             raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; repair or cut the row out")
-    try:
+    with contextlib.suppress(ValueError):
         table = np.loadtxt(lines, delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
-    except ValueError:
-        table = None
-    if table is None or table.shape != (len(lines), len(picked)) or not np.isfinite(table).all():
-        raise ValueError(f"{path}: {_bad_cell(lines, row, names, picked, delimiter)}")
-    return table
+        if table.shape == (len(lines), len(picked)) and np.isfinite(table).all():
+            return table
+    raise ValueError(f"{path}: {_bad_cell(lines, row, names, picked, delimiter)}")
 
 
 def _bad_cell(lines, row, names, picked, delimiter) -> str:
@@ -117,11 +116,9 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
         cells = line.split(delimiter)
         for column in picked:
             cell = cells[column].strip()
-            try:
+            with contextlib.suppress(ValueError):
                 if np.isfinite(np.loadtxt([cell or "-"], delimiter=delimiter, comments=None)).all():
                     continue
-            except ValueError:
-                pass
             found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
             return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"
     return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"

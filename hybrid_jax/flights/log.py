@@ -1,15 +1,19 @@
-"""A recorded flight in the library's frames and units, checked when it is created."""
+"""A recorded flight in the library's frames and units, checked when it is created, and its segments without gaps."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, QUATERNION, STATE_NAMES, STATE_SIZE
 
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)
+GAP = 1.5  # intervals longer than this many times the median are gaps
+IDLE = 0.3  # share of the thrust in flight below which a vehicle is on the ground
+JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
+RESTING = 0.5  # minimum time [s] with idle motors to count as on the ground
 
 
 @dataclass(frozen=True)
@@ -59,18 +63,8 @@ class FlightLog:
         return round(float(np.median(np.diff(self.t))), 9)
 
 
-def require_possible(
-    t: Float[np.ndarray, " n"],
-    x: Float[np.ndarray, "n 13"],
-    u: Float[np.ndarray, "n 4"],
-    origin,
-    unit="sample",
-    first=0,
-) -> None:
-    """Refuse numbers that are impossible in a flight.
-
-    Args:
-        unit, first: name of a sample in messages and the number of the first, such as ("row", 2).
+def require_possible(t, x, u, origin, unit: str = "sample", first: int = 0) -> None:
+    """Refuse numbers that are impossible in a flight, in messages that count from `first`, as in ("row", 2).
 
     Raises:
         ValueError: origin, sample, field and what to do, in one line.
@@ -84,21 +78,24 @@ def require_possible(
 def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     """Impossible values: index of the sample, field and what to do."""
     for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (INPUT_NAMES, u)):
-        bad = ~np.isfinite(block)
-        if bad.any():
-            row, column = np.argwhere(bad)[0].tolist()
+        for row, column in np.argwhere(~np.isfinite(block))[:1].tolist():
             yield row, names[column], f"is {block[row, column]}; cut the sample out (it becomes a gap) or repair it"
     # Compare, as a difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"
         yield row, "t", f"time {times}; sort the samples, drop doubles, split restarted clocks"
-    with np.errstate(over="ignore"):  # an infinite norm is refused too
-        norm = np.linalg.norm(x[:, QUATERNION], axis=1)
-    for row in np.flatnonzero(np.abs(norm - 1) > NORM_TOLERANCE)[:1]:
-        advice = "cut out samples without an attitude" if norm[row] == 0 else "are these the four quaternion columns?"
-        yield row, "qw qx qy qz", f"norm is {norm[row]:.4g}, not 1; {advice}"
+    for row, norm in wrong_norms(x[:, QUATERNION]):
+        advice = "cut out samples without an attitude" if norm == 0 else "are these the four quaternion columns?"
+        yield row, "qw qx qy qz", f"norm is {norm:.4g}, not 1; {advice}"
     for row, column in np.argwhere(u < 0)[:1].tolist():
         yield row, INPUT_NAMES[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
+
+
+def wrong_norms(q: Float[np.ndarray, "n 4"]) -> list[tuple[int, float]]:
+    """Index and norm of the first quaternion, if any, that is not of norm 1."""
+    with np.errstate(over="ignore"):  # an infinite norm is refused too
+        norms = np.linalg.norm(q, axis=1)
+    return [(int(row), float(norms[row])) for row in np.flatnonzero(np.abs(norms - 1) > NORM_TOLERANCE)[:1]]
 
 
 def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
@@ -107,3 +104,53 @@ def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
     flips = np.where((q[1:] * q[:-1]).sum(axis=1) < 0, -1.0, 1.0)
     start = -1.0 if q[0, 0] < 0 else 1.0
     return q * (start * np.cumprod([1.0, *flips]))[:, None]
+
+
+def gaps(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether samples are missing in an interval."""
+    return np.diff(log.t) > GAP * log.dt if len(log) > 1 else np.zeros(0, bool)
+
+
+def repeats(log: FlightLog) -> Bool[np.ndarray, " n"]:
+    """Whether a state equals the one before in every digit, which noise rules out for fresh samples."""
+    return np.concatenate([[False], (np.diff(log.x, axis=0) == 0).all(axis=1)])
+
+
+def sound_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether an interval is no gap and has fresh samples at both ends."""
+    stale = repeats(log)
+    return ~(gaps(log) | stale[:-1] | stale[1:])
+
+
+def runs_of(mask: Bool[np.ndarray, " n"], extra: int = 0) -> list[slice]:
+    """The maximal runs of true entries, each longer by `extra` at its end."""
+    edges = np.flatnonzero(np.diff(np.concatenate([[0], mask, [0]]))).tolist()
+    return [slice(start, stop + extra) for start, stop in zip(edges[::2], edges[1::2], strict=True)]
+
+
+def segments(log: FlightLog) -> list[slice]:
+    """Maximal runs of at least two samples joined by sound intervals."""
+    return runs_of(sound_intervals(log), 1)
+
+
+def even_segments(log: FlightLog) -> list[slice]:
+    """Return the segments; refuse a log whose samples are not evenly spaced within each."""
+    uneven = unevenness(log)
+    if uneven.any():
+        at = log.t[int(uneven.argmax())]
+        raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+    return segments(log)
+
+
+def unevenness(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether a sound interval has another length than the median one."""
+    return sound_intervals(log) & (np.abs(np.diff(log.t) - log.dt) > JITTER * log.dt)
+
+
+def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
+    """Whether a sample belongs to a period of half a second or more with hardly any thrust, on the ground."""
+    power = (log.u**2).sum(axis=1)
+    found = np.zeros(len(log), bool)
+    for part in runs_of(power < IDLE * np.quantile(power, 0.9)):
+        found[part] = log.t[part][-1] - log.t[part.start] >= RESTING
+    return found

@@ -1,23 +1,32 @@
-"""Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake."""
+"""Readings of a log: pairs of records that should be equal, such as dp/dt and v, each after undoing one mistake.
 
-from collections.abc import Callable
+From angular acceleration and motors `respond` estimates the order of the motors, their direction of spin and their lag.
+"""
+
+from itertools import permutations
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import moving_mean
-from hybrid_jax.flights.segments import sound_intervals
+from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.vehicle import Vehicle
 
 NOTHING = "nothing to correct"  # the reading of the unchanged log
-SPAN = 0.05  # s of moving average on both sides of an equation
 LATE = 0.1  # delay or advance of a velocity that is tried [s]
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
 FLIPS = dict(zip("xyz", 1 - 2 * np.eye(3), strict=True))
+
+LONGEST_LAG = 0.1  # s, either way
+# Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
+# and offsets of the centre of mass, which motors counteract and would appear to cause.
+FAST, SLOW = 0.03, 0.2  # s
+YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
+ORDERS = np.array(list(permutations(range(4))))
 
 Vectors = Float[np.ndarray, "n 3"]
 Readings = dict[str, tuple[Vectors, Vectors]]
@@ -26,7 +35,8 @@ Readings = dict[str, tuple[Vectors, Vectors]]
 def velocities(log: FlightLog) -> Readings:
     """dp/dt and v [m/s]."""
     p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
-    slope, late, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], round(LATE / log.dt), BODIES["FRD"]
+    slope, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], BODIES["FRD"]
+    now, late = np.arange(len(v)), round(LATE / log.dt)
     stated = {
         NOTHING: v,
         'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
@@ -37,8 +47,8 @@ def velocities(log: FlightLog) -> Readings:
         "velocity is in cm/s: set its unit": v * 1e-2,
         "position is in mm: set its unit": v * 1e3,
         "position is in cm: set its unit": v * 1e2,
-        f"velocity is about {LATE:g} s late: shift it": _shifted(v, late),
-        f"velocity is about {LATE:g} s early: shift it": _shifted(v, -late),
+        f"velocity is about {LATE:g} s late: shift it": v[np.minimum(now + late, now[-1])],
+        f"velocity is about {LATE:g} s early: shift it": v[np.maximum(now - late, 0)],
     }
     for axis, signs in FLIPS.items():
         stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
@@ -68,18 +78,15 @@ def accelerations(log: FlightLog) -> Readings:
     """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
-
-    def turned(world) -> Float[np.ndarray, "n 4"]:
-        return quaternion_of(Rotation.from_matrix(world @ attitude.as_matrix() @ BODIES["FRD"].T))
-
-    ned = turned(WORLDS["NED"])
+    frd = attitude.as_matrix() @ BODIES["FRD"].T
+    ned = quaternion_of(Rotation.from_matrix(WORLDS["NED"] @ frd))
     stated = {
         NOTHING: (q, v),
         'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
         "attitude alone is NED and FRD: convert it": (ned, v),
         'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
-        'the body is FRD in a world with z up: set body = "FRD"': (turned(np.eye(3)), v),
+        'the body is FRD in a world with z up: set body = "FRD"': (quaternion_of(Rotation.from_matrix(frd)), v),
         'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
     }
     # Other readings of attitudes rotate thrust about z only, which wind or a load may do as well.
@@ -97,10 +104,6 @@ def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"
     }
 
 
-def _shifted(values: Vectors, samples: int) -> Vectors:
-    return values[np.clip(np.arange(len(values)) + samples, 0, len(values) - 1)]
-
-
 def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
     slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], sound_intervals(log)[:, None]
     predicted = middle(rotation_of(q).apply(UP)) * thrust
@@ -114,9 +117,76 @@ def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
     return 0.5 * (values[1:] + values[:-1])
 
 
-def smoother(log: FlightLog) -> Callable[[Vectors], Vectors]:
-    """Return a moving mean over `SPAN` that uses sound intervals only."""
-    sound = sound_intervals(log)[:, None].astype(float)
-    width = min(max(1, round(SPAN / log.dt)), len(sound))
-    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
-    return lambda values: moving_mean(values, width)[whole]
+class Response(NamedTuple):
+    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
+
+    order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
+    yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
+    lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
+    correlations: list[float]  # of roll and pitch at that order and lag, of yaw (its size) at its best lag near it
+    as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
+
+
+def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
+    """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
+    reach = round(LONGEST_LAG / log.dt)
+    torque, squares = _quick(log, vehicle)
+    if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
+        return None
+    arms = np.asarray(vehicle.rotor_positions)
+    # Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row.
+    mix = np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
+    table = np.stack([correlations(torque, squares, mix, lag) for lag in range(-reach, reach + 1)])
+    # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
+    score = table[..., 0] + table[..., 1]
+    at, best = np.unravel_index(score.argmax(), score.shape)
+    near = round(YAW_LEAD / log.dt)
+    around = table[max(0, at - near) : at + near + 1, best, 2]
+    yaw = around[np.abs(around).argmax()]
+    sign = -1 if yaw < 0 else 1
+    found = [*table[at, best, :2].tolist(), float(abs(yaw))]
+    lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
+    return Response(tuple(ORDERS[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+
+
+def correlations(
+    torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n 4"], mix: Float[np.ndarray, "3 4"], lag: int
+) -> Float[np.ndarray, "24 3"]:
+    """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
+    ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
+    cross, spread = ahead.T @ behind, behind.T @ behind
+    shared = np.einsum("aj,aoj->oa", mix, cross[:, ORDERS])
+    variance = np.einsum("ai,oij,aj->oa", mix, spread[ORDERS[:, :, None], ORDERS[:, None, :]], mix)
+    return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
+
+
+def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
+    """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
+    fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
+    sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
+    if len(sound) < fast + slow:
+        return np.zeros((0, 3)), np.zeros((0, 4))
+    mean = middle(omega)
+    torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(mean, inertia * mean)
+    bands = []
+    for values in (torque, log.u[:-1] ** 2):
+        smooth = moving_mean(values, fast)
+        trend = moving_mean(smooth, slow)
+        bands.append(smooth[slow // 2 :][: len(trend)] - trend)
+    whole = moving_mean(sound[:, None].astype(float), fast + slow - 1) > 1 - 1e-9
+    return np.where(whole, bands[0], 0.0), np.where(whole, bands[1], 0.0)
+
+
+def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
+    """The mean of each `width` consecutive rows."""
+    total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+    return (total[width:] - total[:-width]) / width
+
+
+def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
+    """Sub-sample position of the peak, −0.5 … 0.5, by a parabola through the maximum and its neighbours."""
+    if not 0 < at < len(score) - 1:
+        return 0.0
+    left, top, right = score[at - 1 : at + 2]
+    curve = left - 2 * top + right
+    return float(0.5 * (left - right) / curve) if curve < 0 else 0.0

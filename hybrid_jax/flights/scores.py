@@ -29,15 +29,14 @@ class FlightErrors(NamedTuple):
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
     """Compute the error of each predicted state."""
-
-    def length(part: slice):
-        return jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1)
-
+    position, velocity, rates = (
+        jnp.linalg.norm(predicted[..., part] - truth[..., part], axis=-1) for part in (POSITION, VELOCITY, BODY_RATES)
+    )
     # |a − b| and |a + b| are 2 sin and 2 cos of a quarter of the angle, which is accurate for small angles.
     a, b = (rotation.normalise(states[..., QUATERNION]) for states in (predicted, truth))
     chords = jnp.linalg.norm(a - b, axis=-1), jnp.linalg.norm(a + b, axis=-1)
     angle = 4 * jnp.arctan2(jnp.minimum(*chords), jnp.maximum(*chords))  # q and −q are one rotation
-    return FlightErrors(length(POSITION), length(VELOCITY), angle, length(BODY_RATES))
+    return FlightErrors(position, velocity, angle, rates)
 
 
 def flight_errors(
@@ -58,7 +57,7 @@ def flight_errors(
     check_attitudes(windows, "windows")
     # The last part is padded, so that all parts share one program.
     chunk = min(chunk, len(windows))
-    parts = [np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk)]
+    parts = (np.arange(start, start + chunk) % len(windows) for start in range(0, len(windows), chunk))
     found = [jax.device_get(_errors(field, windows[part], solver)) for part in parts]
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
 

@@ -6,6 +6,7 @@ msg/versioned/VehicleLocalPosition.msg). Each topic has its own time stamps; all
 
 import contextlib
 import io
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -13,7 +14,7 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import Frames, interpolate, interpolate_attitude, mean_of_held, to_library
 from hybrid_jax.flights.flight_csv import MAX_ROWS
-from hybrid_jax.flights.log import NORM_TOLERANCE, FlightLog
+from hybrid_jax.flights.log import FlightLog, wrong_norms
 
 FRAMES = Frames(world="NED", body="FRD", velocity="world")
 STATES = {
@@ -28,31 +29,25 @@ LOST = 5  # an interval above this multiple of a topic's median, or of dt, is a 
 
 
 def read_ulog(
-    path: str | Path,
-    *,
-    dt: float = 0.01,
-    motor_order: tuple[int, int, int, int] = (0, 1, 2, 3),
-    polynomial: tuple[float, ...] = (),
+    path: str | Path, *, dt: float = 0.01, motor_order: Sequence[int] = (0, 1, 2, 3), polynomial: Sequence[float] = ()
 ) -> FlightLog:
     """Read one flight at intervals of dt [s]; where a topic has a gap, the log has one too.
 
-    Position, velocity and rates are interpolated linearly, attitude spherically; rotor speeds are the mean over the
-    interval of the values held in the log.
+    Position, velocity and rates are interpolated linearly, attitude spherically; rotor speeds are means of held values.
 
     Args:
         motor_order: which motor (0 is PX4's motor 1) each of the vehicle's rotors is.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ; not needed where the log has ESC rpm.
 
     Raises:
-        ValueError: file, topic and what to do, in one line.
-        ImportError: pyulog is not installed.
+        ValueError: file, topic and what to do, in one line; or pyulog is not installed.
     """
     if not dt > 0:
         raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
     data = _load(path)
     (tp, local), (tq, q), (tw, omega) = (_samples(data, path, topic, fields) for topic, fields in STATES.items())
     tu, u = _motors(data, path, motor_order, polynomial)
-    if np.abs(np.linalg.norm(q, axis=1) - 1).max() > NORM_TOLERANCE:
+    if wrong_norms(q):
         advice = "cut the log where there is no attitude"
         raise ValueError(f"{path}: topic vehicle_attitude, field q: norm is not 1; {advice}")
     times = (tp, tq, tw, tu)
@@ -74,7 +69,7 @@ def _load(path: str | Path):
     try:
         import pyulog
     except ImportError as error:
-        raise ImportError("reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
+        raise ValueError(f"{path}: reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     try:
         # pyulog reports damage on standard output only.
         with contextlib.redirect_stdout(io.StringIO()):
@@ -101,9 +96,7 @@ def _samples(data, path, topic: str, fields: tuple[str, ...], clock: str = "time
     t = table[clock if use_clock else "timestamp"].astype(np.int64) * 1e-6
     with np.errstate(invalid="ignore"):  # damaged numbers are refused below
         values = np.stack([table[field] for field in fields], axis=1).astype(float)
-    bad = ~np.isfinite(values)
-    if topic not in FIELDS and bad.any():
-        row, column = np.argwhere(bad)[0].tolist()
+    for row, column in () if topic in FIELDS else np.argwhere(~np.isfinite(values))[:1].tolist():
         where = f"topic {topic}, sample {row}, field {fields[column]}"
         raise ValueError(f"{path}: {where}: is not finite; cut the log there")
     t, kept = np.unique(t, return_index=True)
@@ -120,9 +113,9 @@ def _motors(data, path, order, polynomial) -> tuple[Float[np.ndarray, " n"], Flo
         if topic not in data:
             continue
         t, values = _samples(data, path, topic, tuple(field.format(motor) for motor in order), "timestamp")
+        if topic == RPM and np.abs(values).max() > 0:
+            return t, np.abs(values) * np.pi / 30
         if topic == RPM:
-            if np.abs(values).max() > 0:
-                return t, np.abs(values) * np.pi / 30
             continue  # ESCs without telemetry report zero
         if not polynomial:
             raise ValueError(f"{path}: has only motor commands ({topic}); give the polynomial that maps them to rad/s")

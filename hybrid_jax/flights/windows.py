@@ -1,7 +1,11 @@
-"""From recorded logs to training windows: `load_windows` takes a folder of logs there in one call."""
+"""From recorded logs to training windows: reading folders, splitting by flight or manoeuvre, cutting.
 
+Windows of one flight overlap and share wind, battery and payload, so a split of windows would leak into the test.
+"""
+
+import re
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,24 +17,24 @@ from hybrid_jax.flights.cleaning import lag_motors, resample
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.flight_csv import read_csv
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.segments import even_segments, segments, unevenness
-from hybrid_jax.flights.splits import SUFFIXES, flight_of
+from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
 
+Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
+SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of log files
+_SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg)$", re.IGNORECASE)
+_RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
+
 
 @dataclass(frozen=True)
 class LogWindows:
-    """Windows of several flights in float32, and the number of windows of each flight.
-
-    Windows are ordered by flight; `stride` is the number of samples between the starts of two.
-    """
+    """Windows of several flights in float32, ordered by flight."""
 
     windows: Trajectories
-    sizes: list[int]
-    stride: int
+    sizes: list[int]  # windows of each flight
+    stride: int  # samples between the starts of two
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -76,10 +80,10 @@ def load_windows(
     logs = load_logs(folder, columns=columns, polynomial=polynomial)
     for log in logs:
         for check in check_log(log, vehicle):
-            message = f"{log.name}: {check.name}: {check.suggestion}"
-            if check.verdict == FAILS and strict:
-                raise ValueError(message)
             if check.verdict == FAILS:
+                message = f"{log.name}: {check.name}: {check.suggestion}"
+                if strict:
+                    raise ValueError(message)
                 warnings.warn(message, stacklevel=2)
     if dt is not None:
         logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
@@ -116,14 +120,61 @@ def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: 
         ValueError: the file, row, field and what to do, in one line.
     """
     if str(path).lower().endswith(".ulg"):
-        try:
-            return read_ulog(path, polynomial=polynomial)
-        except ImportError as error:
-            raise ValueError(f"{path}: {error}") from error
+        return read_ulog(path, polynomial=polynomial)
     log = read_csv(path) if columns is None else read_mapped(path, columns)
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
     return log
+
+
+def flight_of(log: FlightLog) -> str:
+    """The name of a flight's file, without folder and `SUFFIXES`."""
+    return _SUFFIX.sub("", Path(log.name).name)
+
+
+def manoeuvre_of(log: FlightLog) -> str:
+    """The name of a flight without the number of its run: "chirp_run2" and "chirp-03" are both "chirp".
+
+    A number counts as that of a run after a separator or after "run", "flight", "take" or "log"; "figure8" has none.
+    """
+    return _RUN.sub("", flight_of(log)) or flight_of(log)
+
+
+def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
+    """Split flights into those of other names and those of the given names.
+
+    Raises:
+        ValueError: an unknown name, or one side is empty.
+    """
+    known = sorted({of(log) for log in logs})
+    for name in names:
+        if name not in known:
+            raise ValueError(f"names: no flight is called {name!r}, only {', '.join(known)}")
+    split = [log for log in logs if of(log) not in names], [log for log in logs if of(log) in names]
+    if not all(split):
+        found = f"{len(split[0])} flights for training and {len(split[1])} held out"
+        raise ValueError(f"names: {found}; each side needs one")
+    return split
+
+
+def folds(
+    logs: Sequence[FlightLog], count: int | None = None, of: Callable[[FlightLog], str] = flight_of, seed: int = 0
+) -> list[Split]:
+    """Make splits in which each flight is held out once, together with all flights of its name.
+
+    Args:
+        count: number of splits; by default one per name.
+        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
+
+    Raises:
+        ValueError: count is less than 2 or more than the number of names.
+    """
+    names = sorted({of(log) for log in logs})
+    count = len(names) if count is None else count
+    if not 2 <= count <= len(names):
+        raise ValueError(f"count must be from 2 to the {len(names)} different names of the flights, got {count}")
+    dealt = np.random.default_rng(seed).permutation(np.array(names, object))
+    return [hold_out(logs, list(dealt[i::count]), of) for i in range(count)]
 
 
 def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
@@ -149,14 +200,15 @@ def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWi
         long = [part for part in even_segments(log) if part.stop - part.start > steps]
         cut = [windows_of(log.x[p], log.u[p][:-1], log.dt, steps=steps, stride=stride) for p in long]
         parts.append(concatenate(cut))
-    return LogWindows(_float32(concatenate(parts)), [len(part) for part in parts], stride)
+    windows = jax.tree.map(lambda leaf: leaf.astype(np.float32), concatenate(parts))
+    return LogWindows(windows, [len(part) for part in parts], stride)
 
 
 def require_length(logs: Sequence[FlightLog], steps: int) -> list[FlightLog]:
     """Return the logs that hold a window of `steps` intervals; refuse logs of which none does."""
     long = [log for log in logs if max(_intervals(log), default=0) >= steps]
     if not long:
-        names = ", ".join(flight_of(log) for log in logs)
+        names = ", ".join(map(flight_of, logs))
         longest = max((length for log in logs for length in _intervals(log)), default=0)
         raise ValueError(
             f"no window of {steps} intervals without gaps in {names}; the longest segment has {longest}: "
@@ -170,22 +222,5 @@ def count_windows(logs: Sequence[FlightLog], steps: int) -> int:
     return sum(max(0, length - steps + 1) for log in logs for length in _intervals(log))
 
 
-def longest_segment(logs: Sequence[FlightLog], steps: int) -> tuple[FlightLog, float, Trajectories]:
-    """Cut the longest segment of the first log that holds a window of `steps` intervals into adjacent windows.
-
-    Returns:
-        The log, the start of the segment [s] after the log's first sample, and the windows.
-    """
-    log = require_length(logs, steps)[0]
-    part = max(segments(log), key=lambda part: part.stop - part.start)
-    windows = windows_of(log.x[part], log.u[part][:-1], log.dt, steps=steps)
-    return log, float(log.t[part.start] - log.t[0]), _float32(windows)
-
-
-def _float32(windows: Trajectories) -> Trajectories:
-    return jax.tree.map(lambda leaf: leaf.astype(np.float32), windows)
-
-
 def _intervals(log: FlightLog) -> list[int]:
-    """Count the intervals of each segment."""
     return [part.stop - part.start - 1 for part in segments(log)]

@@ -1,8 +1,7 @@
 """The true system: a quadrotor in MuJoCo MJX with drag, ground effect and wind, and a pilot for random flights.
 
-Raises:
-    ImportError: mujoco or mujoco-mjx is missing or of an unsupported version. The two integrate a free body differently
-        across versions, and mujoco-mjx sets no upper bound on mujoco.
+Raises ImportError if mujoco or mujoco-mjx is missing or of an unsupported version: the two integrate a free body
+differently across versions, and mujoco-mjx sets no upper bound on mujoco.
 """
 
 import contextlib
@@ -12,11 +11,7 @@ from hybrid_jax.io.datasets import versions
 
 
 def check_versions(found: dict[str, str]) -> None:
-    """Check the versions of mujoco and mujoco-mjx.
-
-    Raises:
-        ImportError: one is not 3.17.*; the message has the installed versions and the command to install others.
-    """
+    """Raise ImportError, with the command that installs others, unless both versions are 3.17.*."""
     if not all(found[package].startswith("3.17.") for package in ("mujoco", "mujoco-mjx")):
         raise ImportError(
             f"hybrid_jax.sim needs mujoco and mujoco-mjx 3.17.*, found mujoco {found['mujoco']} and mujoco-mjx "
@@ -30,10 +25,14 @@ check_versions(versions("mujoco", "mujoco-mjx"))
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
 
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain  # noqa: E402
-from hybrid_jax.sim.flight import Flights, fly, gone_wrong  # noqa: E402
-from hybrid_jax.sim.quadrotor import Quadrotor  # noqa: E402
-from hybrid_jax.sim.record import SplitSpec, make_dataset  # noqa: E402
+from hybrid_jax.sim.domain import (  # noqa: E402
+    EXTERNAL_FORCE,
+    PARAMETER_SHIFT,
+    SOURCE,
+    Domain,
+    Quadrotor,
+)
+from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402  # noqa: E402
 
 __all__ = [
     "EXTERNAL_FORCE",

@@ -1,8 +1,7 @@
 """A pilot for random flight between waypoints, sometimes close to the ground, with dither on all axes.
 
-A `Plan` holds all that is random and is drawn before take-off. `act` is the closed loop: a cascade of position,
-velocity, attitude and rate control at 100 Hz for the nominal vehicle. It tolerates parameter shifts and wind.
-The constants are those for the Iris; `Scale` adapts them to vehicles of another size.
+A `Plan` holds all that is random. `act` is the closed loop: a cascade of position, velocity, attitude and rate control
+at 100 Hz for the nominal vehicle. The constants are those for the Iris; `Scale` adapts them to other sizes.
 """
 
 import math
@@ -50,10 +49,10 @@ DIP, ARM = 0.12, 0.26  # near the ground a rotor this far out [m] dips by no mor
 
 
 class Scale(NamedTuple):
-    """Quantities of a vehicle over those of the Iris.
+    """Quantities of a vehicle over those of the Iris, by Froude scaling.
 
-    Froude scaling: flights of vehicles of different size are geometrically similar at the same tilt and thrust over
-    weight, with times proportional to the root of lengths. A small vehicle is slowed down to what 100 Hz can control.
+    Flights are geometrically similar at the same tilt and thrust over weight, with times proportional to the root of
+    lengths. A small vehicle is slowed down to what 100 Hz can control.
     """
 
     length: float
@@ -83,8 +82,7 @@ def draw_plan(key: PRNGKeyArray, steps: int, scale: Scale) -> Plan:
     """A random plan of `steps` decisions."""
     key_targets, key_dither = jax.random.split(key)
     target, limit = _draw_waypoints(key_targets, steps, scale)
-    turn = 1 / scale.time**2
-    hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, turn])
+    hardest = jnp.array(ACCELERATION) * np.array([*[scale.acceleration] * 3, 1 / scale.time**2])
 
     def follow(carry, waypoint):
         place, rate = carry
@@ -114,11 +112,8 @@ def _draw_waypoints(key: PRNGKeyArray, steps: int, scale: Scale) -> tuple[Float[
     altitude = jnp.where(draw[2] < LOW_SHARE, low, high)
     arena = ARENA * scale.length
     place = [arena * (2 * draw[0] - 1), arena * (2 * draw[1] - 1), altitude, HEADING * (2 * draw[4] - 1)]
-    limit = [
-        _between(CRUISE, draw[5], scale.speed),
-        _between(CLIMB, draw[6], scale.speed),
-        _between(TURN, draw[7], 1 / scale.time),
-    ]
+    fastest = (CRUISE, draw[5], scale.speed), (CLIMB, draw[6], scale.speed), (TURN, draw[7], 1 / scale.time)
+    limit = [_between(*each) for each in fastest]
     departure = jnp.cumsum(_between(HOLD, draw[8], scale.time))
     current = jnp.searchsorted(departure, PERIOD * jnp.arange(steps))
     return jnp.stack(place, axis=1)[current], jnp.stack(limit, axis=1)[current]

@@ -24,7 +24,7 @@ from experiments.paper.outcome import draw
 from experiments.paper.study import placeholder, study
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.vehicle import IRIS
 
 EXPERIMENTS = ("param_shift", "external_force")

@@ -9,11 +9,17 @@ import pytest
 from recorded import CONFIG, LOGS
 
 from experiments.real_flight.config import LEARN
-from experiments.real_flight.folds import make_folds
-from experiments.real_flight.models import move_to_vehicle, objective_of, physics_of, untrained
-from experiments.real_flight.recipes import RECIPES, equivalent_recipe, stage_of
-from experiments.real_flight.scoring import body_of
-from experiments.real_flight.train import rates_of
+from experiments.real_flight.logs import make_folds
+from experiments.real_flight.models import (
+    RECIPES,
+    body_of,
+    equivalent_recipe,
+    move_to_vehicle,
+    objective_of,
+    physics_of,
+    rates_of,
+    untrained,
+)
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import cut_windows
@@ -64,7 +70,7 @@ def test_untrained_models_equal_their_physics_and_stages_train_them(model, recip
     physics = Kinematics() if model == "no_physics" else physics_of(MODEL, RECIPES[recipe])
     np.testing.assert_allclose(one(x, u), physics(x, u), rtol=1e-6)
     for step in (*RECIPES[recipe].source, *RECIPES[recipe].adaptation, *RECIPES[recipe].scratch):
-        rates = jax.tree.leaves(rates_by_group(one, stage_of(step, model).rates))
+        rates = jax.tree.leaves(rates_by_group(one, rates_of(step, model, one)))
         assert any(rate > 0 for rate in rates) == (model != "physics_only" or step.physics > 0)
         assert step.steps <= RECIPES[recipe].window
 

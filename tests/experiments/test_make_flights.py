@@ -9,7 +9,7 @@ from experiments.make_flights import chosen_flights
 from experiments.paper.study import placeholder
 from hybrid_jax.io.datasets import Dataset, save_dataset
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec
 
 
 def windows(count, steps):

@@ -14,7 +14,7 @@ from experiments.paper.study import placeholder, pretrained
 from experiments.runner.stages import _identity
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.sim.record import SplitSpec
+from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 

@@ -13,23 +13,20 @@ from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
 from rich.console import Console
 
 import hybrid_jax
-from experiments.real_flight.claims import verdicts
+from experiments.real_flight import study
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
-from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
-from experiments.real_flight.logs import LogSet, load_logs
-from experiments.real_flight.models import thrust_baseline, untrained
-from experiments.real_flight.recipes import RECIPES
-from experiments.real_flight.rows import QUANTITIES, TAGS, pooled
-from experiments.real_flight.scoring import parameters, scores
-from experiments.real_flight.study import each_fold, run_folds
-from experiments.real_flight.tables import choice_tables, parameter_tables
+from experiments.real_flight.logs import LogSet, load_logs, make_folds, non_overlapping, sampled_indices
+from experiments.real_flight.models import RECIPES, thrust_baseline, untrained
+from experiments.real_flight.report import choice_tables, parameter_tables
+from experiments.real_flight.scoring import QUANTITIES, TAGS, parameters, pooled, scores, verdicts
+from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
-from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, longest_segment, require_common_interval
+from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, require_common_interval
 from hybrid_jax.integrate import rollout
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.vehicle import IRIS
@@ -112,24 +109,10 @@ def test_random_samples_are_nested_and_contiguous_ones_are_runs():
             assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
     begins = {int(sampled_indices([3, 6, 4], 4, "contiguous", seed)[0]) for seed in range(200)}
     assert begins == {3, 4, 5, 9}  # all that leave room in one flight
-    with pytest.raises(ValueError, match="--n 151: the training flights have only 150 windows"):
-        sampled_indices(sizes, 151, "contiguous", 0)
 
 
 def test_non_overlapping_windows_share_no_sample():
     np.testing.assert_array_equal(non_overlapping(np.array([9, 0, 3, 5, 11, 10]), [10, 5], 4), [0, 5, 9, 10])
-
-
-def test_longest_segment_is_of_the_first_long_flight():
-    short, gap = LOGS[0][:4], LOGS[1][[*range(20), *range(40, SAMPLES)]]
-    log, begin, windows = longest_segment([short, gap, LOGS[2]], 10)
-    assert log.name == LOGS[1].name
-    assert begin == LOGS[1].t[40]
-    states = np.concatenate([windows.x0[:1], *windows.x])
-    np.testing.assert_array_equal(states, LOGS[1].x[40:].astype(np.float32)[: len(states)])
-    assert len(states) == 41
-    with pytest.raises(ValueError, match="no window of 10 intervals without gaps in chirp_run1"):
-        longest_segment([short], 10)
 
 
 def test_kinematics_move_and_turn_at_constant_rates():
@@ -242,11 +225,15 @@ def test_folds_of_real_flights_share_no_sample(name, by, count):
         assert not (train | validation) & test
 
 
-def test_programs_of_the_previous_fold_are_freed():
+def test_programs_of_the_previous_fold_are_freed(monkeypatch):
     """Otherwise many folds need more memory maps than Linux gives a process."""
     kept, twice = [], jax.jit(lambda x: 2 * x)
-    for number, _ in each_fold(make_folds(LOGS, None, CONFIG)):
+
+    def run_fold(experiment, outputs, number, source):
         twice(np.zeros(number + 3)).block_until_ready()  # another program for each shape
         kept.append(len(jax.devices()[0].client.live_executables()))
+
+    monkeypatch.setattr(study, "_run_fold", run_fold)
+    run_folds(Experiment(CONFIG, MODEL, MODEL, {"source": LogSet("source", LOGS, [])}, DT, None))
     assert len(kept) > 1
     assert kept[-1] <= kept[0]

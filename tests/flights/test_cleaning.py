@@ -4,9 +4,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import lagged
-from hybrid_jax.flights.segments import gaps, repeats, segments
+from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
 from hybrid_jax.vehicle import IRIS
@@ -178,4 +176,4 @@ def test_lag_recovers_rotor_speeds_from_commands(flight):
     speeds, step = flight.u, flight.dt / 0.04
     commands = speeds[:-1] + np.diff(speeds, axis=0) / (1 - np.exp(-step))
     commanded = FlightLog(flight.t[:-1], flight.x[:-1], np.maximum(commands, 0))
-    np.testing.assert_allclose(lagged(commanded, 0.04)[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
+    np.testing.assert_allclose(lag_motors(commanded, 0.04)[0].u[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)

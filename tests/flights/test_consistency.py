@@ -9,7 +9,7 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_
 from hybrid_jax.flights.cleaning import delay_motors
 from hybrid_jax.flights.consistency import FAILS, NOTHING, OK, UNKNOWN, check_log
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.motor_response import ORDERS
+from hybrid_jax.flights.readings import ORDERS
 from hybrid_jax.vehicle import IRIS
 
 VELOCITY, RATES, THRUST = "dp/dt against v", "q̇ against ω", "v̇ against thrust along body z"

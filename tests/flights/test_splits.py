@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax.flights.cleaning import choose_time_constant, lag_motors
-from hybrid_jax.flights.splits import flight_of, folds, hold_out, manoeuvre_of
+from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
 
 NAMES = [f"/logs/{kind}_run{i}.csv.gz" for kind in ("chirp", "square", "random") for i in (1, 2, 3)]
 

@@ -4,9 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from hybrid_jax.sim.domain import SOURCE
-from hybrid_jax.sim.quadrotor import Quadrotor
-from hybrid_jax.sim.record import SplitSpec, make_dataset
+from hybrid_jax.sim.domain import SOURCE, Quadrotor
+from hybrid_jax.sim.flight import SplitSpec, make_dataset
 
 
 @pytest.fixture(autouse=True)

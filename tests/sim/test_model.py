@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from mujoco import mjx
 
+from experiments.render import picture
 from hybrid_jax.sim import check_versions
+from hybrid_jax.sim.domain import build_model, traced_model
 from hybrid_jax.sim.forces import parameters_of
-from hybrid_jax.sim.model import build_model, traced_model
-from hybrid_jax.sim.render import picture
 from hybrid_jax.vehicle import IRIS
 
 OTHER = replace(
@@ -58,7 +58,7 @@ def test_other_versions_are_refused_with_the_command_that_mends_it(mujoco, mjx):
 
 
 def test_importing_the_simulator_prints_nothing():
-    command = [sys.executable, "-c", "import hybrid_jax.sim.record"]
+    command = [sys.executable, "-c", "import hybrid_jax.sim.flight"]
     assert subprocess.run(command, capture_output=True, check=True).stdout == b""
 
 
