@@ -11,7 +11,7 @@ import numpy as np
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
-TOTAL = {"full": 10_000}.get(os.environ.get("CASES", ""), 300)
+TOTAL = {"full": 10_000}.get(os.environ.get("CASES", ""), 200)
 
 
 def cases(share):

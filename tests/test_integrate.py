@@ -26,6 +26,7 @@ ODE_SOLVERS = (
 )
 OTHER_SOLVERS = ("EulerHeun", "ItoMilstein", "SEA", "SemiImplicitEuler", "KenCarp3", "ALIGN", "LeapfrogMidpoint")
 STEPPERS = (RK4(), diffrax.Tsit5(), IMPLICIT)
+LONG_TO_COMPILE = [pytest.param(solver, marks=pytest.mark.slow) for solver in STEPPERS[1:]]
 
 
 @pytest.fixture(scope="module")
@@ -118,7 +119,7 @@ def test_a_program_does_not_grow_with_its_substeps(solver):
     assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
 
 
-@pytest.mark.parametrize("solver", STEPPERS, ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize("solver", [RK4(), *LONG_TO_COMPILE], ids=lambda value: type(value).__name__)
 def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
     def by_hand(field):
         term, begin, end = diffrax.ODETerm(lambda t, x, held: field(x, held)), jnp.zeros(()), jnp.asarray(DT / 3)

@@ -8,6 +8,8 @@ import pytest
 
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
+pytestmark = pytest.mark.slow  # each test starts processes
+
 CONFIGURED = """
 import sys
 from pathlib import Path
@@ -72,7 +74,6 @@ def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
     assert printed(PROGRAM, tmp_path / "there") == [compiled, 0]
 
 
-@pytest.mark.slow
 def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
     _, compiled = printed(PROGRAM, tmp_path)
     whole, empty = sorted((tmp_path / "programs").glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]

@@ -62,6 +62,7 @@ def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
     np.testing.assert_allclose(again.disturbance, result.disturbance, rtol=1e-2)  # it is part of the physics by then
 
 
+@pytest.mark.slow
 def test_a_car_s_stiffnesses_are_found_from_noisy_windows():
     data = noisy(windows(car(0.7, 1.2), car_start, car_inputs, 0.05, 60, 0), size=0.002)
     result = adapt(car(1.0, 1.0), data, method="theta_least_squares")

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from pendulum import pendulum, swings
 from test_least_squares import Push, pushes
 
 import hybrid_jax as hj
@@ -122,5 +123,6 @@ def test_noise_is_seldom_taken_for_a_push_and_hides_none_that_is_felt():
 
 
 def test_one_window_cannot_tell():
-    windows = flights(disturbed_by(PUSH), count=1)
-    assert not select_disturbance(HYBRID, windows).needed
+    windows, push = swings(1), jnp.array([0.0, 1.5])
+    pushed = rollout_batch(disturbed(pendulum(), push), windows.x0, windows.u, windows.dt)
+    assert not select_disturbance(pendulum(0.7), replace(windows, x=pushed)).needed

@@ -60,6 +60,7 @@ def body(**ratios):
     return RigidBody({name: jnp.log(jnp.asarray(ratios[name])) for name in LEARNED}, IRIS)
 
 
+@pytest.mark.slow
 def test_exact_flight_gives_back_the_rigid_body():
     rng = np.random.default_rng(0)
     x0 = np.zeros((50, 13), np.float32)

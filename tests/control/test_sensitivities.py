@@ -64,7 +64,11 @@ def samples(count=3):
     return x, rng.uniform(500, 800, (count, 4))
 
 
-@pytest.mark.parametrize(("name", "unit_quaternion"), [*((name, True) for name in FIELDS), ("physics", False)])
+LONG_TO_COMPILE = ("paper", "layer norm", "body frame", "invariant, disturbed")
+CASES = [pytest.param(name, True, marks=[pytest.mark.slow] * (name in LONG_TO_COMPILE)) for name in FIELDS]
+
+
+@pytest.mark.parametrize(("name", "unit_quaternion"), [*CASES, ("physics", False)])
 def test_jacobian_of_a_step_equals_autodiff(name, unit_quaternion):
     """In double precision."""
 

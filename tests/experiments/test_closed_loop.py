@@ -47,7 +47,10 @@ def network(inputs="all"):
     return jax.tree.map(moved, made, is_leaf=lambda node: isinstance(node, BatchNorm))
 
 
-@pytest.mark.parametrize("domain", [SOURCE, PARAMETER_SHIFT, EXTERNAL_FORCE], ids=lambda domain: domain.name)
+WITHOUT_WIND = [pytest.param(domain, marks=pytest.mark.slow) for domain in (SOURCE, PARAMETER_SHIFT)]
+
+
+@pytest.mark.parametrize("domain", [EXTERNAL_FORCE, *WITHOUT_WIND], ids=lambda domain: domain.name)
 def test_true_field_equals_the_simulator_in_the_mean_wind(domain):
     rng = np.random.default_rng(0)
     x = rng.normal(size=(5, 13)).astype(np.float32)
@@ -61,6 +64,7 @@ def test_true_field_equals_the_simulator_in_the_mean_wind(domain):
     np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5 * float(jnp.abs(expected).max()))
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system cannot bind a process to a core")
 def test_calls_are_timed_on_one_core(tmp_path):
     with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (tmp_path,)) as process:

@@ -51,6 +51,7 @@ def record(folder, name):
     return json.loads((folder / "out" / name / "report.json").read_text())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", EXPERIMENTS)
 def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
     report = record(folder, name)
@@ -85,6 +86,7 @@ def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
     assert "Traceback" not in finished[name].stderr
 
 
+@pytest.mark.slow
 def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
     at_rest = placeholder(SplitSpec(2, 5))
     rows = record(folder, "param_shift")["rows"]
@@ -100,6 +102,7 @@ def test_every_row_has_a_model_that_loads_and_predicts(folder, finished):
     assert np.isfinite(predicted).all()
 
 
+@pytest.mark.slow
 def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
     assert "pre-training" not in [line for line in finished["param_shift"].stderr.splitlines() if "cache" in line]
     reused = [line for line in finished["external_force"].stderr.splitlines() if "as found in the cache" in line]
@@ -107,6 +110,7 @@ def test_the_second_experiment_reuses_the_pretraining_of_the_first(finished):
     assert all("pre-training" in line for line in reused)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("model", "figure"), [("no_physics", "predictions"), ("physics_only", "theta")])
 def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figure, folder, finished):
     config = replace(SMOKE, models=(model,), cache=folder / "cache")
@@ -123,6 +127,7 @@ def test_one_model_is_an_experiment_too_and_comes_from_the_cache(model, figure, 
     assert set(drawn) == {"scores", "example_flight", figure}
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("heard")
 @pytest.mark.parametrize(("sent", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)], ids=["TERM", "INT"])
 def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder, finished):
@@ -168,6 +173,7 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
     assert [path.name for path in tmp_path.iterdir()] == ["precious"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("pattern", ["flights-source-*.npz", "sweeps/pre-training-hybrid-*.npz"])
 def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
     (file,) = (folder / "cache").glob(pattern)

@@ -193,6 +193,7 @@ def test_learn_option_overrides_the_vehicle_file(tmp_path):
         replace(config, learn=(LAG, LAG))
 
 
+@pytest.mark.slow
 def test_bad_log_is_refused_with_file_row_and_field(tmp_path):
     (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
     source = write(tmp_path / "source", LOGS[:3])

@@ -42,6 +42,7 @@ def soak(sizes):
     return warm, resident()
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
 def test_memory_is_flat_after_the_warm_up():
     """In a separate process, with two shapes in turn."""

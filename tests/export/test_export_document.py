@@ -16,6 +16,7 @@ def said(code, folder):
     return done.stdout
 
 
+@pytest.mark.slow
 def test_the_examples_run_and_the_two_forms_agree(tmp_path):
     of_the_first = said(WITH, tmp_path)
     assert "F:(x[13],u[4])->(xnext[13])" in of_the_first

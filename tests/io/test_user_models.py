@@ -46,6 +46,7 @@ def in_fresh_process(tmp_path_factory):
     return np.load(folder / "predictions.npy.npz")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", FIELDS)
 def test_a_fresh_process_predicts_the_same(name, in_fresh_process):
     np.testing.assert_array_equal(in_fresh_process[name], prediction(name, hj.Model(FIELDS[name])))
@@ -62,6 +63,7 @@ def test_a_loaded_model_is_the_saved_one(name, tmp_path):
         assert describe(loaded) == describe(field)
 
 
+@pytest.mark.slow
 def test_two_runs_of_a_script_share_its_classes(tmp_path):
     script = tmp_path / "script.py"
     script.write_text(

@@ -57,11 +57,13 @@ def test_other_versions_are_refused_with_the_command_that_mends_it(mujoco, mjx):
     assert "\n" not in str(refusal.value)
 
 
+@pytest.mark.slow
 def test_importing_the_simulator_prints_nothing():
     command = [sys.executable, "-c", "import hybrid_jax.sim.flight"]
     assert subprocess.run(command, capture_output=True, check=True).stdout == b""
 
 
+@pytest.mark.slow
 def test_a_picture_is_drawn_or_the_missing_library_named(tmp_path):
     file = tmp_path / "vehicle.png"
     try:
