@@ -8,6 +8,7 @@ import tomllib
 from importlib import import_module
 from pathlib import Path
 
+import pytest
 from smoke import unbegun
 
 import hybrid_jax

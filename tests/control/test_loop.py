@@ -104,7 +104,9 @@ def test_vmap_equals_single_flights():
     winds = jnp.stack([0 * WIND, WIND])
     references = jnp.stack([reference_of("hover"), reference_of("eight")])
     bandwidths = jnp.array([0.0, 10.0])
-    lanes, found = jax.jit(jax.vmap(simulate, (0, 0, 0, 0, None)))(winds, references, references[:, 0], bandwidths, -1.0)
+    lanes, found = jax.jit(jax.vmap(simulate, (0, 0, 0, 0, None)))(
+        winds, references, references[:, 0], bandwidths, -1.0
+    )
     for i in range(2):
         flight, single = alone(winds[i], references[i], references[i][0], bandwidths[i])
         np.testing.assert_allclose(lanes.x[i], flight.x, rtol=0, atol=2e-3)

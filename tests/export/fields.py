@@ -6,6 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from choices import PAIRS
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid
@@ -13,7 +14,7 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed
 from hybrid_jax.dynamics.terms import SHAPES, Terms
-from hybrid_jax.networks.factory import GO_WITH, INPUTS, OUTPUTS, make_residual
+from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
 from hybrid_jax.state import QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
@@ -74,12 +75,7 @@ FIELDS = {
     "multirotor, per rotor": per_rotor,
     "multirotor": lambda: multirotor(IRIS, (), TERMS),
     **{f"hybrid, norm {norm}": partial(with_norm, norm) for norm in NORMS},
-    **{
-        f"residual from {inputs} to {outputs}": partial(with_residual, inputs, outputs)
-        for inputs in INPUTS
-        for outputs in OUTPUTS
-        if inputs in GO_WITH.get(outputs, INPUTS)
-    },
+    **{f"residual from {inputs} to {outputs}": partial(with_residual, inputs, outputs) for inputs, outputs in PAIRS},
     "linear path": lambda: Hybrid(
         moved(ForcedBody(body().log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
     ),

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import FEW
 from fields import FIELDS, KEY, SIZES, body, double, field_of, samples
 
 from hybrid_jax import Hybrid, residual_network
@@ -25,7 +26,11 @@ def jacobian(function):
     return ca.Function("jacobian", [x, u], [ca.jacobian(function(x, u), ca.vertcat(x, u))])
 
 
-@pytest.mark.parametrize("name", FIELDS)
+FEW_RESIDUALS = [f"residual from {inputs} to {outputs}" for inputs, outputs in FEW]
+SLOW = [name for name in FIELDS if name.startswith("residual") and name not in FEW_RESIDUALS]
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in FIELDS])
 def test_it_has_the_values_and_the_derivatives_of_the_field(name):
     """The derivatives along a random direction: one wrong entry of the Jacobian shows in it."""
     function = casadi_function(field_of(name), **SIZES)

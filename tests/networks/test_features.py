@@ -1,6 +1,5 @@
 """Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
 
-import itertools
 import json
 from dataclasses import replace
 
@@ -9,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import PAIRS, mostly_slow
 
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.dynamics.base import (
@@ -38,11 +38,7 @@ pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-o
 
 KEY = jax.random.key(0)
 HOVER = InputScaling(IRIS.hover_speed, IRIS.hover_speed / 10)
-VIEWS = [
-    (inputs, outputs)
-    for inputs, outputs in itertools.product(factory.INPUTS, factory.OUTPUTS)
-    if inputs in factory.GO_WITH.get(outputs, factory.INPUTS) and outputs != "rotors"  # see test_rotors
-]
+VIEWS = [pair for pair in PAIRS if pair[1] != "rotors"]  # see test_rotors
 FROM_THE_BODY = [pair for pair in VIEWS if pair[0] in factory.FROM_THE_BODY]
 
 
@@ -88,7 +84,7 @@ def test_an_unknown_name_is_refused(options):
         make_residual(KEY, **options)
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), [pair for pair in VIEWS if pair[0] != "all"])
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(pair for pair in VIEWS if pair[0] != "all"))
 def test_where_the_vehicle_is_does_not_matter_and_how_high_may(inputs, outputs):
     field, (x, u) = view(inputs, outputs), samples()
     here = deployed(field, x, u)
@@ -97,7 +93,7 @@ def test_where_the_vehicle_is_does_not_matter_and_how_high_may(inputs, outputs):
     assert (moves == 0).all() if inputs == "body_motion" else (moves > 1e-3).all()
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), FROM_THE_BODY)
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(FROM_THE_BODY))
 def test_seen_from_the_body_a_turned_vehicle_has_the_turned_derivative(inputs, outputs):
     field, (x, u) = view(inputs, outputs), samples()
     for yaw in (0.3, 2.0, -3.0):
@@ -169,7 +165,7 @@ def test_motion_is_not_written_in_the_world():
         view("all", "motion")
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
     field, (x, u) = zero_output(Hybrid(rigid_body(IRIS), view(inputs, outputs))), samples()
     np.testing.assert_array_equal(deployed(field, x, u), deployed(rigid_body(IRIS), x, u))
@@ -179,7 +175,7 @@ def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
         zero_output(rigid_body(IRIS))
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
     field, (x, u) = view(inputs, outputs, linear=True), samples()
     assert (train_batch(field, x, u) == 0).all()
@@ -219,7 +215,7 @@ def test_isotropic_drag_is_the_same_seen_from_the_body():
     assert (derivative[:7] == 0).all()
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
     field, (x, u) = view(inputs, outputs), samples(20)
@@ -239,8 +235,8 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
 
 
-@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
-@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+@pytest.mark.parametrize("norm", ["batch", *(pytest.param(norm, marks=pytest.mark.slow) for norm in ("layer", "none"))])
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
@@ -248,7 +244,7 @@ def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
             np.testing.assert_allclose(infer_batch(same, x, u), deployed(field, x, u), rtol=0, atol=1e-11)
 
 
-@pytest.mark.parametrize(("inputs", "outputs"), VIEWS)
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
     field, (x, u) = Hybrid(rigid_body(IRIS), view(inputs, outputs)), samples()
     save(tmp_path / "model.npz", field)

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import mostly_slow
 
 from hybrid_jax import load, rotation, save
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
@@ -79,10 +80,10 @@ def test_rotors_are_alike():
     np.testing.assert_allclose(same[BODY_RATES][:2], turning, rtol=1e-3, atol=1e-4)
 
 
-@pytest.mark.parametrize("inputs", INPUTS)
-def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, tmp_path):
+@pytest.mark.parametrize(("inputs", "outputs"), mostly_slow((inputs, "rotors") for inputs in INPUTS))
+def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, outputs, tmp_path):
     known = {"inputs": inputs, "hidden": 5, "scaling": HOVER, "vehicle": IRIS}
-    (x, u), field = samples(), make_residual(KEY, outputs="rotors", **known)
+    (x, u), field = samples(), make_residual(KEY, outputs=outputs, **known)
     alone = make_residual(KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
     slope = eqx.filter_grad(lambda residual: jnp.sum(train_batch(residual, x, u)))(field)

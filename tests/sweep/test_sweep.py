@@ -72,7 +72,9 @@ def test_a_lane_is_a_run_by_the_plain_function(final):
         np.testing.assert_allclose(here.field.log_length, alone.field.log_length, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize("solver", [diffrax.Heun(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.slow)], ids=["heun", "tsit5"])
+@pytest.mark.parametrize(
+    "solver", [diffrax.Heun(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.slow)], ids=["heun", "tsit5"]
+)
 def test_a_sweep_trains_through_the_solvers_of_diffrax(solver, final):
     other = swept(starts(), PLANS, settings=Settings(batch_size=BATCH, solver=solver))
     # The steps of 0.05 are short, so that the solver's error is all that is between them.
