@@ -10,32 +10,18 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import (
-    Controller,
-    Flight,
-    OpenLoopCosts,
-    add_body_rates,
-    advance,
-    figure_eight,
-    fly,
-    hover,
-    low_pass,
-    open_loop_costs,
-    performance,
-    relative_cost_error,
-    sample,
-)
+from hybrid_jax import control
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.dynamics.disturbance import disturbed
 
 ROOT = Path(__file__).parents[2]
-CONTROLLER = Controller(hj.IRIS)
+CONTROLLER = control.Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
 WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
 
 
 def plant(field):
-    return lambda x, u, t: advance(field, x, u, CONTROLLER.period)
+    return lambda x, u, t: control.advance(field, x, u, CONTROLLER.period)
 
 
 def simulate(wind, reference, x0, bandwidth, kick):
@@ -43,10 +29,10 @@ def simulate(wind, reference, x0, bandwidth, kick):
 
     def kicked(x, u, t):
         x = plant(disturbed(BODY, wind))(x, u, t)
-        return jnp.where(jnp.abs(t - kick) < 0.5 * CONTROLLER.period, add_body_rates(x), x)
+        return jnp.where(jnp.abs(t - kick) < 0.5 * CONTROLLER.period, control.add_body_rates(x), x)
 
-    flight = fly(kicked, BODY, reference, x0, CONTROLLER, bandwidth)
-    return flight, performance(flight, reference, CONTROLLER)
+    flight = control.fly(kicked, BODY, reference, x0, CONTROLLER, bandwidth)
+    return flight, control.performance(flight, reference, CONTROLLER)
 
 
 program = jax.jit(simulate)  # one for all flights of 2 s
@@ -56,12 +42,17 @@ def alone(wind, reference, x0, bandwidth, kick=-1.0):
     return program(wind, reference, x0, bandwidth, kick)
 
 
-PATHS = {"hover": hover(), "eight": figure_eight(3.5), "fast eight": figure_eight(6.0), "low pass": low_pass()}
+PATHS = {
+    "hover": control.hover(),
+    "eight": control.figure_eight(3.5),
+    "fast eight": control.figure_eight(6.0),
+    "low pass": control.low_pass(),
+}
 
 
 @cache
 def reference_of(name):
-    return sample(PATHS[name], CONTROLLER, 2.0)
+    return control.sample(PATHS[name], CONTROLLER, 2.0)
 
 
 @pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
@@ -74,8 +65,8 @@ def test_true_model_tracks_the_reference(name, allowed):
 
 
 def test_recovery_from_a_rate_of_6_rad_per_s():
-    reference = sample(hover((0.0, 0.0, 3.0)), CONTROLLER, 2.0)
-    flight, found = alone(np.zeros(6), reference, add_body_rates(reference[0]), 0.0)
+    reference = control.sample(control.hover((0.0, 0.0, 3.0)), CONTROLLER, 2.0)
+    flight, found = alone(np.zeros(6), reference, control.add_body_rates(reference[0]), 0.0)
     assert found.largest_error < 0.3
     assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
@@ -117,7 +108,7 @@ def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
     """Predictions have steps of 0.05 s, the plant 0.01 s."""
     reference, calls = reference_of("eight"), range(50, 200, 25)
     costs = jax.jit(
-        lambda flight, wind: open_loop_costs(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, calls)
+        lambda flight, wind: control.open_loop_costs(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, calls)
     )
     exact, windy = (costs(alone(wind, reference, reference[0], 0.0)[0], wind) for wind in (np.zeros(6), WIND))
     np.testing.assert_allclose(exact.actual, exact.predicted, rtol=0.01)
@@ -125,58 +116,58 @@ def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
 
 
 def test_relative_cost_error_is_bounded_near_zero():
-    costs = OpenLoopCosts(jnp.array([1.0, 3.0]), jnp.array([1.0, 3.0]))
-    assert relative_cost_error(costs, CONTROLLER) == 0
-    higher = OpenLoopCosts(costs.predicted, 1.1 * costs.actual)
-    assert relative_cost_error(higher, CONTROLLER) == pytest.approx(0.1, rel=1e-5)
+    costs = control.OpenLoopCosts(jnp.array([1.0, 3.0]), jnp.array([1.0, 3.0]))
+    assert control.relative_cost_error(costs, CONTROLLER) == 0
+    higher = control.OpenLoopCosts(costs.predicted, 1.1 * costs.actual)
+    assert control.relative_cost_error(higher, CONTROLLER) == pytest.approx(0.1, rel=1e-5)
     # The denominator is at least the cost of an offset of 5 mm.
-    reference = sample(hover(), CONTROLLER, 0.01)[:20]
+    reference = control.sample(control.hover(), CONTROLLER, 0.01)[:20]
     floor = plan_cost(CONTROLLER.weights, reference, reference.at[:, 1].add(0.005), jnp.zeros((20, 4)))
-    small = OpenLoopCosts(jnp.array([0.0, 0.0]), jnp.array([0.1 * floor, 0.0]))
-    assert relative_cost_error(small, CONTROLLER) == pytest.approx(0.05, rel=1e-4)
+    small = control.OpenLoopCosts(jnp.array([0.0, 0.0]), jnp.array([0.1 * floor, 0.0]))
+    assert control.relative_cost_error(small, CONTROLLER) == pytest.approx(0.05, rel=1e-4)
     with pytest.raises(ValueError, match="distance must be"):
-        relative_cost_error(costs, CONTROLLER, 0.0)
+        control.relative_cost_error(costs, CONTROLLER, 0.0)
 
 
 def still(periods=4):
-    x = jnp.tile(sample(hover(), CONTROLLER, 0.1)[0], (periods + 1, 1))
+    x = jnp.tile(control.sample(control.hover(), CONTROLLER, 0.1)[0], (periods + 1, 1))
     u = jnp.full((periods, 4), hj.IRIS.hover_speed)
-    return Flight(x, u, CONTROLLER.begin(), jnp.zeros((periods, 6)))
+    return control.Flight(x, u, CONTROLLER.begin(), jnp.zeros((periods, 6)))
 
 
 def test_performance_of_a_known_flight():
-    flight, reference = still(), sample(hover(), CONTROLLER, 0.1)
+    flight, reference = still(), control.sample(control.hover(), CONTROLLER, 0.1)
     flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[2:, 1].add(jnp.array([0.3, 0.0, 0.4])))
     flight = eqx.tree_at(lambda f: f.u, flight, flight.u.at[0, 0].set(1099.0).at[1, 1].set(1.0))
-    found = performance(flight, reference, CONTROLLER)
+    found = control.performance(flight, reference, CONTROLLER)
     assert found.position_rmse == pytest.approx(0.25, rel=1e-5)
     assert found.largest_error == pytest.approx(0.4, rel=1e-5)
     assert found.saturation == 2 / 16
     assert found.yaw_rmse == 0
     assert not found.crashed
     # The yaw error wraps.
-    behind, ahead = (sample(hover(yaw=yaw), CONTROLLER, 0.1) for yaw in (np.pi - 0.1, -np.pi + 0.1))
+    behind, ahead = (control.sample(control.hover(yaw=yaw), CONTROLLER, 0.1) for yaw in (np.pi - 0.1, -np.pi + 0.1))
     flight = eqx.tree_at(lambda f: f.x, flight, ahead[:5])
-    assert performance(flight, behind, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
+    assert control.performance(flight, behind, CONTROLLER).yaw_rmse == pytest.approx(0.2, rel=1e-4)
 
 
 @pytest.mark.parametrize("end", [(0.0, 0.0, -0.1), (11.0, 0.0, 1.0), (np.nan, 0.0, 1.0)])
 def test_crashes_are_below_ground_too_far_or_not_finite(end):
     flight = still()
     flight = eqx.tree_at(lambda f: f.x, flight, flight.x.at[3, :3].set(jnp.array(end)))
-    assert performance(flight, sample(hover(), CONTROLLER, 0.1), CONTROLLER).crashed
+    assert control.performance(flight, control.sample(control.hover(), CONTROLLER, 0.1), CONTROLLER).crashed
 
 
 def test_invalid_arguments_are_refused():
     reference = reference_of("hover")
     for x0, samples in ((reference[0, :4], reference), (reference[0], reference[0]), (reference[0], reference[:101])):
         with pytest.raises(ValueError, match="reference"):
-            fly(plant(BODY), BODY, samples, x0, CONTROLLER)
+            control.fly(plant(BODY), BODY, samples, x0, CONTROLLER)
     with pytest.raises(ValueError, match=r"x0\[3:7\] must be a unit quaternion"):
-        fly(plant(BODY), BODY, reference, reference[0].at[3:7].set(0.0), CONTROLLER)
+        control.fly(plant(BODY), BODY, reference, reference[0].at[3:7].set(0.0), CONTROLLER)
     for bandwidth in (-1.0, np.nan, jnp.asarray(-1.0)):
         with pytest.raises(ValueError, match="bandwidth must be a finite number of at least 0"):
-            fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
+            control.fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
 @pytest.mark.parametrize(
@@ -186,15 +177,15 @@ def test_invalid_arguments_are_refused():
 def test_mixed_precision_is_promoted(start, wanted, evaluate):
     """For the loop with a plant of another precision, and for the controller alone."""
     with jax.enable_x64(True):
-        controller, body = Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
-        reference = np.asarray(sample(hover(), controller, 0.02), wanted)
+        controller, body = control.Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
+        reference = np.asarray(control.sample(control.hover(), controller, 0.02), wanted)
 
         def single(x, u, t):
-            return advance(body, x, u, controller.period).astype(np.float32)
+            return control.advance(body, x, u, controller.period).astype(np.float32)
 
         def both(reference, x0):
             u, _ = controller(body, controller.horizon(reference, 0), x0, controller.begin())
-            return fly(single, body, reference, x0, controller), u
+            return control.fly(single, body, reference, x0, controller), u
 
         flight, u = evaluate(both, reference, reference[0].astype(start))
     assert flight.x.dtype == u.dtype == np.float64

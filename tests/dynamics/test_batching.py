@@ -6,17 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.dynamics.base import (
-    AbstractVectorField,
-    Frozen,
-    Hybrid,
-    check_batch_norm,
-    fuse_for_inference,
-    infer_batch,
-    linearize,
-    train_batch,
-    update_running_stats,
-)
+from hybrid_jax.dynamics import base
 from hybrid_jax.integrate import RK4, rollout_minibatch
 from hybrid_jax.networks.mlp import residual_network
 
@@ -35,10 +25,10 @@ CALLS = {
 HIDDEN_FROM_DERIVATIVES = ("stop_gradient", "grad")
 
 
-class Gain(AbstractVectorField):
+class Gain(base.AbstractVectorField):
     """What a user may write around a network."""
 
-    inner: AbstractVectorField
+    inner: base.AbstractVectorField
     scale: float = eqx.field(static=True, default=1.0)
     how: str = eqx.field(static=True, default="call")
 
@@ -73,7 +63,7 @@ def trained(field):
     def loss(field):
         return jnp.sum(jnp.square(rollout_minibatch(field, x, u, 0.1, RK4())))
 
-    return *eqx.filter_value_and_grad(loss)(field), update_running_stats(field, x, u[0])
+    return *eqx.filter_value_and_grad(loss)(field), base.update_running_stats(field, x, u[0])
 
 
 def assert_trained_alike(field, other):
@@ -84,26 +74,26 @@ def assert_trained_alike(field, other):
 
 @pytest.mark.parametrize("how", [how for how in CALLS if how not in HIDDEN_FROM_DERIVATIVES])
 def test_a_wrapped_network_is_trained_as_the_bare_one(how):
-    check_batch_norm(Gain(network(), how=how), *(part[..., :2] for part in (batch()[0], batch()[1][0])))
+    base.check_batch_norm(Gain(network(), how=how), *(part[..., :2] for part in (batch()[0], batch()[1][0])))
     assert_trained_alike(Gain(network(), how=how), network())
 
 
 def test_nested_wrappers_and_several_networks_are_trained_as_their_hybrid():
-    assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), Hybrid(network(1), network(2)))
+    assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), base.Hybrid(network(1), network(2)))
 
 
 def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():
-    (x, u), field = batch(), Gain(Frozen(network()))
-    np.testing.assert_allclose(train_batch(field, x, u[0]), infer_batch(network(), x, u[0]), rtol=1e-12)
-    assert eqx.tree_equal(update_running_stats(field, x, u[0]), field)
+    (x, u), field = batch(), Gain(base.Frozen(network()))
+    np.testing.assert_allclose(base.train_batch(field, x, u[0]), base.infer_batch(network(), x, u[0]), rtol=1e-12)
+    assert eqx.tree_equal(base.update_running_stats(field, x, u[0]), field)
 
 
 @pytest.mark.parametrize("how", HIDDEN_FROM_DERIVATIVES)
 def test_statistics_that_cannot_be_recorded_are_refused(how):
     x, u = batch()
     with pytest.raises(ValueError, match="field: Gain holds a BatchNorm whose minibatch statistics cannot be recorded"):
-        check_batch_norm(Gain(network(), how=how), x, u[0])
-    check_batch_norm(Gain(Frozen(network()), how=how), x, u[0])
+        base.check_batch_norm(Gain(network(), how=how), x, u[0])
+    base.check_batch_norm(Gain(base.Frozen(network()), how=how), x, u[0])
 
 
 def test_a_function_is_a_field():
@@ -111,9 +101,9 @@ def test_a_function_is_a_field():
         return -x + u[0]
 
     x, u = batch()
-    for evaluate in (train_batch, infer_batch):
+    for evaluate in (base.train_batch, base.infer_batch):
         np.testing.assert_allclose(evaluate(field, x, u[0]), field(x, u[0]), rtol=1e-12)
-    value, slope = linearize(field, x[:, 0], u[0, :, 0], jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
+    value, slope = base.linearize(field, x[:, 0], u[0, :, 0], jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
     np.testing.assert_allclose(value, field(x[:, 0], u[0, :, 0]), rtol=1e-12)
     np.testing.assert_array_equal(slope, -np.eye(STATES))
-    assert update_running_stats(field, x, u[0]) is fuse_for_inference(field) is field
+    assert base.update_running_stats(field, x, u[0]) is base.fuse_for_inference(field) is field

@@ -11,16 +11,7 @@ import pytest
 from choices import PAIRS, mostly_slow
 
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
-from hybrid_jax.dynamics.base import (
-    AbstractVectorField,
-    Frozen,
-    RunningStats,
-    fuse_for_inference,
-    infer_batch,
-    train_batch,
-    trainable,
-    update_running_stats,
-)
+from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.io.archive import load_archive, save_archive
 from hybrid_jax.io.models import FORMAT
@@ -178,7 +169,7 @@ def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
     field, (x, u) = view(inputs, outputs, linear=True), samples()
-    assert (train_batch(field, x, u) == 0).all()
+    assert (base.train_batch(field, x, u) == 0).all()
     slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field)
     path = network_of(slope)
     assert (path.weight != 0).any()
@@ -191,14 +182,14 @@ def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
 @pytest.mark.parametrize("inputs", factory.INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
-    for evaluate in (deployed, train_batch):
+    for evaluate in (deployed, base.train_batch):
         derivative = evaluate(field, x, u)
         assert (derivative[:-written] == 0).all()
         assert (jnp.abs(derivative[-written:]).max(1) > 1e-3).all()
     assert network_of(field).weight_out.shape == (written, 9)
 
 
-class Kinetic(AbstractVectorField):
+class Kinetic(base.AbstractVectorField):
     """v̇ = −C v, the same in every frame."""
 
     drag: jax.Array
@@ -219,7 +210,7 @@ def test_isotropic_drag_is_the_same_seen_from_the_body():
 def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
     field, (x, u) = view(inputs, outputs), samples(20)
-    trained = train_batch(field, x, u)
+    trained = base.train_batch(field, x, u)
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
     def seen(node, x):
@@ -227,10 +218,10 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
 
     network = network_of(field)
     hidden = network.weight_in @ network.inputs(seen(field, x), u)
-    here = RunningStats(hidden.mean(1), hidden.var(1))
+    here = base.RunningStats(hidden.mean(1), hidden.var(1))
     exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
     np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
-    running = network_of(update_running_stats(field, x, u)).norm.running
+    running = network_of(base.update_running_stats(field, x, u)).norm.running
     np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
 
@@ -240,8 +231,8 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
 def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
-        for same in (field, Frozen(field)):
-            np.testing.assert_allclose(infer_batch(same, x, u), deployed(field, x, u), rtol=0, atol=1e-11)
+        for same in (field, base.Frozen(field)):
+            np.testing.assert_allclose(base.infer_batch(same, x, u), deployed(field, x, u), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
@@ -252,14 +243,14 @@ def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
     assert eqx.tree_equal(loaded, field)
     np.testing.assert_array_equal(deployed(loaded, x, u), deployed(field, x, u))
     # θ_p (3), the network's weights, gain, shift and bias (5); not its running statistics.
-    assert sum(jax.tree.leaves(trainable(field))) == 8
+    assert sum(jax.tree.leaves(base.trainable(field))) == 8
 
 
 def test_files_that_name_the_former_modules_are_loaded(tmp_path):
     """Of all the classes that moved between modules."""
     path, moved = tmp_path / "model.npz", {name: cls for name, cls in _RENAMED.items() if ":" in name}
     residual = view("near_ground", "rotors", scaling=ChannelScaling())
-    field = Hybrid(Hybrid(Kinematics(), fuse_for_inference(view(norm="none"))), residual)
+    field = Hybrid(Hybrid(Kinematics(), base.fuse_for_inference(view(norm="none"))), residual)
     save(path, field)
     metadata, arrays = load_archive(path, FORMAT)
     text = json.dumps(metadata)

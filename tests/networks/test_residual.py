@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax import load, save
-from hybrid_jax.dynamics.base import (
-    Hybrid,
-    RunningStats,
-    fuse_for_inference,
-    infer_batch,
-    train_batch,
-    trainable,
-    update_running_stats,
-)
+from hybrid_jax.dynamics import base
 from hybrid_jax.networks.mlp import (
     FusedNetwork,
     InputScaling,
@@ -34,7 +26,7 @@ def network(seed=0, hidden=HIDDEN):
     keys = jax.random.split(jax.random.key(seed), 5)
     fresh = residual_network(STATES, INPUTS, keys[0], hidden=hidden, scaling=InputScaling(2.0, 3.0))
     gain, shift, mean = (jax.random.normal(key, (hidden,)) for key in keys[1:4])
-    running = RunningStats(mean, jax.random.uniform(keys[4], (hidden,), minval=0.5, maxval=2.0))
+    running = base.RunningStats(mean, jax.random.uniform(keys[4], (hidden,), minval=0.5, maxval=2.0))
     return eqx.tree_at(lambda field: field.norm, fresh, BatchNorm(gain, shift, running))
 
 
@@ -62,8 +54,8 @@ def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(seed):
             parameters, rest = eqx.partition((field, x, u), eqx.is_inexact_array)
             return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
 
-        np.testing.assert_allclose(train_batch(field, x, u), plain(field, x, u), rtol=0, atol=1e-12)
-        found, expected = (jax.tree.leaves(gradients(formula)) for formula in (train_batch, plain))
+        np.testing.assert_allclose(base.train_batch(field, x, u), plain(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(formula)) for formula in (base.train_batch, plain))
         assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
         for one, other in zip(found, expected, strict=True):
             # Round-off of float64 on gradients of up to about 100.
@@ -76,12 +68,12 @@ def test_in_training_hidden_units_have_mean_zero_and_variance_one():
     with jax.enable_x64(True):
         # relu(h) − relu(−h) = h: with weights ±1 the output shows the normalised units themselves.
         inner = jax.random.normal(jax.random.key(0), (STATES, STATES + INPUTS))
-        both = BatchNorm(jnp.ones(2 * STATES), jnp.zeros(2 * STATES), RunningStats(jnp.zeros(10), jnp.ones(10)))
+        both = BatchNorm(jnp.ones(2 * STATES), jnp.zeros(2 * STATES), base.RunningStats(jnp.zeros(10), jnp.ones(10)))
         field = ResidualNetwork(
             jnp.concatenate([inner, -inner]), both, jnp.hstack([jnp.eye(STATES), -jnp.eye(STATES)]), jnp.zeros(STATES)
         )
         x, u = batch(columns=50)
-        normalised = np.asarray(train_batch(field, x, u))
+        normalised = np.asarray(base.train_batch(field, x, u))
         variance = np.asarray(inner @ jnp.concatenate([x, u])).var(1)
         np.testing.assert_allclose(normalised.mean(1), 0, atol=1e-13)
         np.testing.assert_allclose(normalised.var(1), variance / (variance + 1e-5), rtol=1e-12)
@@ -91,10 +83,10 @@ def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
     with jax.enable_x64(True):
         field, (x, u) = network(), batch()
         hidden = field.weight_in @ field.inputs(x, u)
-        target = RunningStats(hidden.mean(1), hidden.var(1))
+        target = base.RunningStats(hidden.mean(1), hidden.var(1))
         before, observed = field.norm.running, field
         for _ in range(20):
-            observed = update_running_stats(observed, x, u)
+            observed = base.update_running_stats(observed, x, u)
         for name in ("mean", "variance"):
             start, end, goal = (getattr(each, name) for each in (before, observed.norm.running, target))
             np.testing.assert_allclose(end - goal, 0.9**20 * (start - goal), rtol=0, atol=1e-12)
@@ -105,7 +97,7 @@ def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
 def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
     field = network()
     x, u = jnp.ones((STATES, COLUMNS)), jnp.ones((INPUTS, COLUMNS))
-    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(train_batch(field, x, u))))(x)
+    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(base.train_batch(field, x, u))))(x)
     assert jnp.isfinite(value)
     assert jnp.isfinite(slope).all()
 
@@ -116,14 +108,16 @@ def test_a_linear_path_adds_its_map_in_training_and_in_deployment():
         weight = jax.random.normal(jax.random.key(3), (STATES, STATES + INPUTS))
         path = LinearSkip(weight, field)
         line = weight @ jnp.concatenate([x, (u - 2) / 3])
-        for evaluate in (train_batch, infer_batch):
+        for evaluate in (base.train_batch, base.infer_batch):
             np.testing.assert_allclose(evaluate(path, x, u), evaluate(field, x, u) + line, rtol=0, atol=1e-12)
-        assert eqx.tree_equal(update_running_stats(path, x, u), LinearSkip(weight, update_running_stats(field, x, u)))
-        assert sum(jax.tree.leaves(trainable(path))) == 1 + sum(jax.tree.leaves(trainable(field)))
+        assert eqx.tree_equal(
+            base.update_running_stats(path, x, u), LinearSkip(weight, base.update_running_stats(field, x, u))
+        )
+        assert sum(jax.tree.leaves(base.trainable(path))) == 1 + sum(jax.tree.leaves(base.trainable(field)))
 
 
 def test_running_statistics_are_not_trainable_and_all_else_is():
-    marks = trainable(Hybrid(network(), network()))
+    marks = base.trainable(base.Hybrid(network(), network()))
     for part in (marks.physics, marks.residual):
         assert jax.tree.leaves(part.norm.running) == [False]
         assert jax.tree.leaves(eqx.tree_at(lambda part: part.norm.running, part, None)) == [True] * 5
@@ -131,7 +125,7 @@ def test_running_statistics_are_not_trainable_and_all_else_is():
 
 def test_the_paper_s_network_has_the_paper_s_size():
     field = residual_network(13, 4, jax.random.key(0))
-    learned = eqx.filter(field, trainable(field))
+    learned = eqx.filter(field, base.trainable(field))
     # 17 × 64 (its bias would be removed by batch norm), γ and β of 64, 64 × 13 + 13.
     assert sum(leaf.size for leaf in jax.tree.leaves(learned)) == 17 * 64 + 2 * 64 + 64 * 13 + 13
     for weight, fan_in in ((field.weight_in, 17), (field.weight_out, 64), (field.bias_out, 64)):
@@ -161,10 +155,10 @@ def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_
         field, (x, u) = unbatched(norm), batch()
         expected = jnp.stack([plain_one(field, x[:, i], u[:, i]) for i in range(COLUMNS)], axis=1)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(train_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(base.train_batch(field, x, u), expected, rtol=0, atol=1e-12)
         # A sample's result does not depend on its neighbours, and nothing is remembered of them.
-        np.testing.assert_allclose(train_batch(field, x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
-        assert eqx.tree_equal(update_running_stats(field, x, u), field)
+        np.testing.assert_allclose(base.train_batch(field, x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
+        assert eqx.tree_equal(base.update_running_stats(field, x, u), field)
 
 
 @pytest.mark.parametrize("norm", ["layer", "none"])
@@ -175,10 +169,10 @@ def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
         def one_by_one(field):
             return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
 
-        found = jax.grad(lambda field: jnp.sum(train_batch(field, x[:, :3], u[:, :3]) ** 2))(field)
+        found = jax.grad(lambda field: jnp.sum(base.train_batch(field, x[:, :3], u[:, :3]) ** 2))(field)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.grad(one_by_one)(field)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
-        assert all(jax.tree.leaves(trainable(field)))
+        assert all(jax.tree.leaves(base.trainable(field)))
 
 
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])
@@ -200,7 +194,7 @@ def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
         rng = np.random.default_rng(0)
         field, (x, u) = LinearResidual(jnp.asarray(rng.normal(size=(5, 7))), jnp.asarray(rng.normal(size=5))), batch()
         expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
-        np.testing.assert_allclose(train_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(base.train_batch(field, x, u), expected, rtol=0, atol=1e-12)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
 
 
@@ -217,8 +211,8 @@ def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
     field = LinearSkip(jnp.asarray(rng.normal(size=(3, sum(sizes)))), network) if linear else network
     field = jax.tree.map(lambda leaf: leaf + rng.uniform(0.1, 1.0, leaf.shape), field)
     x, u = (jnp.asarray(rng.normal(size=(size, *shape))) for size in sizes)
-    np.testing.assert_allclose(fuse_for_inference(field)(x, u), field(x, u), rtol=1e-5, atol=1e-5)
-    assert isinstance(fuse_for_inference(field), FusedNetwork) == (norm != "layer")
+    np.testing.assert_allclose(base.fuse_for_inference(field)(x, u), field(x, u), rtol=1e-5, atol=1e-5)
+    assert isinstance(base.fuse_for_inference(field), FusedNetwork) == (norm != "layer")
 
 
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
