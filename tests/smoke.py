@@ -34,6 +34,14 @@ def smallest(*options: str, folder: Path, out: Path | None = None) -> list[str]:
     return [*preset, "--out", str(out), "--cache", str(folder / "cache"), *options]
 
 
+def script(*arguments: object, **options: Any) -> str:
+    """What Python prints with these arguments, once it has ended well."""
+    run = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(run, capture_output=True, text=True, **{"cwd": ROOT} | options)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return done.stdout
+
+
 def python(module: str, *options: str) -> Run:
     """`python -m module options`."""
     run = [sys.executable, "-m", module, *options]

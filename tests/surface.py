@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
@@ -32,6 +33,17 @@ def outcome(function, *arguments, naming="", **named):
     assert said
     assert "\n" not in said
     return None
+
+
+def refusal(call, *words):
+    """The one line in which a call is refused with a ValueError; it holds all these words."""
+    with pytest.raises(ValueError, match=r".") as error:
+        call()
+    message = str(error.value)
+    assert "\n" not in message
+    for word in words:
+        assert str(word) in message, message
+    return message
 
 
 def is_finite(tree):

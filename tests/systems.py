@@ -4,7 +4,7 @@
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 
 import equinox as eqx
@@ -19,6 +19,10 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.terms import Terms
 
+ODD = replace(  # a vehicle without any symmetry
+    hj.IRIS, mass=2.1, inertia=(0.05, 0.02, 0.06), thrust_coefficient=1.1e-5, torque_coefficient=2e-6, gravity=9.7,
+    rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)), spin=(1.0, 1.0, -1.0, -1.0),
+)  # fmt: skip
 STEPS = 10
 GRID = 64
 

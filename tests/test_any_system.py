@@ -1,7 +1,5 @@
 """Any system goes from fit to file: fit, adapt by every method, save, load elsewhere, predict, export."""
 
-import subprocess
-import sys
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -10,6 +8,7 @@ import casadi
 import jax
 import numpy as np
 import pytest
+from smoke import script
 from systems import SYSTEMS
 
 import hybrid_jax as hj
@@ -84,9 +83,7 @@ def test_a_file_gives_the_same_model_in_another_process(adapted, tmp_path):
     for name, field in kept.items():
         hj.save(tmp_path / f"{name}.npz", field)
     files = [str(tmp_path / f"{name}.npz") for name in kept]
-    run = [sys.executable, "-c", LOADED_ELSEWHERE, str(Path(__file__).parent), adapted.name, *files]
-    done = subprocess.run(run, capture_output=True, text=True, cwd=Path(__file__).parents[1], timeout=300)
-    assert done.returncode == 0, done.stderr
+    script("-c", LOADED_ELSEWHERE, Path(__file__).parent, adapted.name, *files)
     for name, field in kept.items():
         predicted = hj.Model(field).predict(test.x0, test.u, test.dt)
         np.testing.assert_array_equal(np.load(tmp_path / f"{name}.npz.predicted.npy"), predicted, err_msg=name)

@@ -63,7 +63,6 @@ def flights(draw, shapes=((), (3,))):
 @cases(0.17)
 @given(flights(), odd(0.01, 0.01, np.float32(0.01), np.array(0.01)), st.sampled_from([*FLOWN, None]))
 def test_a_prediction_is_finite_or_refused(flight, dt, other):
-    """`other`: the field of another system than that of the flight, half of the time."""
     kind, x0, u = flight
     found = outcome(hj.Model(FLOWN[other or kind]).predict, x0, u, dt)
     assert found is None or is_finite(found)
@@ -231,7 +230,6 @@ def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
 @cases(0.04)
 @given(flights(shapes=((2,),)), odd(0.01), odd(1), st.sampled_from(sorted(set(SPOILED) - {"itself", "jax", "list"})))
 def test_the_simulator_refuses_states_that_cannot_fly(flight, dt, chunk, name):
-    """Sound ones are compiled for seconds and flown elsewhere, in tests/sim."""
     _, _, u = flight
     x0 = SPOILED["nan" if name in ("f8", "f2", "1e+25", "-100000.0", "i4", "u1") else name](np.zeros((2, 13)), 3)
     assert outcome(SOURCE.quadrotor().rollouts, x0, u, jnp.zeros(2), dt, chunk) is None

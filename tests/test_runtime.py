@@ -1,10 +1,9 @@
 """How a process is set up."""
 
 import os
-import subprocess
-import sys
 
 import pytest
+from smoke import script
 
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
@@ -47,10 +46,7 @@ print(len(names))
 
 def printed(program, cache, **more):
     own = {name: value for name, value in os.environ.items() if name != PROGRAMS}  # not the cache of all tests
-    command = [sys.executable, "-c", program, str(cache)]
-    run = subprocess.run(command, env=own | more, capture_output=True, text=True, check=False)
-    assert run.returncode == 0, run.stderr
-    return [int(number) for number in run.stdout.split()]
+    return [int(number) for number in script("-c", program, cache, env=own | more).split()]
 
 
 def test_no_module_makes_an_array_when_it_is_imported(tmp_path):

@@ -13,7 +13,6 @@ import numpy as np
 import pytest
 from jaxtyping import Array, Float
 from pendulum import LENGTH, pendulum, swings
-from systems import car, car_inputs, car_start, windows
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
@@ -60,17 +59,6 @@ def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
     assert result.parameters["disturbance[1]"].low > 1
     again = adapt(result.field, noisy(flown(truth)), method=LeastSquares(disturbance=False))
     np.testing.assert_allclose(again.disturbance, result.disturbance, rtol=1e-2)  # it is part of the physics by then
-
-
-@pytest.mark.slow
-def test_a_car_s_stiffnesses_are_found_from_noisy_windows():
-    data = noisy(windows(car(0.7, 1.2), car_start, car_inputs, 0.05, 60, 0), size=0.002)
-    result = adapt(car(1.0, 1.0), data, method="theta_least_squares")
-    assert result.converged
-    for name, factor in (("log_front", 0.7), ("log_rear", 1.2)):
-        found = result.parameters[name]
-        assert abs(found.value - np.log(factor)) < 4 / 1.96 * (found.high - found.value)
-        assert 0 < found.high - found.low < 0.2
 
 
 class Stretched(AbstractVectorField):

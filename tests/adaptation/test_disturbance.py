@@ -93,14 +93,6 @@ def test_left_out_of_a_linear_problem_is_a_fit_to_the_others():
         assert found[i] == pytest.approx(expected, rel=1e-4)
 
 
-def test_a_push_is_kept_with_all_that_was_fitted_beside_it():
-    windows = flights(disturbed_by(PUSH))
-    found = select_disturbance(HYBRID, windows)
-    assert found.needed
-    np.testing.assert_allclose(found.fit.field.physics.residual.value, PUSH, atol=5e-3)
-    np.testing.assert_allclose(found.fit.field.physics.physics.log_ratios["Ix"], RATIOS["Ix"], atol=2e-3)
-
-
 def test_what_a_network_gets_wrong_is_not_taken_for_a_push():
     """Six numbers more fit these windows better, and the next ones worse: they are left at zero, and θ_p is alone."""
     windows = flights(hj.Hybrid(hj.Hybrid(body(**RATIOS), Drag()), network()))

@@ -135,7 +135,6 @@ def gusty(seed):
 
 @pytest.mark.parametrize(("method", "left"), [(last_layer, 0.8), (linear_residual, 0.1)])
 def test_flights_not_seen_are_predicted_better(method, left):
-    """Six hidden units of no training offer little; all of the state offers the drag but for its curvature."""
     result = _fit_ridge(method, source(), gusty(0), gusty(1))
     assert _mse(result.field, gusty(2)) < left * _mse(source(), gusty(2))
     assert PENALTIES[-1] <= result.penalty < PENALTIES[0]
@@ -143,7 +142,6 @@ def test_flights_not_seen_are_predicted_better(method, left):
 
 
 def test_a_mapped_run_is_the_run_alone():
-    """Seeds have other fields and other training windows; one program serves them all."""
     fields, trains = [source(seed) for seed in range(3)], [gusty(seed) for seed in (0, 2, 3)]
 
     def one(field, train):

@@ -58,7 +58,6 @@ def test_under_white_noise_the_two_agree():
 
 
 def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
-    """Against the spread of the estimates of 4000 recordings, which for a linear problem is one matrix product."""
     windows, design = pushes(60, 0.0)
     rng = np.random.default_rng(2)
     solve = np.linalg.pinv(design.reshape(-1, 2))

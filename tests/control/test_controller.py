@@ -42,7 +42,6 @@ def still():
 
 
 def test_hover_is_an_equilibrium(still):
-    """The command is the hover speed, and the shifted plan does not drift."""
     x, reference = still
     plan = None
     for _ in range(20):
@@ -54,7 +53,6 @@ def test_hover_is_an_equilibrium(still):
 
 @pytest.mark.parametrize("model", [lambda: BODY, lambda: hybrid(0)], ids=["physics", "hybrid"])
 def test_q_and_minus_q_give_the_same_command(model, still):
-    """Bit by bit, even with a network, for which −q is another input."""
     model = model()
     x, reference = still
     x = x.at[3:7].set(normalise(jnp.array([0.8, 0.3, -0.2, 0.5])))
@@ -90,7 +88,6 @@ def test_speeds_reach_the_limits_and_stay_within(still):
 
 
 def test_more_iterations_never_raise_the_cost(still):
-    """Also from large rates, a wrong heading and far away, where many steps are no descent."""
     x, reference = still
     turned = x.at[3:7].set(from_axis_angle(jnp.array([0.0, 0.0, 1.0]), jnp.array(2.5)))
     for start in (add_body_rates(x, (5.0, -6.0, 4.0)), turned, x.at[:3].add(3.0)):
@@ -100,7 +97,6 @@ def test_more_iterations_never_raise_the_cost(still):
 
 
 def test_plan_cost_equals_its_rollout_and_is_stationary(still):
-    """The assembled Jacobians agree with autodiff."""
     x, reference = still
     x = x.at[0].add(0.2).at[11].set(1.0)
     _, plan = command(x, reference, iterations=30)

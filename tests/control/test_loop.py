@@ -75,7 +75,6 @@ def test_recovery_from_a_rate_of_6_rad_per_s():
 
 
 def test_damping_does_not_grow_at_the_optimum():
-    """A kick after a second of hover is corrected as well as one at the start."""
     reference = reference_of("hover")
     early, late = (alone(np.zeros(6), reference, reference[0], 0.0, at)[1].largest_error for at in (0.0, 1.0))
     assert late < 1.03 * early
@@ -175,7 +174,6 @@ def test_invalid_arguments_are_refused():
 )
 @pytest.mark.parametrize(("start", "wanted"), [(np.float32, np.float64), (np.float64, np.float32)])
 def test_mixed_precision_is_promoted(start, wanted, evaluate):
-    """For the loop with a plant of another precision, and for the controller alone."""
     with jax.enable_x64(True):
         controller, body = control.Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)
         reference = np.asarray(control.sample(control.hover(), controller, 0.02), wanted)

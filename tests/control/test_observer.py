@@ -39,7 +39,6 @@ def fields():
 
 @pytest.mark.parametrize("name", ["physics", "hybrid", "network"])
 def test_estimate_converges_at_the_bandwidth(fields, name):
-    """As a first-order filter, 1 − exp(−β t), for any field."""
     found = watch(fields[name], disturbed(fields[name], TRUE), 5.0)
     share = -np.expm1(-5.0 * DT * np.arange(100))[:, None]
     # Rounding of v and ω over DT: 1e-6 / 0.01, more where a network's speeds are large.

@@ -70,8 +70,6 @@ CASES = [pytest.param(name, True, marks=[pytest.mark.slow] * (name in LONG_TO_CO
 
 @pytest.mark.parametrize(("name", "unit_quaternion"), [*CASES, ("physics", False)])
 def test_jacobian_of_a_step_equals_autodiff(name, unit_quaternion):
-    """In double precision."""
-
     def both(field, x, u):
         expected = jax.jacfwd(lambda x, u: advance(field, x, u, DT, unit_quaternion), argnums=(0, 1))(x, u)
         state = advance(field, x, u, DT, unit_quaternion)

@@ -83,7 +83,6 @@ def test_it_is_newton_euler_with_drag_moment_damping_gain_and_offset():
 
 @pytest.mark.parametrize("name", SIGNED)
 def test_a_known_term_is_a_learned_one_at_its_value(name):
-    """What is learned is the deviation from the nominal value, in SI units `theta`."""
     x, u = samples()
     value = getattr(KNOWN, name)
     terms = Terms(**{"drag": KNOWN.drag, name: value})  # a lag without a force is none
@@ -100,7 +99,6 @@ MINIBATCHES = {"rigid body": rigid_body(IRIS)} | {
 
 @pytest.mark.parametrize("field", MINIBATCHES.values(), ids=MINIBATCHES)
 def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
-    """With respect to θ_p, states and inputs alike."""
     field, (x, u) = moved(field), samples()
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
 
@@ -114,7 +112,6 @@ def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
 
 
 def test_all_terms_are_recovered_from_flights_made_with_them():
-    """Exact data, so what is left is round-off; gains are the inertia's and the lag's as well."""
     learn = tuple(name for name in ALL if name not in ("torque_gain", "velocity_gain"))
     truth, (x, u) = moved(multirotor(IRIS, learn), 0.05), samples(30)
     start, rebuild = ravel_pytree(multirotor(IRIS, learn))

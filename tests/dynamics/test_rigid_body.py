@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from matrices import newton_euler
+from systems import ODD
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import HoldState
@@ -17,17 +18,6 @@ from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
-
-ODD = replace(
-    IRIS,
-    mass=2.1,
-    inertia=(0.05, 0.02, 0.06),
-    thrust_coefficient=1.1e-5,
-    torque_coefficient=2e-6,
-    rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)),
-    spin=(1.0, 1.0, -1.0, -1.0),
-    gravity=9.7,
-)
 
 
 def level(**parts):

@@ -46,7 +46,6 @@ def test_the_last_save_is_loaded_bit_for_bit_and_two_are_kept(tmp_path):
 
 
 def test_a_flipped_bit_is_detected(tmp_path):
-    """For bits all over a checkpoint: what is loaded is exact, or the checkpoint before."""
     saved(tmp_path, 2)
     file, rng = tmp_path / "000002.npz", random.Random(0)
     intact = file.read_bytes()
@@ -77,7 +76,6 @@ def test_a_truncated_checkpoint_is_named_and_renamed(left, tmp_path):
 
 
 def test_checkpoints_of_the_version_before_are_moved_and_the_stage_starts_anew(tmp_path):
-    """It wrote a folder for each."""
     (tmp_path / "old.begun" / "000001" / "arrays").mkdir(parents=True)
     found, (line,) = loaded(tmp_path / "old.begun")
     assert found is None

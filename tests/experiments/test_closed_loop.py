@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from rich.console import Console
-from smoke import command, experiments, refused, smallest, unbegun
+from smoke import command, experiments
 
 import hybrid_jax as hj
 from experiments.closed_loop.flights import PATHS, Scenario, flown
@@ -174,18 +174,3 @@ def test_second_run_trains_and_flies_nothing(folder):
     assert "runs active" not in again.stderr
     first, second = (json.loads((folder / out / "closed_loop" / "report.json").read_text()) for out in ("out", "again"))
     assert second["rows"] == [row for row in first["rows"] if row["reference"] == "hover"]
-
-
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (("--references", "hover", "hover"), "--references must be at least one, each different"),
-        (("--references", "hover", "--away-references", "low_pass"), "--away-references must be among --references"),
-        (("--seconds", "0.2"), "--seconds must be at least 1"),
-        (("--residual-outputs", "accelerations"), "no_physics must write all derivatives"),
-    ],
-    ids=["twice", "not at home", "short", "no physics without velocities"],
-)
-def test_invalid_options_are_refused_before_training(options, named, tmp_path):
-    assert named in refused(unbegun("closed_loop.__main__", *smallest(*options, folder=tmp_path)), "closed_loop")
-    assert not list(tmp_path.iterdir())

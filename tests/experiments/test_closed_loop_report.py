@@ -204,7 +204,6 @@ def test_title_mentions_errors_below_the_floor():
 
 
 def test_ticks_of_small_errors_do_not_overlap():
-    """Numbers of four characters, at 1, 2, 5 of two decades."""
     rows = changed(changed(ROWS, Agent("oracle"), position_rmse=0.0), Agent("hybrid"), position_rmse=0.009)
     axes = figures.errors(rows, "external_force").axes[0]
     low, high = axes.get_xlim()

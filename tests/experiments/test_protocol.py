@@ -68,7 +68,6 @@ def test_runs_have_the_table_s_rates_and_patience(model, mode, table):
 
 
 def test_other_input_scaling_is_another_pretraining():
-    """Nothing but what is static in the network differs."""
     windows = placeholder(SplitSpec(2, 10))
     data = Dataset({"train": windows, "validation": windows}, {})
     identities = {
@@ -147,19 +146,14 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
 @pytest.mark.parametrize(
     ("change", "named"),
     [
-        ({"sizes": (10,)}, "--sizes"),
-        ({"sizes": ()}, "--sizes"),
-        ({"sizes": (100, 100)}, "--sizes"),
-        ({"sizes": (100, 1_000_000_000)}, "--sizes"),
+        *(({"sizes": sizes}, "--sizes") for sizes in ((10,), (), (100, 100), (100, 1_000_000_000))),
         ({"sizes": (9,), "batch_size": 9}, "constant_disturbance"),
         ({"models": ()}, "--models"),
         ({"batch_size": 1}, "--batch-size must be at least 2 with --norm batch, got 1"),
         ({"source_train": 50}, "--source-train"),
         ({"seeds": 0}, "--seeds"),
         ({"max_epochs": 0}, "--max-epochs"),
-        ({"guess": (1.2, 0.8)}, "--guess"),
-        ({"guess": (-1.0, 0.8)}, "--guess"),
-        ({"guess": (0.8, math.inf)}, "--guess must be two factors"),
+        *(({"guess": box}, "--guess must be two factors") for box in ((1.2, 0.8), (-1.0, 0.8), (0.8, math.inf))),
         ({"perturbed_by": math.nan}, "--perturbed-by must be a positive finite number, got nan"),
         ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
         ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
@@ -190,7 +184,6 @@ def test_minibatches_of_one_window_are_for_what_does_not_normalise_them():
 
 @pytest.mark.parametrize("model", ["hybrid", "no_physics", "physics_only"])
 def test_the_output_bias_has_a_rate_of_its_own_if_asked_for(model):
-    """And all else the rate that it had; physics alone has no such bias."""
     offset = replace(SMALL, rates=replace(SMALL.rates, offset=0.3))
     for (_, _, usual), (_, _, found) in zip(
         plans_by_lane(model, "fine_tuned"), plans_by_lane(model, "fine_tuned", offset), strict=False

@@ -73,7 +73,6 @@ def test_c9_needs_the_whole_order_in_both_domains(domain, model, factor):
 
 
 def test_c9_compares_the_hybrids_mean_with_the_others_best():
-    """One bad seed ruins the hybrid, but not a rival."""
     for model, holds in (("hybrid", False), ("expert_augmentation", True), ("physics_only", True)):
         rows = spoilt(compared_rows(), model, lambda row: math.nan if row["seed"] == 2 else row["test_mse"])
         assert verdict(rows).holds is holds

@@ -199,7 +199,6 @@ def test_chosen_recipe_has_the_smallest_finite_error(errors):
 
 @pytest.mark.parametrize("sizes", [(20,), (100, 1000)])
 def test_points_are_centred_at_their_number_of_windows(sizes):
-    """Models drawn as lines are not counted."""
     rows = [row("zero_shot", 1.0, n=0), row("nominal", 1.0, n=0, model="hold")]
     rows += [row(mode, 1.0, n=n) for n in sizes for mode in ("fine_tuned", "scratch")]
     rows = Results([each | {"scores": {"10": each["scores"]["10"]}} for each in rows], TAGS)

@@ -1,8 +1,6 @@
 """From folders of logs to a report: what is read, what is refused and what is written."""
 
 import json
-import subprocess
-import sys
 from dataclasses import fields, replace
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, write
 from rich.console import Console
-from smoke import ROOT, command, experiments, refused
+from smoke import command, experiments, refused, script
 
 from experiments.real_flight.__main__ import LISTS, load_vehicle_models, main, prepare, split_lists
 from experiments.real_flight.config import PRESETS, Cleaning, RealFlightConfig
@@ -149,7 +147,6 @@ def test_lag_is_not_chosen_on_test_flights(options, tmp_path):
 
 @pytest.mark.parametrize("learned", [True, False])
 def test_rotor_lag_is_applied_once(learned, tmp_path):
-    """A stated lag is only an initial guess if the lag is to be chosen."""
     vehicle = with_lag(tmp_path)
     if not learned:
         vehicle.write_text(vehicle.read_text().replace(f', "{LAG}"', ""))
@@ -251,7 +248,6 @@ def test_adaptation_changes_all_parameters(simulated):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["hybrid", "no_physics", "physics_only"])
 def test_saved_models_load_and_predict(simulated, name):
-    """In a process that imports nothing of the experiment."""
     path = simulated[0] / "models" / f"fold0-{name}-fine_tuned-20-seed0.npz"
     code = f"""
 import hybrid_jax, numpy as np
@@ -260,4 +256,4 @@ x0 = np.array([0, 0, 2, 1, *[0] * 9], np.float32)
 assert model.about["dt"] == {DT}
 assert np.isfinite(model.predict(x0, np.full((5, 4), 600, np.float32), {DT})).all()
 """
-    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    script("-c", code)

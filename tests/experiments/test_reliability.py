@@ -95,7 +95,6 @@ def kill(place, due, delay=0.0, flights=False):
 
 @pytest.mark.slow
 def test_a_killed_run_survives_other_inputs_a_full_disk_and_a_truncated_checkpoint(place, whole):
-    """What is saved is intact after each, and the run ends in the same bits."""
     for _ in range(TRIES):  # a busy machine may see the checkpoints only after the end
         if kill(place, lambda: len(place.checkpoints()) == 2) and len(place.checkpoints()) == 2:
             break

@@ -70,7 +70,6 @@ def test_flights_are_known_by_their_content(tmp_path):
 
 
 def test_another_version_is_refused(tmp_path, monkeypatch):
-    """A package of another version number stands before the installed one, as after an upgrade."""
     interrupt(tmp_path / "out", SMOKE)
     about = tmp_path / "numpy-99.0.dist-info" / "METADATA"
     about.parent.mkdir()

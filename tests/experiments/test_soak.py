@@ -2,8 +2,6 @@
 
 import gc
 import os
-import subprocess
-import sys
 import weakref
 from pathlib import Path
 
@@ -11,6 +9,7 @@ import jax
 import numpy as np
 import pytest
 from pendulum import DAMPING, pendulum, swings
+from smoke import script
 
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import PROGRAMS, _block, evaluate, sweep
@@ -45,13 +44,9 @@ def soak(sizes):
 @pytest.mark.slow
 @pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="memory is read from Linux's /proc")
 def test_memory_is_flat_after_the_warm_up():
-    """In a separate process, with two shapes in turn."""
     paths = "import sys; sys.path[:0] = ['tests', 'tests/experiments']"
     code = f"{paths}; from test_soak import soak; print(*soak([10, 15]))"
-    root = Path(__file__).parents[2]
-    run = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=root, check=False)
-    assert run.returncode == 0, run.stderr
-    warm, last = map(int, run.stdout.split())
+    warm, last = map(int, script("-c", code).split())
     assert last < GROWTH * warm, f"{warm / 2**20:.0f} MiB, then {last / 2**20:.0f} MiB"
 
 

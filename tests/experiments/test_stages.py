@@ -83,7 +83,6 @@ def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole,
 
 @pytest.mark.usefixtures("heard")
 def test_a_sweep_begun_by_another_version_is_refused_and_fresh_runs_it_anew(tmp_path, whole, monkeypatch):
-    """A package of another version number stands before the installed one, as after an upgrade."""
     interrupt(tmp_path, monkeypatch)
     (begun,) = tmp_path.glob("*.begun")
     about = tmp_path / "upgrade" / "jax-99.0.dist-info" / "METADATA"
@@ -111,7 +110,6 @@ def test_anything_else_is_another_sweep(folder, whole, other):
 
 
 def test_a_diverged_run_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
-    """With a learning rate of 1e3 in one run the other keeps every bit."""
     final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
     assert same(lane(final, 0), lane(whole, 0))
     where = (20, 20), (0, 1)

@@ -1,21 +1,15 @@
 """What docs/export.md shows is what happens; a program is read without the library."""
 
 import re
-import subprocess
-import sys
-from pathlib import Path
 
 import pytest
+from smoke import ROOT, script
 
-ROOT = Path(__file__).parents[2]
 WITH, WITHOUT = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), flags=re.DOTALL)
 
 
 def said(code, folder):
-    code = f"import sys\nsys.path.insert(0, {str(ROOT)!r})\n{code}"
-    done = subprocess.run([sys.executable, "-c", code], cwd=folder, capture_output=True, text=True, timeout=300)
-    assert done.returncode == 0, done.stderr
-    return done.stdout
+    return script("-c", f"import sys\nsys.path.insert(0, {str(ROOT)!r})\n{code}", cwd=folder)
 
 
 @pytest.mark.slow

@@ -47,19 +47,3 @@ def _squares(thrust, torque):
     arms, k = np.array(IRIS.rotor_positions), IRIS.thrust_coefficient
     mixer = np.stack([k * np.ones(4), k * arms[:, 1], -k * arms[:, 0], IRIS.torque_coefficient * np.array(IRIS.spin)])
     return np.linalg.solve(mixer, np.concatenate([thrust[:, None], torque], axis=1).T).T
-
-
-@pytest.fixture
-def refusal():
-    """The message of the ValueError that a call raises: one line that holds every word asked for."""
-
-    def refuse(call, *words):
-        with pytest.raises(ValueError, match=r".") as error:
-            call()
-        message = str(error.value)
-        assert "\n" not in message
-        for word in words:
-            assert str(word) in message, message
-        return message
-
-    return refuse

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from surface import refusal
 
 from hybrid_jax.flights import attitude
 from hybrid_jax.flights.attitude import Frames, from_euler, mean_of_held, rotation_of, to_library
@@ -78,5 +79,5 @@ def test_held_values_are_averaged_over_intervals():
 
 
 @pytest.mark.parametrize("wrong", [("NWU", "FLU", "world"), ("ENU", "flu", "world"), ("ENU", "FLU", "earth")])
-def test_unknown_frames_are_refused(wrong, refusal):
+def test_unknown_frames_are_refused(wrong):
     refusal(lambda: Frames(*wrong), "must be one of")

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from surface import refusal
 
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
@@ -42,7 +43,7 @@ def test_windows_never_cross_a_gap(flight, stride):
     assert len(cut) == expected
 
 
-def test_too_long_windows_and_uneven_samples_are_refused(flight, refusal):
+def test_too_long_windows_and_uneven_samples_are_refused(flight):
     refusal(lambda: cut_windows([with_gap(flight[:800])], 500), "no window of 500", "longest segment has 399")
     t = flight.t.copy()
     t[50] += 0.003
@@ -130,7 +131,7 @@ def test_filters_drop_repeated_samples(flight):
     assert "1 repeated samples left out" in done
 
 
-def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight, refusal):
+def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight):
     u = flight.u.copy()
     u[:80], u[500:530] = 3.0, 3.0  # 0.8 s, and 0.3 s without thrust
     log, done = in_flight(FlightLog(flight.t, flight.x, u))
@@ -139,7 +140,7 @@ def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight, refusal):
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 50.1, -1.0, np.nan])
-def test_impossible_cutoffs_are_refused(flight, refusal, cutoff):
+def test_impossible_cutoffs_are_refused(flight, cutoff):
     refusal(lambda: low_pass(flight, cutoff), "cutoff must lie between 0 and half the sampling frequency")
 
 
@@ -153,7 +154,7 @@ def test_a_shift_by_whole_samples_moves_rows(flight, steps):
     assert f"{abs(steps)} samples cut" in done
 
 
-def test_alignment_finds_the_shift(flight, refusal):
+def test_alignment_finds_the_shift(flight):
     late = FlightLog(flight.t[:-5], flight.x[:-5], flight.u[5:])
     log, done = align_motors(late, IRIS)
     assert float(done.split("by ")[1].split(" ms")[0]) == pytest.approx(50, abs=2)

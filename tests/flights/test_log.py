@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from surface import refusal
 
 from hybrid_jax.flights.log import FlightLog
 
@@ -38,18 +39,18 @@ def test_the_arrays_given_are_not_changed(flight):
         ("x", (9, 3), 1e200, ("sample 9", "qw", "norm is inf")),
     ],
 )
-def test_impossible_values_are_named(flight, refusal, array, at, value, words):
+def test_impossible_values_are_named(flight, array, at, value, words):
     broken = parts(flight)
     broken[array][at] = value
     refusal(lambda: FlightLog(**broken, name="mine"), "mine", *words)
 
 
-def test_repeated_and_decreasing_times_are_distinguished(flight, refusal):
+def test_repeated_and_decreasing_times_are_distinguished(flight):
     broken = parts(flight)
     broken["t"][6] = broken["t"][5]
     refusal(lambda: FlightLog(**broken), "sample 6", "repeats")
 
 
-def test_shapes_must_agree(flight, refusal):
+def test_shapes_must_agree(flight):
     refusal(lambda: FlightLog(flight.t[1:], flight.x, flight.u), "(n, 13)")
     refusal(lambda: FlightLog(flight.t[:0], flight.x[:0], flight.u[:0]), "no samples")

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from surface import refusal
 
 from hybrid_jax.flights.cleaning import choose_time_constant, lag_motors
 from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
@@ -55,7 +56,7 @@ def test_a_manoeuvre_is_held_out_whole(logs):
     assert len(kept) == 6
 
 
-def test_impossible_splits_are_refused(logs, refusal):
+def test_impossible_splits_are_refused(logs):
     refusal(lambda: hold_out(logs, ["melon"], manoeuvre_of), "'melon'", "chirp")
     refusal(lambda: hold_out(logs[:1], ["chirp_run1"]), "0 flights for training")
     refusal(lambda: folds(logs, 4, manoeuvre_of), "3 different names")

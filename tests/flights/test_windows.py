@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import DT, LOGS, SAMPLES, write
+from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.flights import FlightLog, cut_windows, load_logs
@@ -21,7 +22,7 @@ def test_windows_are_those_of_all_logs(tmp_path, recwarn):
 
 
 @pytest.mark.filterwarnings("ignore")
-def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path, refusal):
+def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path):
     write(tmp_path, [LOGS[0], replace(LOGS[1], t=2 * LOGS[1].t)])
     refusal(lambda: hj.load_windows(tmp_path, IRIS), "0.02 s apart", "dt=0.02")
     windows = hj.load_windows(tmp_path, IRIS, dt=0.02, motor_time_constant=0.05)
@@ -29,7 +30,7 @@ def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path, refusal):
     assert windows.u.std() < hj.load_windows(tmp_path, IRIS, dt=0.02).u.std()
 
 
-def test_failed_checks_are_reported(tmp_path, refusal):
+def test_failed_checks_are_reported(tmp_path):
     still = FlightLog(LOGS[0].t, LOGS[0].x, LOGS[0].u * [1, 1, 1, 0], "still.csv")
     write(tmp_path, [still])
     with pytest.warns(UserWarning, match=r"still.csv.gz: columns: u3 never changes"):
@@ -41,12 +42,12 @@ def test_failed_checks_are_reported(tmp_path, refusal):
     ("options", "message"),
     [({"steps": 0}, "steps"), ({"dt": -1.0}, "dt must be"), ({"steps": 500}, "no window of 500")],
 )
-def test_invalid_arguments_are_refused(tmp_path, refusal, options, message):
+def test_invalid_arguments_are_refused(tmp_path, options, message):
     write(tmp_path, LOGS[:1])
     refusal(lambda: hj.load_windows(tmp_path, IRIS, **options), message)
 
 
-def test_a_folder_without_logs_is_refused(tmp_path, refusal):
+def test_a_folder_without_logs_is_refused(tmp_path):
     refusal(lambda: load_logs(tmp_path), tmp_path, "holds no flights")
     refusal(lambda: load_logs(tmp_path / "none"), "no such folder")
     assert len(cut_windows([*LOGS[:2], LOGS[2][:5]], 10)) == 2 * (SAMPLES - 10)

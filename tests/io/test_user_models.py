@@ -3,7 +3,6 @@
 import functools
 import os
 import re
-import subprocess
 import sys
 import warnings
 from pathlib import Path
@@ -16,6 +15,7 @@ import numpy as np
 import pytest
 import user_modules
 from pendulum import pendulum
+from smoke import script
 from user_modules import fields, prediction
 
 import hybrid_jax as hj
@@ -29,20 +29,15 @@ FIELDS = fields()
 OLD_FILES = sorted((Path(__file__).parent / "saved_by_version_1").glob("*.npz"))
 
 
-def python(*arguments):
-    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
-    command = [sys.executable, *map(str, arguments)]
-    return subprocess.run(command, env=os.environ | {"PYTHONPATH": path}, capture_output=True, text=True, timeout=300)
-
-
 @pytest.fixture(scope="module")
 def in_fresh_process(tmp_path_factory):
     """Predictions of all models, saved here and loaded in another process."""
     folder = tmp_path_factory.mktemp("models")
     for name, field in FIELDS.items():
         hj.save(folder / f"{name}.npz", field)
-    done = python("-c", "import sys, user_modules; user_modules.predict_all(sys.argv[1])", folder)
-    assert done.returncode == 0, done.stderr
+    path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
+    code = "import sys, user_modules; user_modules.predict_all(sys.argv[1])"
+    script("-c", code, folder, env=os.environ | {"PYTHONPATH": path})
     return np.load(folder / "predictions.npy.npz")
 
 
@@ -65,8 +60,7 @@ def test_a_loaded_model_is_the_saved_one(name, tmp_path):
 
 @pytest.mark.slow
 def test_two_runs_of_a_script_share_its_classes(tmp_path):
-    script = tmp_path / "script.py"
-    script.write_text(
+    (tmp_path / "script.py").write_text(
         "import sys, jax, jax.numpy as jnp, hybrid_jax as hj\n"
         "class Decay(hj.AbstractVectorField):\n"
         "    rate: jax.Array\n"
@@ -75,12 +69,8 @@ def test_two_runs_of_a_script_share_its_classes(tmp_path):
         "if sys.argv[1] == 'save': hj.save('model.npz', Decay(jax.random.key(3)))\n"
         "print(hj.load('model.npz').field.rate)\n"
     )
-    first, second = (
-        subprocess.run([sys.executable, script, what], cwd=tmp_path, capture_output=True, text=True, timeout=300)
-        for what in ("save", "load")
-    )
-    assert first.returncode == second.returncode == 0, first.stderr + second.stderr
-    assert first.stdout == second.stdout
+    first, second = (script("script.py", what, cwd=tmp_path) for what in ("save", "load"))
+    assert first == second
 
 
 @pytest.mark.parametrize("path", OLD_FILES, ids=lambda path: path.stem)

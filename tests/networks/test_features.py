@@ -144,7 +144,6 @@ def test_the_body_s_view_of_a_state():
 
 @pytest.mark.parametrize("inputs", factory.FROM_THE_BODY)
 def test_a_correction_of_the_motion_keeps_the_attitude_a_rotation(inputs):
-    """All of ṗ, q̇, v̇ and ω̇ are moved, and q̇ is perpendicular to q."""
     field, (x, u) = view(inputs, "motion"), samples()
     derivative = deployed(field, x, u)
     assert (jnp.abs(derivative).max(1) > 1e-3).all()
@@ -199,7 +198,6 @@ class Kinetic(base.AbstractVectorField):
 
 
 def test_isotropic_drag_is_the_same_seen_from_the_body():
-    """A map that reads the body-frame velocity and writes a body-frame v̇ is the drag of the world."""
     field, (x, u) = BodyFrame(Kinetic(jnp.asarray(0.4))), samples()
     derivative = deployed(field, x, u)
     np.testing.assert_allclose(derivative[VELOCITY], -0.4 * x[VELOCITY], atol=1e-12)
@@ -208,7 +206,6 @@ def test_isotropic_drag_is_the_same_seen_from_the_body():
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
-    """Training is deployment at the batch's own statistics, and those are what running statistics move towards."""
     field, (x, u) = view(inputs, outputs), samples(20)
     trained = base.train_batch(field, x, u)
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
@@ -247,7 +244,6 @@ def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
 
 
 def test_files_that_name_the_former_modules_are_loaded(tmp_path):
-    """Of all the classes that moved between modules."""
     path, moved = tmp_path / "model.npz", {name: cls for name, cls in _RENAMED.items() if ":" in name}
     residual = view("near_ground", "rotors", scaling=ChannelScaling())
     field = Hybrid(Hybrid(Kinematics(), base.fuse_for_inference(view(norm="none"))), residual)

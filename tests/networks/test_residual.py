@@ -64,7 +64,6 @@ def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(seed):
 
 
 def test_in_training_hidden_units_have_mean_zero_and_variance_one():
-    """As torch.nn.BatchNorm1d in training: the batch's own mean and biased variance, ε = 1e-5."""
     with jax.enable_x64(True):
         # relu(h) − relu(−h) = h: with weights ±1 the output shows the normalised units themselves.
         inner = jax.random.normal(jax.random.key(0), (STATES, STATES + INPUTS))
@@ -203,7 +202,6 @@ def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
 @pytest.mark.parametrize("norm", ["batch", "layer", "none"])
 @pytest.mark.parametrize("linear", [False, True])
 def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
-    """Batch normalisation by its running statistics, which are not those that it began with."""
     rng = np.random.default_rng(0)
     network = residual_network(
         *sizes, jax.random.key(0), hidden=9, norm=norm, outputs=3, scaling=InputScaling(1.0, 2.0)
@@ -217,7 +215,6 @@ def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
 
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])
 def test_a_network_of_two_inputs_is_one_of_more_that_are_zero(shape):
-    """Few inputs are summed, more go through a product of matrices."""
     few = residual_network(1, 1, jax.random.key(0), hidden=9, norm="none", outputs=3)
     more = eqx.tree_at(lambda network: network.weight_in, few, jnp.pad(few.weight_in, ((0, 0), (1, 0))))
     x, u = np.random.default_rng(0).normal(size=(2, 1, *shape))

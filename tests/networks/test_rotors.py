@@ -50,7 +50,6 @@ def deployed(field, x, u):
 
 
 def test_with_their_formula_it_is_the_simulator_s_ground_effect():
-    """Force and torque at once, though nothing of the torque is said."""
     x, u = samples()
     at_once = jax.vmap(ground_effect, (-1, -1, None, None), -1)
     force, torque = at_once(x, u, jnp.asarray(0.0), parameters_of(IRIS))

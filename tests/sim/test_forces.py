@@ -39,7 +39,6 @@ def test_a_tilted_rotor_has_its_own_altitude_and_pushes_the_low_side_up():
 
 
 def test_ground_effect_turns_with_the_vehicle():
-    """Its torque is in the world frame: yaw the vehicle by 90° and the torque turns with it."""
     straight, turned = (
         ground_effect(
             hovering(0.3).at[3:7].set(q), jnp.array([600.0, 800.0, 800.0, 600.0]), T0, parameters_of(IRIS)

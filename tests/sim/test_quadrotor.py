@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import mujoco
 import numpy as np
 import pytest
+from systems import ODD
 
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import rotate
@@ -17,16 +18,6 @@ from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, wind
 from hybrid_jax.vehicle import IRIS
 
 ALL = (drag, ground_effect, wind)
-ODD = replace(
-    IRIS,
-    mass=2.1,
-    inertia=(0.05, 0.02, 0.06),
-    thrust_coefficient=1.1e-5,
-    torque_coefficient=2e-6,
-    rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)),
-    spin=(1.0, 1.0, -1.0, -1.0),
-    gravity=9.7,
-)
 
 
 def newton_euler(x, u, vehicle, force=None, torque=None, np=np):
@@ -143,7 +134,6 @@ def reference_flight(x0, u, t0, duration):
 
 
 def test_order_of_convergence_is_four(step):
-    """In a turning flight in ground effect and wind."""
     x0 = at_rest(0.35).at[7:13].set(jnp.array([2.0, -1.0, 0.4, 0.5, -0.8, 1.5]))
     u = jnp.array([650.0, 660.0, 655.0, 668.0])
     truth = jax.jit(reference_flight)(x0, u, 0.2, 0.4)

@@ -2,8 +2,6 @@
 
 import logging
 import os
-import subprocess
-import sys
 from dataclasses import replace
 
 import diffrax
@@ -13,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pendulum import DAMPING, pendulum, swings
+from smoke import script
 
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.sweep.lanes import LaneMap, lane, stack
@@ -157,7 +156,6 @@ def test_a_diverged_lane_changes_no_bit_of_another(width, final):
 
 
 def test_stopped_lanes_are_run_no_more(monkeypatch):
-    """Only the active lanes are handed to the compiled block."""
     handed, epochs, run = [], [], LaneMap.__call__
 
     def counting(self, lanes, shared, costs, active):
@@ -237,10 +235,6 @@ print(final.epoch.tolist(), [np.float32(number).tobytes().hex() for number in fi
 
 @pytest.mark.slow
 def test_the_number_of_devices_changes_nothing():
-    runs = [
-        subprocess.run([sys.executable, "-c", DEVICES, str(n)], capture_output=True, text=True, check=False)
-        for n in (1, 2)
-    ]
-    assert [run.returncode for run in runs] == [0, 0], runs[-1].stderr
-    assert runs[0].stdout == runs[1].stdout
-    assert runs[0].stdout.startswith("[")
+    one, two = (script("-c", DEVICES, number) for number in (1, 2))
+    assert one == two
+    assert one.startswith("[")

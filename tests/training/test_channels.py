@@ -36,7 +36,6 @@ def test_with_a_scale_of_one_it_is_the_plain_loss():
 
 
 def test_scales_are_the_baseline_s_errors_at_the_horizon():
-    """So the baseline counts 1 in each channel there, whatever the units."""
     channels = channels_from(HoldState(), TRAIN, PARTS)
     last = (TRAIN.x - TRAIN.x0[:, None])[:, -1]
     counted = ChannelLoss(channels).error(last)
@@ -64,7 +63,6 @@ def test_beyond_its_threshold_a_robust_loss_grows_with_the_error_and_not_its_squ
 
 
 def test_a_robust_loss_does_not_follow_outliers():
-    """A tenth of the windows end somewhere else altogether: the length is found all the same."""
     wild = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x.at[::10].add(20.0))
     found = {}
     for name, huber in (("square", None), ("robust", 0.05)):

@@ -30,7 +30,6 @@ def test_every_input_has_mean_zero_and_deviation_one():
 
 
 def test_a_unit_of_the_state_changes_nothing_that_the_network_reads():
-    """The position in kilometres: the network's inputs are the same."""
     x, u = samples(CAR.train)
     unit = np.array([1e-3, 1, 1, 1, 1, 1], np.float32)
     windows = hj.Trajectories(CAR.train.x0 * unit, CAR.train.u, CAR.train.x * unit, CAR.train.dt)

@@ -127,7 +127,6 @@ def test_exact_physics_leaves_a_silent_residual_silent():
 
 
 def test_the_best_epoch_is_the_best_that_validation_saw():
-    """Epoch by epoch by hand: the best field is the one kept, and its error is what validation says."""
     whole = trained(pendulum(0.8, DAMPING), max_epochs=15)
     state = start(pendulum(0.8, DAMPING), KEY)
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 15, 1e-3)
@@ -176,7 +175,6 @@ def test_only_the_first_n_train_of_the_subset_are_used():
 
 
 def test_each_epoch_sees_every_window_once():
-    """With one feature and a rate of 0 the mean training loss is that of all windows, whatever their order."""
     field = pendulum(0.8, DAMPING)
     for key in (KEY, jax.random.key(1)):
         state = trained(field, 0.0, key=key, max_epochs=1)
@@ -234,7 +232,6 @@ def test_a_weight_is_that_of_a_regulariser():
 
 
 def test_an_optax_optimiser_moves_a_field_as_adam_does():
-    """Adam by itself, and as an optimiser of the user's with its rate inside, or as a factor outside."""
     field = pendulum(0.8, DAMPING)
     usual, inside, outside = (
         trained(field, rates, max_epochs=3, optimiser=optimiser)
