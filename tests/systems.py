@@ -29,13 +29,9 @@ GRID = 64
 
 @dataclass(frozen=True)
 class System:
-    """A system to learn on `source` windows and to adapt to on `target` windows.
+    """A system to learn on windows of `truth` and to adapt to those of `changed`, `target`.
 
-    Attributes:
-        truth, changed: the true field of the source and of the target.
-        model: the field to train; its physics has wrong parameters and leaves out a force.
-        train, validation: windows of the truth.
-        target, test: windows of the changed truth.
+    The physics of the model has wrong parameters and leaves out a force.
     """
 
     truth: AbstractVectorField

@@ -13,7 +13,7 @@ from test_least_squares import Push, pushes
 import hybrid_jax as hj
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import left_out, normal_equations, select_disturbance
-from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.factory import make_residual
@@ -58,15 +58,6 @@ def test_parameters_and_push_are_found_together_and_the_network_stays():
         np.testing.assert_allclose(found.field.physics.physics.log_ratios[name], ratio, atol=2e-3)
     np.testing.assert_allclose(found.field.physics.residual.value, PUSH, atol=5e-3)
     assert eqx.tree_equal(found.field.residual, network())
-
-
-def test_it_adds_to_the_accelerations_of_one_state_and_of_many():
-    x, u = flights(body(), count=5).x[:, 0], jnp.full((5, 4), 600.0)
-    field = disturbed(body(), PUSH)
-    one = jax.vmap(body())(x, u).at[:, 7:].add(PUSH)
-    np.testing.assert_allclose(jax.vmap(field)(x, u), one, rtol=1e-6)
-    for many in (train_batch, infer_batch):
-        np.testing.assert_allclose(many(field, x.T, u.T).T, one, rtol=1e-5, atol=1e-5)
 
 
 class Drag(AbstractVectorField):

@@ -35,13 +35,8 @@ def simulate(wind, reference, x0, bandwidth, kick):
     return flight, control.performance(flight, reference, CONTROLLER)
 
 
-program = jax.jit(simulate)  # one for all flights of 2 s
-
-
-def alone(wind, reference, x0, bandwidth, kick=-1.0):
-    return program(wind, reference, x0, bandwidth, kick)
-
-
+alone = jax.jit(simulate)  # one program for all flights of 2 s
+NEVER = -1.0
 PATHS = {
     "hover": control.hover(),
     "eight": control.figure_eight(3.5),
@@ -58,7 +53,7 @@ def reference_of(name):
 @pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
 def test_true_model_tracks_the_reference(name, allowed):
     """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
-    _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0)
+    _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0, NEVER)
     assert found.position_rmse < allowed
     assert found.yaw_rmse < 0.002
     assert not found.crashed
@@ -66,7 +61,7 @@ def test_true_model_tracks_the_reference(name, allowed):
 
 def test_recovery_from_a_rate_of_6_rad_per_s():
     reference = control.sample(control.hover((0.0, 0.0, 3.0)), CONTROLLER, 2.0)
-    flight, found = alone(np.zeros(6), reference, control.add_body_rates(reference[0]), 0.0)
+    flight, found = alone(np.zeros(6), reference, control.add_body_rates(reference[0]), 0.0, NEVER)
     assert found.largest_error < 0.3
     assert not found.crashed
     away = np.abs(flight.x[-1] - reference[0])
@@ -82,8 +77,8 @@ def test_damping_does_not_grow_at_the_optimum():
 
 def test_observer_finds_the_wind_and_removes_its_error():
     reference = reference_of("hover")
-    _, without = alone(WIND, reference, reference[0], 0.0)
-    flight, found = alone(WIND, reference, reference[0], 10.0)
+    _, without = alone(WIND, reference, reference[0], 0.0, NEVER)
+    flight, found = alone(WIND, reference, reference[0], 10.0, NEVER)
     np.testing.assert_allclose(flight.disturbance[-1], WIND, rtol=0, atol=0.01)
     assert without.position_rmse > 0.1
     assert found.position_rmse < 0.3 * without.position_rmse
@@ -95,10 +90,10 @@ def test_vmap_equals_single_flights():
     references = jnp.stack([reference_of("hover"), reference_of("eight")])
     bandwidths = jnp.array([0.0, 10.0])
     lanes, found = jax.jit(jax.vmap(simulate, (0, 0, 0, 0, None)))(
-        winds, references, references[:, 0], bandwidths, -1.0
+        winds, references, references[:, 0], bandwidths, NEVER
     )
     for i in range(2):
-        flight, single = alone(winds[i], references[i], references[i][0], bandwidths[i])
+        flight, single = alone(winds[i], references[i], references[i][0], bandwidths[i], NEVER)
         np.testing.assert_allclose(lanes.x[i], flight.x, rtol=0, atol=2e-3)
         np.testing.assert_allclose(found.position_rmse[i], single.position_rmse, rtol=0, atol=2e-4)
 
@@ -109,7 +104,7 @@ def test_actual_cost_equals_the_predicted_one_only_for_the_true_model():
     costs = jax.jit(
         lambda flight, wind: control.open_loop_costs(plant(disturbed(BODY, wind)), flight, reference, CONTROLLER, calls)
     )
-    exact, windy = (costs(alone(wind, reference, reference[0], 0.0)[0], wind) for wind in (np.zeros(6), WIND))
+    exact, windy = (costs(alone(wind, reference, reference[0], 0.0, NEVER)[0], wind) for wind in (np.zeros(6), WIND))
     np.testing.assert_allclose(exact.actual, exact.predicted, rtol=0.01)
     assert (windy.actual > 5.0 * windy.predicted).all()
 

@@ -32,9 +32,10 @@ def test_all_that_is_written_is_the_model(tmp_path, capsys):
     ("about", "options", "message"),
     [
         ({"dt": 0.02}, ["--state-size", "12"], "field: Hybrid does not take"),
-        ({"dt": 0.02}, ["--dt", "-0.01"], "--dt must be a positive number of seconds, got -0.01"),
-        ({"dt": 0.02}, ["--dt", "0"], "--dt must be a positive number of seconds, got 0"),
-        ({"dt": 0.02}, ["--dt", "nan"], "--dt must be a positive number of seconds, got nan"),
+        *(
+            ({"dt": 0.02}, ["--dt", dt], f"--dt must be a positive number of seconds, got {dt}")
+            for dt in ("-0.01", "0", "nan")
+        ),
         ({}, [], "--dt is needed"),
     ],
     ids=str,

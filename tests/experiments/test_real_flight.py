@@ -35,11 +35,6 @@ ROOT = Path(__file__).parents[2]
 REAL = Path(os.environ.get("HYBRID_JAX_FLIGHTS", ROOT.parent / "shared" / "flights"))
 MODEL = VehicleModel(IRIS, learn=LEARN)
 
-needs_flights = pytest.mark.skipif(
-    not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder"
-)
-
-
 CASES = {
     "by flight": ({}, None),
     "by manoeuvre": ({"folds_by": "manoeuvre", "validate_by": "manoeuvre"}, None),
@@ -209,7 +204,7 @@ def test_points_are_centred_at_their_number_of_windows(sizes):
         np.testing.assert_array_less(1.04, [places.min() / axes.get_xlim()[0], axes.get_xlim()[1] / places.max()])
 
 
-@needs_flights
+@pytest.mark.skipif(not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
 @pytest.mark.parametrize(
     ("name", "by", "count"), [("crazyflie_payload/payload", "flight", 3), ("nanodrone/train", "manoeuvre", 3)]
 )
@@ -224,6 +219,7 @@ def test_folds_of_real_flights_share_no_sample(name, by, count):
         assert not (train | validation) & test
 
 
+@pytest.mark.slow
 def test_programs_of_the_previous_fold_are_freed(monkeypatch):
     """Otherwise many folds need more memory maps than Linux gives a process."""
     kept, twice = [], jax.jit(lambda x: 2 * x)

@@ -50,6 +50,7 @@ SMALL = Vehicle(
 )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_small_vehicle_flies_as_well_as_the_iris():
     flights = fly(Domain("small", SMALL), 16, 11.0, jax.random.key(0))
     assert not gone_wrong(flights.states, SMALL).any()
