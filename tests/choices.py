@@ -1,4 +1,4 @@
-"""Which inputs and outputs of a network go together, and a few pairs in which each of them occurs."""
+"""Parameters for the slow run, and the pairs of inputs and outputs of a network, of which few are not for it alone."""
 
 import pytest
 
@@ -11,3 +11,8 @@ FEW = [pair for pair in PAIRS if "all" in pair or pair == ("body", "motion")]
 def mostly_slow(pairs):
     """Parameters of a test, slow but for those of a few pairs."""
     return [pytest.param(*pair, marks=[pytest.mark.slow] * (pair not in FEW)) for pair in pairs]
+
+
+def slow(*values):
+    """Parameters of a test for the slow run alone."""
+    return [pytest.param(value, marks=pytest.mark.slow) for value in values]

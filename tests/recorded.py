@@ -32,7 +32,6 @@ OTHERS = flights([f"/more/{kind}_run4.csv" for kind in ("chirp", "random", "squa
 
 
 def windows_of_fold(fold, steps, stride):
-    """Windows of training, validation and test."""
     parts = ((fold.train, stride), (fold.validation, 1), (fold.test, stride))
     return [cut_windows(logs, steps, every).windows for logs, every in parts]
 

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
 from pendulum import pendulum
 
 from hybrid_jax.dynamics.base import Hybrid
@@ -26,7 +27,6 @@ ODE_SOLVERS = (
 )
 OTHER_SOLVERS = ("EulerHeun", "ItoMilstein", "SEA", "SemiImplicitEuler", "KenCarp3", "ALIGN", "LeapfrogMidpoint")
 STEPPERS = (RK4(), diffrax.Tsit5(), IMPLICIT)
-LONG_TO_COMPILE = [pytest.param(solver, marks=pytest.mark.slow) for solver in STEPPERS[1:]]
 
 
 @pytest.fixture(scope="module")
@@ -108,7 +108,7 @@ def test_a_program_does_not_grow_with_its_substeps(solver):
     assert abs(size(100) - size(2)) < 0.1 * size(1)  # lines are broken where names happen to be longer
 
 
-@pytest.mark.parametrize("solver", [RK4(), *LONG_TO_COMPILE], ids=lambda value: type(value).__name__)
+@pytest.mark.parametrize("solver", [RK4(), *slow(*STEPPERS[1:])], ids=lambda value: type(value).__name__)
 def test_substeps_and_their_gradient_are_those_of_steps_by_hand(solver):
     def by_hand(field):
         term, begin, end = diffrax.ODETerm(lambda t, x, held: field(x, held)), jnp.zeros(()), jnp.asarray(DT / 3)

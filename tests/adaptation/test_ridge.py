@@ -35,7 +35,6 @@ _last_layer, _linear_residual = map(eqx.filter_jit, (last_layer, linear_residual
 
 
 def source(seed=0):
-    """A hybrid whose physics is a guess and whose network is anything."""
     key = jax.random.key(seed)
     return Hybrid(perturbed(IRIS, key), residual_network(13, 4, key, hidden=6, scaling=HOVER))
 
@@ -59,7 +58,6 @@ def with_linear(field):
 
 
 def with_other_output(field):
-    """The field with its network's output layer replaced."""
     layer = (jax.random.normal(jax.random.key(8), (13, 6)), jax.random.normal(jax.random.key(9), (13,)))
 
     def where(field):

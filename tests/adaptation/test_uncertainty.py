@@ -111,7 +111,6 @@ REPEATS = 100
 
 @pytest.fixture(scope="module")
 def said_and_written(tmp_path_factory):
-    """What the command prints and writes."""
     folder, said = tmp_path_factory.mktemp("runs"), io.StringIO()
     with contextlib.redirect_stdout(said):
         command.main(["--repeats", str(REPEATS), "--out", str(folder)])
@@ -120,7 +119,6 @@ def said_and_written(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def rows(said_and_written):
-    """Its rows, by case, noise and parameter."""
     return {(row["case"], row["noise_on"], row["parameter"]): row for row in said_and_written[1]["rows"]}
 
 

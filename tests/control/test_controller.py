@@ -36,7 +36,6 @@ def hybrid(i):
 
 @pytest.fixture(scope="module")
 def still():
-    """A state of hover and the reference to stay there."""
     reference = sample(hover((1.0, -2.0, 3.0)), CONTROLLER, 0.01)
     return reference[0], CONTROLLER.horizon(reference, 0)
 

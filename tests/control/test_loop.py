@@ -1,20 +1,20 @@
 """Laws of the closed loop, with a rigid body as the plant."""
 
 from functools import cache
-from pathlib import Path
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
+from smoke import ROOT
 
 import hybrid_jax as hj
 from hybrid_jax import control
 from hybrid_jax.control.cost import plan_cost
 from hybrid_jax.dynamics.disturbance import disturbed
 
-ROOT = Path(__file__).parents[2]
 CONTROLLER = control.Controller(hj.IRIS)
 BODY = hj.rigid_body(hj.IRIS)
 WIND = np.array([0.0, -4 / 1.5, 0.0, 0.0, 0.0, 0.0], np.float32)  # m/s²: the mean of experiment 2's
@@ -52,7 +52,6 @@ def reference_of(name):
 
 @pytest.mark.parametrize(("name", "allowed"), [*zip(PATHS, (0.001, 0.001, 0.005, 0.002), strict=True)])
 def test_true_model_tracks_the_reference(name, allowed):
-    """Within 1 mm at hover and 3.5 m/s, 5 mm at 6 m/s, 2 mm in a low pass: plans step by 50 ms, the plant by 10 ms."""
     _, found = alone(np.zeros(6), reference_of(name), reference_of(name)[0], 0.0, NEVER)
     assert found.position_rmse < allowed
     assert found.yaw_rmse < 0.002
@@ -164,9 +163,7 @@ def test_invalid_arguments_are_refused():
             control.fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
-@pytest.mark.parametrize(
-    "evaluate", [jax.eval_shape, pytest.param(lambda both, *x: jax.jit(both)(*x), marks=pytest.mark.slow)]
-)
+@pytest.mark.parametrize("evaluate", [jax.eval_shape, *slow(lambda both, *x: jax.jit(both)(*x))])
 @pytest.mark.parametrize(("start", "wanted"), [(np.float32, np.float64), (np.float64, np.float32)])
 def test_mixed_precision_is_promoted(start, wanted, evaluate):
     with jax.enable_x64(True):

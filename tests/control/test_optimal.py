@@ -62,7 +62,6 @@ def test_cold_start_converges(name):
 
 
 def test_one_iteration_per_call_is_enough():
-    """0.2 s after an initial rate of 6 rad/s, from the plan of the previous call."""
     still = reference_of("still")[:20]
     x, plan = add_body_rates(still[0]), CONTROLLER.begin()
     for _ in range(20):

@@ -16,7 +16,6 @@ ARRAYS = {
 
 
 def saved(folder, count):
-    """Checkpoints of that many saves, each with its number."""
     checkpoints = Checkpoints(folder)
     for number in range(1, count + 1):
         checkpoints.save({"number": number}, ARRAYS)

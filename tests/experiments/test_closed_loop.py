@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
 from rich.console import Console
 from smoke import command, experiments
 
@@ -47,10 +48,7 @@ def network(inputs="all"):
     return jax.tree.map(moved, made, is_leaf=lambda node: isinstance(node, BatchNorm))
 
 
-WITHOUT_WIND = [pytest.param(domain, marks=pytest.mark.slow) for domain in (SOURCE, PARAMETER_SHIFT)]
-
-
-@pytest.mark.parametrize("domain", [EXTERNAL_FORCE, *WITHOUT_WIND], ids=lambda domain: domain.name)
+@pytest.mark.parametrize("domain", [EXTERNAL_FORCE, *slow(SOURCE, PARAMETER_SHIFT)], ids=lambda domain: domain.name)
 def test_true_field_equals_the_simulator_in_the_mean_wind(domain):
     rng = np.random.default_rng(0)
     x = rng.normal(size=(5, 13)).astype(np.float32)

@@ -75,7 +75,6 @@ def place(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def whole(place):
-    """The rows of a run that nothing interrupted."""
     done = place.run()
     assert done.returncode == 0, done.stderr
     assert place.read("run.json")["state"] == "finished"

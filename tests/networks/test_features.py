@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from choices import PAIRS, mostly_slow
+from choices import PAIRS, mostly_slow, slow
 
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.dynamics import base
@@ -39,7 +39,6 @@ def view(inputs="all", outputs="all", **options):
 
 
 def samples(count=7, seed=0):
-    """States and inputs as columns."""
     rng = np.random.default_rng(seed)
     x = rng.normal(size=(13, count)) * 2
     x[QUATERNION] /= np.linalg.norm(x[QUATERNION], axis=0)
@@ -223,7 +222,7 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
 
 
-@pytest.mark.parametrize("norm", ["batch", *(pytest.param(norm, marks=pytest.mark.slow) for norm in ("layer", "none"))])
+@pytest.mark.parametrize("norm", ["batch", *slow("layer", "none")])
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()

@@ -41,5 +41,4 @@ SPLITS = {"train": SplitSpec(200, 10), "test": SplitSpec(30, 100)}
 
 @pytest.fixture(scope="session")
 def source():
-    """A small dataset of the source domain."""
     return make_dataset(SOURCE, SPLITS, seed=3)

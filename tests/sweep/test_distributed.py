@@ -109,7 +109,6 @@ def numbers(row):
 
 
 def test_two_processes_find_the_rows_of_one_and_only_the_first_writes(alone, tmp_path):
-    """Bit for bit; the second has neither the flights nor a sweep in its cache, nor makes any."""
     where = address()
     caches = with_flights(alone, tmp_path / "cache"), tmp_path / "other"
     both = [

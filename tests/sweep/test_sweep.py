@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from choices import slow
 from pendulum import DAMPING, pendulum, swings
 from smoke import script
 
@@ -71,16 +72,14 @@ def test_a_lane_is_a_run_by_the_plain_function(final):
         np.testing.assert_allclose(here.field.log_length, alone.field.log_length, rtol=0, atol=1e-5)
 
 
-@pytest.mark.parametrize(
-    "solver", [diffrax.Heun(), pytest.param(diffrax.Tsit5(), marks=pytest.mark.slow)], ids=["heun", "tsit5"]
-)
+@pytest.mark.parametrize("solver", [diffrax.Heun(), *slow(diffrax.Tsit5())], ids=["heun", "tsit5"])
 def test_a_sweep_trains_through_the_solvers_of_diffrax(solver, final):
     other = swept(starts(), PLANS, settings=Settings(batch_size=BATCH, solver=solver))
     # The steps of 0.05 are short, so that the solver's error is all that is between them.
     np.testing.assert_allclose(other.field.log_length, final.field.log_length, rtol=0, atol=0.02)
 
 
-@pytest.mark.parametrize("width", [2, pytest.param(3, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("width", [2, *slow(3)])
 def test_lanes_that_share_a_chunk_are_the_same_runs(width, final):
     together = swept(starts(), PLANS, width=width)
     np.testing.assert_array_equal(together.status, final.status)
@@ -130,7 +129,7 @@ def test_sweeps_of_fewer_lanes_and_windows_share_a_program(caplog):
         np.testing.assert_allclose(error, evaluate(other.best, VALIDATION, 2, own), rtol=1e-4)
 
 
-@pytest.mark.parametrize("listed", [3, 40, pytest.param(1000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("listed", [3, 40, *slow(1000)])
 def test_minibatches_are_of_the_lanes_windows_however_many_are_listed(listed):
     subset, key = np.random.default_rng(0).permutation(listed), jax.random.key_data(jax.random.key(1))
     for n in {1, listed // 8, listed // 8 + 1, listed} - {0}:

@@ -100,8 +100,6 @@ def test_running_statistics_move_while_a_part_with_rate_zero_does_not(hybrid):
 
 
 class Dragged(AbstractVectorField):
-    """The rigid body with drag, −0.3 v [m/s²]."""
-
     body: AbstractVectorField
 
     def __call__(self, x, u):
