@@ -59,7 +59,7 @@ def path_of(solver=None, substeps=1, torques=TORQUES, dt=DT):
     return np.asarray(_path(jnp.asarray(torques), dt, solver, substeps))
 
 
-@pytest.mark.parametrize(("name", "order"), zip(SOLVERS, (4, 2, 2, 5, 5), strict=True))
+@pytest.mark.parametrize(("name", "order"), [*zip(SOLVERS, (4, 2, 2, 5, 5), strict=True)])
 def test_order_of_convergence_of_every_named_solver(name, order, reference):
     finer = np.array([4, 8, 16])
     paths = [path_of(SOLVERS[name], torques=np.repeat(TORQUES, n, axis=0), dt=DT / n)[n - 1 :: n] for n in finer]
