@@ -21,7 +21,7 @@ from experiments.reporting.tables import print_tables, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
 from experiments.runner.progress import Line
-from hybrid_jax import rotation
+from hybrid_jax import checks, rotation
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -195,7 +195,7 @@ def _repeats(
 def experiment(config: Config) -> None:
     """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
     folder = config.out / NAME
-    command.check_folder("--out", folder)
+    checks.writable_folder("--out", folder)
     rows = coverage(config, Console(stderr=True))
     write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": rows.rows}))
     columns = {

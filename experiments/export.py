@@ -51,7 +51,7 @@ def export(config: Config) -> None:
     if dt is None:
         raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
     checks.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
-    command.check_folder("--out", config.out)
+    checks.writable_folder("--out", config.out)
     sizes: dict[str, Any] = {"state_size": config.state_size, "input_size": config.input_size}
     options = sizes | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
     written = [config.out / "field.npz", config.out / "step.npz"]
