@@ -25,7 +25,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.control import Controller

@@ -24,7 +24,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly

@@ -23,7 +23,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.results import Results
 from experiments.reporting.stats import spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.flights.consistency import FAILS
 from hybrid_jax.flights.windows import flight_of

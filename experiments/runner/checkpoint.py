@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from experiments.runner.environment import PACKAGES
+from experiments.runner.run_record import PACKAGES
 from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path

@@ -9,10 +9,9 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
-from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
-from experiments.runner.run_record import require_same
+from experiments.runner.run_record import PACKAGES, require_same
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
 from hybrid_jax.io.files import backup_path
