@@ -9,19 +9,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.results import (
-    LEARNED,
-    ORACLE,
-    REFERENCES,
-    SOURCES,
-    UNCHANGED,
-    Agent,
-    away,
-    gaps,
-    uncrashed,
-)
-from experiments.reporting.claims import Claim, Inconclusive, all_of
-from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
+from experiments.closed_loop.results import LEARNED, ORACLE, REFERENCES, SOURCES, Agent, away, gaps, uncrashed
+from experiments.reporting.claims import Claim, Inconclusive, Part, all_of
+from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
 from experiments.reporting.results import Results
 from experiments.reporting.stats import mean_difference
 
@@ -67,9 +57,6 @@ class Evidence:
         """What an agent flew at home under the parameter shift."""
         own = self.group(agent, PARAMETER_SHIFT)["reference"]
         return [name for name in REFERENCES if name in own]
-
-
-Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
 
 
 def claims(few: int) -> list[Claim[Evidence]]:

@@ -16,17 +16,8 @@ from matplotlib.lines import Line2D
 
 from experiments.closed_loop.claims import COST_TOLERANCE
 from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
-from experiments.reporting.plots import (
-    COLOURS,
-    STYLE,
-    Line,
-    error_legend,
-    error_panel,
-    legend_below,
-    name_lines,
-    note,
-    tick_errors,
-)
+from experiments.reporting import plots
+from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note
 from experiments.reporting.results import Results
 from experiments.reporting.stats import Interval
 
@@ -63,11 +54,11 @@ def errors(rows: Results, domain: str, ablation: bool = False) -> Figure:
         drawn = {agent: np.maximum(100 * own.numbers(ERROR), SMALLEST_ERROR) for agent, own in group.items()}
         marks = {ORACLE: "the true vehicle as its own model"}
         lines = [Line(label(a), values, COLOURS_OF[a.model], marks.get(a, "")) for a, values in drawn.items()]
-        error_panel(axes, lines, REFERENCES[reference] + away(distance))
+        plots.error_panel(axes, lines, REFERENCES[reference] + away(distance))
         axes.set_xlabel(XLABEL)
     note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
     title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
-    return error_legend(figure, title, any(rows["crashed"]))
+    return plots.error_legend(figure, title, any(rows["crashed"]))
 
 
 @mpl.rc_context(STYLE)
@@ -164,7 +155,7 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, 
     finite = [max(value, SMALLEST_ERROR) for value in values if math.isfinite(value)] or [1.0]
     edge = max(finite) * 1.8
     axes.set(xscale="log", xlim=(min(finite) / 1.4, edge), xlabel=XLABEL)
-    tick_errors(axes.xaxis, *axes.get_xlim())
+    plots.tick_errors(axes.xaxis, *axes.get_xlim())
     name_lines(axes, [agent.name for agent in means])
     for y, (agent, (here, error)) in enumerate(means.items()):
         start, end = max(here, SMALLEST_ERROR), min(max(error, SMALLEST_ERROR), edge)

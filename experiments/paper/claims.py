@@ -9,7 +9,7 @@ from typing import Any
 
 from experiments.paper.lanes import DOMAINS, cells, gain
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, all_of, evaluate
+from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, all_of, evaluate
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
 from experiments.reporting.results import Results
 from experiments.reporting.stats import Spread
@@ -55,7 +55,6 @@ class Evidence:
         return self.rows(model, n).spread(gain).mean
 
 
-Part = tuple[bool, str]  # whether a claim holds in one case, and the numbers behind that
 Predicate = Callable[[Evidence], Iterator[Part]]
 
 

@@ -5,16 +5,8 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner.options import (
-    Count,
-    CountFromZero,
-    NotNegative,
-    Positive,
-    Run,
-    check_numbers,
-    distinct,
-    factors,
-)
+from experiments.runner import options
+from experiments.runner.options import Count, CountFromZero, NotNegative, Positive, Run, check_numbers, distinct
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
@@ -139,9 +131,8 @@ class Config(Run):
     def __post_init__(self):
         Run.__post_init__(self)
         check_numbers("--", self)
-        factors("--guess", self.guess)
-        if not self.sizes or len({*self.sizes}) < len(self.sizes):
-            raise ValueError(f"--sizes must be at least one, each different, got {self.sizes}")
+        options.factors("--guess", self.guess)
+        distinct("--sizes", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")

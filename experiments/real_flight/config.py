@@ -117,7 +117,7 @@ class RealFlightConfig(Run):
         check_numbers("--", self)
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):
-            distinct(f"--{name}", tuple(map(str, getattr(self, name))))
+            distinct(f"--{name}", getattr(self, name))
         if min(self.n) < self.batch_size:
             raise ValueError(f"--n must each be at least --batch-size {self.batch_size}, got {self.n}")
         if self.learn is not None:

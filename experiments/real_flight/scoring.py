@@ -26,7 +26,7 @@ from experiments.real_flight.logs import non_overlapping
 from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate
+from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
@@ -198,7 +198,7 @@ def verdicts(rows: Results) -> list[Verdict]:
 def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cells]:
     """Claim that a cell has a smaller error than each of the others, in every quantity and at every horizon."""
 
-    def predicate(found: Cells) -> tuple[bool, str]:
+    def predicate(found: Cells) -> Part:
         known = [found[other] for other in others if other in found]
         if not known:
             raise Inconclusive("none of these was run")

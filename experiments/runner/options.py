@@ -76,8 +76,8 @@ def _rules(hint: Any) -> list[Any]:
     return own + [rule for part in get_args(hint) for rule in _rules(part)]
 
 
-def distinct(option: str, names: Sequence[str]) -> None:
-    """Raise ValueError if an option lists no names, or one twice."""
+def distinct(option: str, names: Sequence[Any]) -> None:
+    """Raise ValueError if an option lists nothing, or something twice."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
 
