@@ -70,11 +70,11 @@ def least_squares(source: AbstractVectorField, method: Method, config: Config, s
 
 
 def _adapt(start: AbstractVectorField, config: Config, stages: Stages, fit: Callable[[Dataset], Fit]) -> Trained:
-    sizes, _ = study.places(config.sizes, config)
-    found = {}
+    found, seeds = {}, config.seeds
     for domain in DOMAINS:
         fields = fit(study.flown(domain, study.target_splits(config), config, stages)).fields
-        found |= {(domain.name, n): lane(fields, np.flatnonzero(np.equal(sizes, n))) for n in config.sizes}
+        for i, n in enumerate(config.sizes):
+            found[domain.name, n] = lane(fields, np.arange(i * seeds, (i + 1) * seeds))
     return Trained(start, found)
 
 

@@ -58,19 +58,20 @@ def lanes_of(
     domain: str,
     model: str,
     mode: str,
-    where: tuple[Sequence[int], Sequence[int]],
+    sizes: Sequence[int],
     fit: Fit,
     errors: np.ndarray,
     theta: Mapping[str, np.ndarray] | None = None,
     intervals: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Models tested in a domain: their sizes and seeds (see `study.places`), and L^T_MSE on the test flights.
+    """Models tested in a domain, one for each size and, in it, seed.
 
     Args:
+        errors: L^T_MSE on the test flights.
         theta: name → the value of each, instead of that in the models.
         intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
     """
-    theta = theta_of(fit.fields) if theta is None else theta
+    theta, seeds = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
 
     def row(i: int) -> Row:
         ends = {name: pair[i] for name, pair in (intervals or {}).items()}
@@ -80,8 +81,8 @@ def lanes_of(
             "domain": domain,
             "model": model,
             "mode": mode,
-            "n_train": int(where[0][i]),
-            "seed": int(where[1][i]),
+            "n_train": sizes[i // seeds],
+            "seed": i % seeds,
             "test_mse": float(errors[i]),
             "rho": None,  # see `with_rho`
             "val_mse": float(fit.val_mse[i]),

@@ -9,10 +9,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.conditions import adaptation, settings
+from experiments.paper.conditions import adaptation, settings, subsets
 from experiments.paper.config import Config
 from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, physics_in, source_of, theta_of
-from experiments.paper.study import SOLVED, domain_name, places, solved, subsets
+from experiments.paper.study import SOLVED, solved
 from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import covariance_of, intervals
@@ -47,7 +47,7 @@ class Case:
     @property
     def name(self) -> str:
         """The target domain."""
-        return domain_name(self.target)
+        return self.target.config["domain"]
 
     def tested(self, name: str, fields: Any) -> np.ndarray:
         """L^T_MSE of stacked fields on the steps after the past."""
@@ -59,7 +59,7 @@ def source_only(case: Case, model: str) -> Lanes:
     """A pre-trained model, unchanged."""
     fit, mode = case.pretrained[model], names.SOURCE_ONLY
     errors = case.tested(f"{mode} {model}", fit.fields)
-    return lanes_of(case.name, model, mode, places((0,), case.config), fit, errors)
+    return lanes_of(case.name, model, mode, (0,), fit, errors)
 
 
 def adapted(case: Case, method: Method) -> Lanes:
@@ -79,7 +79,7 @@ def adapted(case: Case, method: Method) -> Lanes:
         fit = fit._replace(fields=unfreeze(fit.fields))
     errors = case.tested(method, fit.fields)
     known = _intervals_of(case, method, fit.fields)
-    return lanes_of(case.name, method, mode, places(config.sizes, config), fit, errors, intervals=known)
+    return lanes_of(case.name, method, mode, config.sizes, fit, errors, intervals=known)
 
 
 def _augmented(case: Case) -> Lanes:
@@ -91,8 +91,7 @@ def _augmented(case: Case) -> Lanes:
         return jax.device_get(_encoded(experts.fields, windows, settings(case.config).solver))
 
     errors, physics = case.stages.timed(f"test {name} {case.name}", test)
-    where = places((0,), case.config)
-    return lanes_of(case.name, name, names.SOURCE_ONLY, where, experts, errors, theta_of(physics))
+    return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), experts, errors, theta_of(physics))
 
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
@@ -118,7 +117,7 @@ def _intervals_of(case: Case, method: Method, fields: Any) -> Mapping[str, np.nd
 
     def of_size(index: int, size: int):
         own = lane(fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
-        return jax.device_get(_intervals((own, subsets(size, config)), pool, settings(config).solver))
+        return jax.device_get(_intervals((own, subsets(config)[:, :size]), pool, settings(config).solver))
 
     parts = case.stages.timed(
         f"intervals {method} {case.name}", lambda: [of_size(index, size) for index, size in enumerate(config.sizes)]
