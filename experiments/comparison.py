@@ -77,7 +77,6 @@ PRESETS = {
 
 
 def experiment(config: ComparisonConfig, console: Console) -> None:
-    """Run all methods in both domains and write the report."""
     stages = stages_of(config, console)
     learned, experts = source_models(config, stages)
     out, rows, flights = config.out / NAME, Results(), dict[str, Any]()

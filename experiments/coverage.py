@@ -211,6 +211,5 @@ def experiment(config: Config) -> None:
 
 main = partial(command.call, NAME, Config, experiment)
 
-
 if __name__ == "__main__":
     main()

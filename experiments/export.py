@@ -45,7 +45,6 @@ class Config:
 
 
 def export(config: Config) -> None:
-    """Write the files; print their paths."""
     model = load(config.model)
     dt = model.about.get("dt") if config.dt is None else config.dt
     if dt is None:
@@ -66,7 +65,6 @@ def export(config: Config) -> None:
 
 
 main = partial(command.call, NAME, Config, export)
-
 
 if __name__ == "__main__":
     main()

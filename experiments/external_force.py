@@ -17,6 +17,7 @@ from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
 from hybrid_jax.vehicle import IRIS
 
 NAME = "external_force"
+ABOUT = "A side wind that no source flight had: adapt to it."
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:
@@ -34,7 +35,6 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
 FLOOR = sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))  # on test flights
 
 
-ABOUT = "A side wind that no source flight had: adapt to it."
 main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, EXTERNAL_FORCE, FLOOR), presets=PRESETS)
 
 if __name__ == "__main__":

@@ -11,8 +11,6 @@ from experiments.runner import command
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 
 NAME = "param_shift"
-
-
 ABOUT = "The vehicle's roll and pitch inertia change: adapt to it."
 main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, PARAMETER_SHIFT, 0.0), presets=PRESETS)
 

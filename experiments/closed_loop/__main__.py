@@ -72,7 +72,6 @@ unchanged vehicle, on which the source networks were trained.
 
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
-    """Train, fly and write the report."""
     training: Training = {}
     trained = train_all(config, console, training)
     flown = fly_models(config, trained, console)
@@ -82,7 +81,6 @@ def experiment(config: ClosedLoopConfig, console: Console) -> None:
 
 
 def train_one(console: Console, training: Training, name: str, model: str, config: Config) -> Trained:
-    """Train a model and record its stages."""
     console.print(name, style="bold", highlight=False)
     training[name] = stages_of(config, console)
     return models.train(model, config, training[name])
@@ -127,7 +125,6 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
 
 
 def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
-    """Fly scenarios with one controller, or find them in the cache."""
     return flights.flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
 
 
@@ -147,7 +144,6 @@ def write(
     ablation: Sequence[Flown],
     training: Training,
 ) -> None:
-    """Write the report and its figures, and print the tables."""
     out, few, every, timed = config.out / NAME, min(config.sizes), [*flown, *ablation], speeds(config, trained)
     rows, ablated, call = results_of(flown), results_of(ablation), timed[Agent("hybrid", few).name]
     count = sum(len(each.scenario.keys()) for each in every)

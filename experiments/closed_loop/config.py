@@ -77,7 +77,6 @@ class ClosedLoopConfig(Config):
 
     @property
     def flown_away(self) -> tuple[Reference, ...]:
-        """References flown away from home."""
         if self.away_references is not None:
             return self.away_references
         return tuple(name for name in ABLATED if name in self.references)
@@ -102,7 +101,6 @@ class ClosedLoopConfig(Config):
         )
 
     def ablated(self) -> Config:
-        """The configuration that trains the ablation's networks."""
         return self._limited(self.ends[:1], self.ablation_source, self.ablation_epochs)
 
     def _limited(self, sizes: tuple[int, ...], source: int, epochs: int) -> Config:

@@ -43,7 +43,8 @@ def paths(
         view = VIEWS.get(reference, TOP_VIEW)
         left.plot(*wanted[:, view].T, color="0.6", linestyle="--", linewidth=2.5, label="reference")
         for agent, states in flown.items():
-            style = {"color": COLOURS_OF[agent.model], "linestyle": _dash(agent), "label": agent.name}
+            dash = ":" if agent.observer else "-" if agent.n_train or agent.model in KNOWN else "--"
+            style = {"color": COLOURS_OF[agent.model], "linestyle": dash, "label": agent.name}
             left.plot(*states[:, POSITION][:, view].T, linewidth=1.2, **style)
             error = 100 * np.linalg.norm(states[:, POSITION] - wanted, axis=1)
             smallest = np.fmin(smallest, np.nanmin(error))
@@ -116,7 +117,3 @@ def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:
         return
     (x, y), half = (low + high) / 2, max(0.6, 0.62 * (high - low).max())
     axes.set(xlim=(x - half, x + half), ylim=(y - 0.6 * half, y + 0.6 * half), aspect="equal")
-
-
-def _dash(agent: Agent) -> str:
-    return ":" if agent.observer else "-" if agent.n_train or agent.model in KNOWN else "--"

@@ -41,7 +41,6 @@ class Agent:
 
     @property
     def name(self) -> str:
-        """Label in tables and figures."""
         size = f"N = {self.n_train}" if self.n_train else "source"
         name = KNOWN[self.model] if self.model in KNOWN else f"{LEARNED[self.model]}, {size}"
         return (f"{self.variant}, {name}" if self.variant else name) + (" + observer" if self.observer else "")

@@ -47,11 +47,9 @@ class Evidence:
         return rows
 
     def mse(self, *cell: Any, **seeds: int) -> Spread:
-        """The spread of the test error of `rows`."""
         return self.rows(*cell, **seeds).spread("test_mse")
 
     def rho(self, model: str, n: int) -> float:
-        """The mean ρ of a fine-tuned model."""
         return self.rows(model, n).spread(gain).mean
 
 
@@ -113,9 +111,8 @@ def _falls_with_n(e: Evidence) -> Iterator[Part]:
 
 
 def _beats_source_only(e: Evidence) -> Iterator[Part]:
-    for n in e.sizes():
-        mean = e.rho(HYBRID, n)
-        yield mean > 0, f"N = {n}: ρ = {mean:.3g}"
+    means = {n: e.rho(HYBRID, n) for n in e.sizes()}
+    return ((mean > 0, f"N = {n}: ρ = {mean:.3g}") for n, mean in means.items())
 
 
 def _pretraining_helps_when_small(e: Evidence) -> Iterator[Part]:

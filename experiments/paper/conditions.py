@@ -36,7 +36,6 @@ PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range
 
 
 def settings(config: Config) -> Settings:
-    """The settings that all runs of the experiment share."""
     return Settings(config.batch_size, REGULARISERS.get(config.regulariser), SOLVERS[config.solver])
 
 

@@ -157,7 +157,6 @@ class Config(Run):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def pooled(self) -> int:
-        """The number of target trajectories from which a seed draws."""
         return max(self.sizes) if self.pool is None else self.pool
 
 

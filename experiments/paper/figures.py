@@ -65,7 +65,12 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     figure = Figure(figsize=(9, 4.1), layout="constrained")
     panels = figure.subplots(1, len(THETA))
     for axes, name in zip(panels, THETA, strict=True):
-        _draw_biases(axes, _curves(known, lambda row, name=name: _bias(row, name, truth)))
+
+        def bias(row: Row, name: str = name) -> float:
+            value = row["theta"][name]
+            return math.inf if value is None else 100 * (value / truth[name] - 1)
+
+        _draw_biases(axes, _curves(known, bias))
         axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
         axes.set_xticks(sizes, [str(n) for n in sizes])
     panels[0].set_ylabel("recovered / true − 1  [%]")
@@ -194,9 +199,3 @@ def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, co
         box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5}
         style = {"va": align, "fontsize": 8, "color": colour, "bbox": box, "zorder": 6}
         axes.annotate(words, (at, y), offset, textcoords="offset points", **style)
-
-
-def _bias(row: Row, name: str, truth: Mapping[str, float]) -> float:
-    """recovered / true − 1 [%]."""
-    value = row["theta"][name]
-    return math.inf if value is None else 100 * (value / truth[name] - 1)

@@ -50,7 +50,6 @@ class Lanes:
 
 
 def fit_of(final: FitState) -> Fit:
-    """The best models of a sweep."""
     return Fit(final.best, final.best_mse, final.epoch, final.status)
 
 
@@ -107,7 +106,6 @@ def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
 
 
 def rows_of(groups: Sequence[Lanes]) -> Results:
-    """The rows of all models, with ρ."""
     return with_rho(Results([row for lanes in groups for row in lanes.rows], TAGS))
 
 

@@ -46,7 +46,6 @@ class Case:
 
     @property
     def name(self) -> str:
-        """The target domain."""
         return self.target.config["domain"]
 
     def tested(self, name: str, fields: Any) -> np.ndarray:
@@ -56,7 +55,6 @@ class Case:
 
 
 def source_only(case: Case, model: str) -> Lanes:
-    """A pre-trained model, unchanged."""
     fit, mode = case.pretrained[model], names.SOURCE_ONLY
     errors = case.tested(f"{mode} {model}", fit.fields)
     return lanes_of(case.name, model, mode, (0,), fit, errors)

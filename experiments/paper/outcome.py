@@ -108,7 +108,6 @@ def paper_report(
 
 
 def introduction(experiment: str, rows: Results) -> str:
-    """Title and introduction of a report, Markdown."""
     domains = list(by_domain(rows))
     sizes = ", ".join(str(n) for n in sorted({*rows["n_train"]} - {0})) or "none"
     where = f" in each of {len(domains)} targets ({', '.join(map(label, domains))})" if len(domains) > 1 else ""

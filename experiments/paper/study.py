@@ -167,7 +167,6 @@ def flown(
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
-    """The splits of the source."""
     return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
 
 

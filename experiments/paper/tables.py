@@ -158,7 +158,6 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
 
 
 def value_label(row: Row) -> str:
-    """The value of an ablation, the default marked."""
     return f"{row['value']} (default)" if row["default"] else row["value"]
 
 

@@ -65,7 +65,6 @@ def split_lists(arguments: Sequence[str]) -> list[str]:
 
 
 def run(config: RealFlightConfig, console: Console) -> None:
-    """Run the experiment from the logs to the report."""
     experiment = prepare(config, console)
     outputs = run_folds(experiment)
     if hosts.is_main_process():
@@ -73,7 +72,6 @@ def run(config: RealFlightConfig, console: Console) -> None:
 
 
 def prepare(config: RealFlightConfig, console: Console) -> Experiment:
-    """Load the vehicle and all logs, and check them."""
     path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
     folders = {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:

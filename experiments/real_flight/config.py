@@ -127,7 +127,6 @@ class RealFlightConfig(Run):
 
     @property
     def longest(self) -> int:
-        """Intervals per test window."""
         return max(*self.horizon, NANODRONE_STEPS if self.protocol == "nanodrone" else 1)
 
     @property

@@ -73,7 +73,6 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
 
 
 def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
-    """Introduce the report to a reader who knows nothing of the experiment."""
     config, logs = experiment.config, experiment.logs
     flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
     of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
@@ -181,7 +180,6 @@ def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mappi
 
 
 def _errors(label: str) -> dict[str, Callable[[Results], str]]:
-    """The columns of a score: the error in each quantity."""
 
     def text(quantity: str, rows: Results) -> str:
         return spread_text(spread(pooled(rows, label, quantity)), ".4g", ".2g")

@@ -12,7 +12,7 @@ Columns:
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any
 
 import equinox as eqx
@@ -202,19 +202,12 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cel
         known = [found[other] for other in others if other in found]
         if not known:
             raise Inconclusive("none of these was run")
-        ratios = {
-            f"{'summed' if label == SUM else f'step {label}'} {quantity}": max(
-                _ratio(found[cell], other, label, quantity) for other in known
-            )
-            for label in score_labels(found[cell])
-            for quantity in QUANTITIES
-        }
+        ratios = {}
+        for label, quantity in product(score_labels(found[cell]), QUANTITIES):
+            own, *theirs = (float(np.mean(pooled(rows, label, quantity))) for rows in (found[cell], *known))
+            worst = max(own / other if math.isfinite(own) else math.inf for other in theirs)
+            ratios[f"{'summed' if label == SUM else f'step {label}'} {quantity}"] = worst
         words = ", ".join(f"{where} {ratio:.3f}" for where, ratio in ratios.items())
         return all(ratio < 1 for ratio in ratios.values()), f"error over that of the best of them: {words}"
 
     return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", predicate)
-
-
-def _ratio(rows: Results, others: Results, label: str, quantity: str) -> float:
-    own, other = (float(np.mean(pooled(group, label, quantity))) for group in (rows, others))
-    return own / other if math.isfinite(own) else math.inf

@@ -41,7 +41,6 @@ def all_of(parts: Iterable[Part]) -> Part:
 
 
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
-    """The verdict on each claim."""
 
     def verdict(claim: Claim[Evidence]) -> Verdict:
         try:
@@ -54,7 +53,6 @@ def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verd
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
-    """A line per claim."""
     lines = [(each.id, each.text, OUTCOMES[each.holds], each.measured) for each in verdicts]
     return Table(title, ("", "claim", "verdict", "measured"), lines)
 

@@ -46,8 +46,6 @@ FLOOR_LABEL = "floor: error that no model here can see"
 
 
 class Line(NamedTuple):
-    """A line of an error panel."""
-
     name: str
     errors: np.ndarray  # of each seed, not finite where it failed
     colour: str
@@ -55,7 +53,6 @@ class Line(NamedTuple):
 
 
 def colour(model: str) -> str:
-    """The colour that a model has in every figure."""
     return COLOURS.get(model, OTHERS)
 
 

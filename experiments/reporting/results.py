@@ -83,7 +83,6 @@ class Results:
         return self._with(sorted(self.rows, key=key))
 
     def unique(self, column: str) -> list[Any]:
-        """The different values of a column, in order of appearance."""
         return list(dict.fromkeys(self[column]))
 
     def tagged(self, **tags: Any) -> "Results":

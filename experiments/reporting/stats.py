@@ -32,7 +32,6 @@ class Interval(NamedTuple):
 
 
 def spread(values: Values) -> Spread:
-    """The spread of at least one value."""
     array = np.asarray(values, float)
     non_finite = int(np.sum(~np.isfinite(array)))
     with np.errstate(all="ignore"):

@@ -61,7 +61,6 @@ class Checkpoints:
             self._folder.rmdir()
 
     def _paths(self) -> list[Path]:
-        """From the oldest to the newest."""
         return sorted(path for path in self._folder.glob("*.npz") if path.stem.isdecimal())
 
 

@@ -56,7 +56,6 @@ class Run:
             raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
 
     def described(self) -> dict[str, Any]:
-        """The options that determine the results."""
         return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
 

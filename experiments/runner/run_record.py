@@ -76,7 +76,6 @@ def describe(config: Run) -> dict[str, Any]:
 
 
 def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Compare two records of runs."""
     before, now = (dict(leaves({name: each.get(name, {}) for name in FIXED}, ".")) for each in (old, new))
     lines = [
         f"  {name}: {before.get(name, 'absent')} → {now.get(name, 'absent')}"

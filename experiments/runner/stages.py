@@ -147,7 +147,6 @@ def stages_of(config: Run, console: Console) -> Stages:
 
 
 def summary(states: FitState) -> str:
-    """One line about a finished sweep."""
     epochs, best = states.epoch, states.best_mse.min()
     return f"{len(epochs)} runs, {epochs.min()} to {epochs.max()} epochs, best validation loss {best:.3g}"
 
@@ -157,7 +156,6 @@ def _stem(name: str) -> str:
 
 
 def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:
-    """A hash of everything that determines the result."""
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
     shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
     objective: Any = settings.objective
