@@ -1,7 +1,4 @@
-"""Ablations of the hybrid method: one choice at a time is changed, ten seeds each.
-
-python -m experiments.ablation --help
-"""
+"""Ablations of the hybrid method, one choice at a time: python -m experiments.ablation --help"""
 
 from dataclasses import dataclass, replace
 from functools import partial

@@ -1,7 +1,4 @@
-"""Table 2 and more baselines (paper, Sec. 4.7): every method adapts the same source model, in both experiments.
-
-python -m experiments.comparison --help
-"""
+"""Every method adapts the same source model (paper, Sec. 4.7, Table 2): python -m experiments.comparison --help"""
 
 from dataclasses import dataclass, field, replace
 from functools import partial

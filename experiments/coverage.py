@@ -1,7 +1,4 @@
-"""Coverage of the intervals of θ_p: how often they contain the truth, over repeated flights of a known vehicle.
-
-python -m experiments.coverage --help
-"""
+"""How often the intervals of θ_p contain the truth, over repeated flights: python -m experiments.coverage --help"""
 
 import itertools
 from dataclasses import asdict, dataclass, field

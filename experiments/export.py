@@ -1,7 +1,4 @@
-"""Export a trained model to StableHLO files and CasADi functions; see docs/export.md.
-
-python -m experiments.export --help
-"""
+"""Export a trained model to StableHLO files and CasADi functions: python -m experiments.export --help"""
 
 from dataclasses import dataclass
 from functools import partial

@@ -1,7 +1,4 @@
-"""Experiment 2 (paper, Sec. 4.5): a side wind pushes with [0, −4 + sin(2π t / 3), 0] N.
-
-python -m experiments.external_force --help
-"""
+"""Experiment 2 (paper, Sec. 4.5), a side wind of [0, −4 + sin(2π t / 3), 0] N: python -m experiments.external_force"""
 
 from functools import partial
 

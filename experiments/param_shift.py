@@ -1,7 +1,4 @@
-"""Experiment 1 (paper, Sec. 4.4): the inertia shifts, Ix 0.02912 → 0.040, Iy 0.02912 → 0.020 kg m².
-
-python -m experiments.param_shift --help
-"""
+"""Experiment 1 (paper, Sec. 4.4), Ix 0.02912 → 0.040, Iy 0.02912 → 0.020 kg m²: python -m experiments.param_shift"""
 
 from functools import partial
 

@@ -1,7 +1,4 @@
-"""Closed-loop flight with every model, before and after adaptation, as prediction model of a predictive controller.
-
-python -m experiments.closed_loop --help
-"""
+"""A predictive controller flies with every model, before and after adaptation: python -m experiments.closed_loop"""
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial

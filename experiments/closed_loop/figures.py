@@ -17,7 +17,7 @@ from matplotlib.lines import Line2D
 from experiments.closed_loop.claims import COST_TOLERANCE
 from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
 from experiments.reporting import plots
-from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note
+from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note, subplots
 from experiments.reporting.results import Results
 from experiments.reporting.stats import Interval
 
@@ -70,8 +70,7 @@ def away_from_home(rows: Results) -> Figure:
         raise ValueError("rows must not be empty: nothing was flown both at home and away from it")
     domains, references = (list(dict.fromkeys(cell[i] for cell in cells)) for i in (0, 1))
     height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(by_agent(found[cell])) for cell in cells))
-    figure = Figure(figsize=(3.6 * len(references) + 2, height), layout="constrained")
-    panels = figure.subplots(len(domains), len(references), squeeze=False, sharey="row")
+    figure, panels = subplots((3.6 * len(references) + 2, height), len(domains), len(references), sharey="row")
     smallest = math.inf
     for domain, reference, distance in cells:
         axes = panels[domains.index(domain), references.index(reference)]
@@ -115,8 +114,7 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
     found = {domain: rows.where(domain=domain, distance=0.0) for domain in DOMAINS if domain in rows["domain"]}
     if not any(agent in by_agent(group) for group in found.values() for agent in agents):
         raise ValueError("rows must hold one of the agents: there is nothing to draw")
-    figure = Figure(figsize=(4.4 * len(found) + 2.2, 4.6), layout="constrained")
-    panels = figure.subplots(1, len(found), squeeze=False, sharex=True, sharey=True)[0]
+    figure, (panels,) = subplots((4.4 * len(found) + 2.2, 4.6), 1, len(found), sharex=True, sharey=True)
     for axes, (domain, group) in zip(panels, found.items(), strict=True):
         _draw_costs(axes, group, agents)
         axes.set(title=DOMAINS[domain].capitalize(), xlabel="predicted cost of a plan", ylabel="actual cost, open loop")
@@ -140,12 +138,11 @@ def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure
     columns = 2 if count == 4 else min(count, 3)
     rows, room = -(-count // columns), 0.085 * max(map(len, labels))
     size = width * columns + room, rows * (1.0 + 0.25 * len(set(labels))) + 0.9
-    figure = Figure(figsize=size, layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for i, axes in enumerate(panels):
+    figure, panels = subplots(size, rows, columns)
+    for i, axes in enumerate(panels.flat):
         axes.tick_params(labelleft=i % columns == 0)
         axes.set_visible(i < count)
-    return figure, panels
+    return figure, list(panels.flat)
 
 
 def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, Results]) -> float:

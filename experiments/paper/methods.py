@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -85,10 +86,8 @@ def _augmented(case: Case) -> Lanes:
     name, experts, windows = names.EXPERT_AUGMENTATION, case.experts, case.target.splits["test_with_past"]
     assert experts is not None
 
-    def test():
-        return jax.device_get(_encoded(experts.fields, windows, settings(case.config).solver))
-
-    errors, physics = case.stages.timed(f"test {name} {case.name}", test)
+    encoded = partial(_encoded, experts.fields, windows, settings(case.config).solver)
+    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: jax.device_get(encoded()))
     return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), experts, errors, theta_of(physics))
 
 

@@ -1,13 +1,8 @@
-"""Test models on held-out flights: the table of results, one row for each model tested in one fold, and hypotheses.
+"""Test models on held-out flights: a row for each model tested in one fold, and hypotheses.
 
-Columns:
-
-- fold: the flights tested on; model, mode: of MODELS and MODES; n_train: target windows trained on, 0 if none; seed.
-- recipe: how the model was trained, empty for a baseline; val_loss, epochs, status: of its training.
-- windows: number of test windows.
-- scores: "10", "50", … (RMSE after so many intervals) and "sum" → quantity → error in the units of QUANTITIES.
-- theta: learned physical parameters by name in SI units, None for a model without; theta_interval: their 95 % intervals
-  [low, high], None without intervals.
+Columns besides TAGS: recipe (empty for a baseline), val_loss, epochs, status of the training; windows, how many were
+tested; scores: "10", "50", … (RMSE after so many intervals) and "sum" → quantity → error; theta: θ_p by name in SI
+units; theta_interval: their 95 % intervals [low, high]. Both are None where there are none.
 """
 
 import math

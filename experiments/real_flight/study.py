@@ -22,7 +22,6 @@ from hybrid_jax.flights.windows import count_windows, cut_windows
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
 
-
 Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 
 

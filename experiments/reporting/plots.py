@@ -56,6 +56,12 @@ def colour(model: str) -> str:
     return COLOURS.get(model, OTHERS)
 
 
+def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure [inches] and its panels, (rows, columns)."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
+
+
 def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths."""
     paths = []

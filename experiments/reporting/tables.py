@@ -61,10 +61,8 @@ def spread_text(values: Spread, form: str = ".3g", std_form: str = "", what: str
     The standard deviation has by default the format of the mean.
     """
     if values.non_finite:
-        text = (
-            f"{values.mean:{form}} ({values.non_finite} of {values.count} seeds {what}, median {values.median:{form}})"
-        )
-        return text.replace("-inf", "−∞").replace("inf", "∞")
+        of = f"{values.non_finite} of {values.count} seeds {what}"
+        return f"{values.mean:{form}} ({of}, median {values.median:{form}})".replace("-inf", "−∞").replace("inf", "∞")
     return f"{values.mean:{form}}" + ("" if math.isnan(values.std) else f" ± {values.std:{std_form or form}}")
 
 

@@ -102,9 +102,7 @@ class DeferredSignals(AbstractContextManager):
 class Autosave:
     """Save a sweep between blocks, within its share of the time, and whenever a signal is pending.
 
-    Args:
-        spent: seconds that earlier runs spent on the sweep.
-        share: largest share of the time that saving may take.
+    `spent` are the seconds that earlier runs spent on the sweep.
     """
 
     def __init__(self, checkpoints: Checkpoints, signals: DeferredSignals, name: str, spent: float, share: float):

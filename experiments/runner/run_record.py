@@ -35,9 +35,7 @@ class OtherRun(ValueError):
 
 @contextmanager
 def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
-    """Record that a run began in a folder, and at the end that it finished.
-
-    A run that ends in bad input restores the previous record.
+    """Record that a run began in a folder, and at the end that it finished; bad input restores the previous record.
 
     Raises:
         OtherRun: an unfinished run there has another configuration, other flights or other versions.

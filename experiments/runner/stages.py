@@ -31,9 +31,7 @@ Result = TypeVar("Result")
 class Stages:
     """The stages of an experiment: training sweeps cached in a folder, and the time that each stage took.
 
-    Args:
-        saving: largest share of a sweep's time spent on checkpoints.
-        fresh: move unfinished sweeps, and finished ones of other versions, to a backup and run them anew.
+    `saving` is as in `Run`; with `fresh`, unfinished sweeps, and those of other versions, are moved aside and run anew.
     """
 
     def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
