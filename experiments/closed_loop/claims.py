@@ -12,8 +12,7 @@ import numpy as np
 from experiments.closed_loop.results import LEARNED, ORACLE, REFERENCES, SOURCES, Agent, away, gaps, uncrashed
 from experiments.reporting.claims import Claim, Inconclusive, Part, all_of
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
-from experiments.reporting.results import Results
-from experiments.reporting.stats import mean_difference
+from experiments.reporting.results import Results, mean_difference
 
 THREE = ("hover", "figure_eight", "low_pass")
 WIND_FACTOR, GAP_SHARE, COST_TOLERANCE, AWAY_FACTOR = 4.0, 0.9, 0.1, 1.1

@@ -1,7 +1,7 @@
 """Options of the closed-loop experiment, and its presets."""
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
 from experiments.runner.options import Count, Positive, distinct
@@ -105,12 +105,9 @@ class ClosedLoopConfig(Config):
 
     def _limited(self, sizes: tuple[int, ...], source: int, epochs: int) -> Config:
         """The options of all experiments in simulation, so that their stages are shared, with the own rate of bias."""
-        known: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Config)}
-        known |= {"sizes": sizes, "pool": self.pooled()}
-        known |= {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
-        if self.invariant_offset is not None:
-            known["rates"] = replace(self.rates, offset=self.invariant_offset)
-        return Config(**known)
+        rates = self.rates if self.invariant_offset is None else replace(self.rates, offset=self.invariant_offset)
+        most = {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
+        return preset_like(Config, self, sizes=sizes, pool=self.pooled(), rates=rates, **most)
 
 
 PRESETS = {

@@ -11,8 +11,7 @@ from experiments.paper.lanes import DOMAINS, cells, gain
 from experiments.reporting import names
 from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, all_of, evaluate
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
-from experiments.reporting.results import Results
-from experiments.reporting.stats import Spread
+from experiments.reporting.results import Results, Spread
 
 COMPARISON = "comparison"  # the experiment on both domains (Table 2)
 DOMAINS_OF = {"param_shift": DOMAINS[:1], "external_force": DOMAINS[1:], COMPARISON: DOMAINS}

@@ -5,8 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner import options
-from experiments.runner.options import Count, CountFromZero, NotNegative, Positive, Run, check_numbers, distinct
+from experiments.runner.options import Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
@@ -130,8 +129,7 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        check_numbers("--", self)
-        options.factors("--guess", self.guess)
+        factors("--guess", self.guess)
         distinct("--sizes", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:

@@ -114,7 +114,7 @@ class RealFlightConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        check_numbers("--", self)
+
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):
             distinct(f"--{name}", getattr(self, name))

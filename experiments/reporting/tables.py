@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.reporting.results import Results
-from experiments.reporting.stats import Spread
+from experiments.reporting.results import Results, Spread
 
 EMPTY = "–"
 STYLES = {"✓ holds": "green", "✗ fails": "bold red"}
