@@ -60,7 +60,7 @@ class Evidence:
 
 def claims(few: int) -> list[Claim[Evidence]]:
     """All hypotheses, those on a model for each of SOURCES; `few` is the smallest N."""
-    made = [Claim(id, text, lambda e, fast=fast: fast(e.speed)) for id, text, fast in SPEED_CLAIMS]
+    made: list[Claim[Evidence]] = [Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
         own = partial(parts, Agent(SOURCES[model]), Agent(model, few))
         made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", lambda e, own=own: all_of(own(e))))

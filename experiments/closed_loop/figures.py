@@ -101,7 +101,7 @@ def shares(rows: Results, domain: str) -> Figure:
             axes.axvline(x, color="0.4", linestyle=":", linewidth=1)
             axes.text(x, -0.66, words, fontsize=7, color="0.4", ha="center", va="bottom")
         for y, (agent, line) in enumerate(found.items()):
-            _draw_share(axes, y, line.get(name, Interval(*[math.nan] * 3)), COLOURS_OF[agent.model])
+            _draw_share(axes, y, line.get(name, Interval()), COLOURS_OF[agent.model])
     what = "share of the gap from source to true vehicle (bar: 95 %; hollow: gap not significant)"
     figure.suptitle(f"{DOMAINS[domain].capitalize()}: {what}", fontsize=12)
     return figure
