@@ -25,6 +25,7 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
+from hybrid_jax import checks
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import json_text, write_atomic
 from hybrid_jax.runtime import PROGRAMS, configure, cores, hardware
@@ -212,22 +213,13 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
 
 
 def check_file(option: str, file: Path | None) -> None:
-    """Create the folder of a file to write and check that it can be written, before work begins.
+    """Require a file that can be written, before work begins; its folder is created."""
 
-    Raises:
-        ValueError: the file is a folder, or its folder cannot be created or written.
-    """
     if file is None:
         return
     if file.is_dir():
         raise ValueError(f"{option} {file}: is a folder, a file is needed")
-    probe = file.parent / f".writable.{os.getpid()}"
-    try:
-        file.parent.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"{option} {file.parent}: cannot be written: {error.strerror}") from error
+    checks.writable_folder(option, file.parent)
 
 
 def _end(name: str, error: Exception, code: int):

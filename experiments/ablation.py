@@ -1,7 +1,4 @@
-"""Ablations of the hybrid method: one choice at a time is changed, ten seeds each.
-
-python -m experiments.ablation --help
-"""
+"""Ablations of the hybrid method, one choice at a time: python -m experiments.ablation --help"""
 
 from dataclasses import dataclass, replace
 from functools import partial
@@ -21,7 +18,7 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import print_tables
 from experiments.runner import command
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE

@@ -1,7 +1,4 @@
-"""Table 2 and more baselines (paper, Sec. 4.7): every method adapts the same source model, in both experiments.
-
-python -m experiments.comparison --help
-"""
+"""Every method adapts the same source model (paper, Sec. 4.7, Table 2): python -m experiments.comparison --help"""
 
 from dataclasses import dataclass, field, replace
 from functools import partial
@@ -20,7 +17,7 @@ from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
-from experiments.paper.study import adaptation_splits, flown, pretrained, source_splits
+from experiments.paper.study import flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
@@ -77,12 +74,12 @@ PRESETS = {
 
 
 def experiment(config: ComparisonConfig, console: Console) -> None:
-    """Run all methods in both domains and write the report."""
     stages = stages_of(config, console)
     learned, experts = source_models(config, stages)
     out, rows, flights = config.out / NAME, Results(), dict[str, Any]()
     for domain in DOMAINS:
-        target = flown(domain, adaptation_splits(config) | past_splits(test=config.test), config, stages)
+        pool = {"train": SplitSpec(config.pooled(), 10)}
+        target = flown(domain, source_splits(config) | pool | past_splits(test=config.test), config, stages)
         case = Case(config, stages, learned, experts, target)
         lanes = [source_only(case, model) for model in learned]
         lanes += [adapted(case, method) for method in config.methods]

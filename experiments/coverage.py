@@ -1,7 +1,4 @@
-"""Coverage of the intervals of θ_p: how often they contain the truth, over repeated flights of a known vehicle.
-
-python -m experiments.coverage --help
-"""
+"""How often the intervals of θ_p contain the truth, over repeated flights: python -m experiments.coverage --help"""
 
 import itertools
 from dataclasses import asdict, dataclass, field
@@ -21,7 +18,7 @@ from experiments.reporting.tables import print_tables, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
 from experiments.runner.progress import Line
-from hybrid_jax import rotation
+from hybrid_jax import checks, rotation
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -195,7 +192,7 @@ def _repeats(
 def experiment(config: Config) -> None:
     """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
     folder = config.out / NAME
-    command.check_folder("--out", folder)
+    checks.writable_folder("--out", folder)
     rows = coverage(config, Console(stderr=True))
     write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": rows.rows}))
     columns = {
@@ -210,7 +207,6 @@ def experiment(config: Config) -> None:
 
 
 main = partial(command.call, NAME, Config, experiment)
-
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,4 @@
-"""Export a trained model to StableHLO files and CasADi functions; see docs/export.md.
-
-python -m experiments.export --help
-"""
+"""Export a trained model to StableHLO files and CasADi functions: python -m experiments.export --help"""
 
 from dataclasses import dataclass
 from functools import partial
@@ -45,13 +42,12 @@ class Config:
 
 
 def export(config: Config) -> None:
-    """Write the files; print their paths."""
     model = load(config.model)
     dt = model.about.get("dt") if config.dt is None else config.dt
     if dt is None:
         raise ValueError(f"--dt is needed: {config.model} does not say how long the steps of its flights were")
     checks.positive(f"{config.model}: dt" if config.dt is None else "--dt", dt, "a positive number of seconds")
-    command.check_folder("--out", config.out)
+    checks.writable_folder("--out", config.out)
     sizes: dict[str, Any] = {"state_size": config.state_size, "input_size": config.input_size}
     options = sizes | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
     written = [config.out / "field.npz", config.out / "step.npz"]
@@ -66,7 +62,6 @@ def export(config: Config) -> None:
 
 
 main = partial(command.call, NAME, Config, export)
-
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,4 @@
-"""Experiment 2 (paper, Sec. 4.5): a side wind pushes with [0, −4 + sin(2π t / 3), 0] N.
-
-python -m experiments.external_force --help
-"""
+"""Experiment 2 (paper, Sec. 4.5), a side wind of [0, −4 + sin(2π t / 3), 0] N: python -m experiments.external_force"""
 
 from functools import partial
 
@@ -17,6 +14,7 @@ from hybrid_jax.sim.forces import WIND_AMPLITUDE, WIND_ANGULAR_FREQUENCY
 from hybrid_jax.vehicle import IRIS
 
 NAME = "external_force"
+ABOUT = "A side wind that no source flight had: adapt to it."
 
 
 def sine_floor(mass: float, times: np.ndarray) -> float:
@@ -34,7 +32,6 @@ def sine_floor(mass: float, times: np.ndarray) -> float:
 FLOOR = sine_floor(IRIS.mass, DT * np.arange(EVERY, 101, EVERY))  # on test flights
 
 
-ABOUT = "A side wind that no source flight had: adapt to it."
 main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, EXTERNAL_FORCE, FLOOR), presets=PRESETS)
 
 if __name__ == "__main__":

@@ -48,7 +48,6 @@ class Options:
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
 
     def splits(self) -> dict[str, SplitSpec]:
-        """The requested splits."""
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}
         splits = {name: SplitSpec(getattr(self, name), n) for name, n in steps.items() if getattr(self, name) != 0}
         if not splits:
@@ -96,7 +95,6 @@ def make_flights(options: Options) -> None:
 
 
 main = partial(command.call, "make_flights", Options, make_flights)
-
 
 if __name__ == "__main__":
     main()

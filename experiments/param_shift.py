@@ -1,7 +1,4 @@
-"""Experiment 1 (paper, Sec. 4.4): the inertia shifts, Ix 0.02912 → 0.040, Iy 0.02912 → 0.020 kg m².
-
-python -m experiments.param_shift --help
-"""
+"""Experiment 1 (paper, Sec. 4.4), Ix 0.02912 → 0.040, Iy 0.02912 → 0.020 kg m²: python -m experiments.param_shift"""
 
 from functools import partial
 
@@ -11,8 +8,6 @@ from experiments.runner import command
 from hybrid_jax.sim.domain import PARAMETER_SHIFT
 
 NAME = "param_shift"
-
-
 ABOUT = "The vehicle's roll and pitch inertia change: adapt to it."
 main = partial(command.run, NAME, ABOUT, partial(adapt_and_report, NAME, PARAMETER_SHIFT, 0.0), presets=PRESETS)
 

@@ -25,25 +25,18 @@ Images = UInt8[np.ndarray, "n h w 3"]
 
 
 def picture(path: str | Path) -> None:
-    """Write the rendered vehicle as a PNG of 1600 × 1200 pixels.
-
-    Raises:
-        ValueError: the name does not end in .png, or no off-screen backend works; says what to install.
-    """
+    """Write the rendered vehicle as a PNG; ValueError if no off-screen backend works, or for another suffix."""
     if Path(path).suffix.lower() != ".png":
         raise ValueError(f"{path}: a picture's name must end in .png")
     matplotlib.image.imsave(path, _rendered([POSE], HEIGHT, WIDTH, None)[0])
 
 
 def frames(poses: Float[np.ndarray, "n 7"], place: Float[np.ndarray, "3"]) -> Images:
-    """Images of the vehicle in the given poses, seen from ahead, with a red mark.
+    """Images of the vehicle seen from ahead, and of a red mark; ValueError if no off-screen backend works.
 
     Args:
         poses: position [m] and quaternion (w, x, y, z), world frame.
         place: of the mark [m, world].
-
-    Raises:
-        ValueError: no off-screen backend works; says what to install.
     """
     return _rendered(poses.tolist(), FRAME_HEIGHT, FRAME_WIDTH, place.tolist())
 

@@ -4,6 +4,8 @@ In a compiled or mapped program an array is traced: it has no numbers yet, and t
 """
 
 import math
+import os
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -114,6 +116,17 @@ def key(name: str, value: Any) -> None:
         if new or (value.dtype == np.uint32 and value.shape == (2,)):
             return
     raise ValueError(f"{name} must be a random key, such as jax.random.key(0), got {short_repr(value)}")
+
+
+def writable_folder(name: str, folder: Path) -> None:
+    """Create a folder and check that it can be written, before work begins."""
+    probe = folder / f".writable.{os.getpid()}"
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ValueError(f"{name} {folder}: cannot be written: {error.strerror}") from error
 
 
 def short_repr(value: Any) -> str:

@@ -1,10 +1,6 @@
-"""Closed-loop flight with every model, before and after adaptation, as prediction model of a predictive controller.
-
-python -m experiments.closed_loop --help
-"""
+"""A predictive controller flies with every model, before and after adaptation: python -m experiments.closed_loop"""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
 from functools import partial
 
 from matplotlib.figure import Figure
@@ -25,7 +21,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
 from hybrid_jax.control import Controller
@@ -36,6 +32,7 @@ from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
+Training = dict[str, Stages]  # of each trained model
 Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
@@ -71,36 +68,19 @@ unchanged vehicle, on which the source networks were trained.
 """
 
 
-@dataclass
-class Training:
-    """Seconds of the stages of training, and notes on these."""
-
-    seconds: dict[str, float] = field(default_factory=dict)
-    notes: list[str] = field(default_factory=list)
-
-    def record(self, name: str, stages: Stages) -> None:
-        """Keep the seconds of the stages of a model, and the notes on them."""
-        self.seconds |= {f"{name}, {stage}": seconds for stage, seconds in stages.seconds.items()}
-        self.notes += [f"{name}: {note}" for note in stages.notes()]
-
-
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
-    """Train, fly and write the report."""
-    training = Training()
+    training: Training = {}
     trained = train_all(config, console, training)
     flown = fly_models(config, trained, console)
     ablation = fly_ablation(config, console, training) if config.ablation else []
     if hosts.is_main_process():
-        write(config, flown, ablation, speeds(config, trained), training)
+        write(config, trained, flown, ablation, training)
 
 
 def train_one(console: Console, training: Training, name: str, model: str, config: Config) -> Trained:
-    """Train a model and record its stages."""
     console.print(name, style="bold", highlight=False)
-    stages = stages_of(config, console)
-    found = models.train(model, config, stages)
-    training.record(name, stages)
-    return found
+    training[name] = stages_of(config, console)
+    return models.train(model, config, training[name])
 
 
 def train_all(config: ClosedLoopConfig, console: Console, training: Training) -> dict[str, Trained]:
@@ -108,10 +88,9 @@ def train_all(config: ClosedLoopConfig, console: Console, training: Training) ->
     trained = {name: train_one(console, training, name, model, config) for name, model in MODELS.items()}
     own = config.invariant()
     trained["invariant"] = train_one(console, training, "invariant", "hybrid", own)
-    stages, solve = stages_of(own, console), DISTURBANCES[config.invariant_disturbance]
-    trained["least_squares"] = models.least_squares(trained["invariant"].source, solve, own, stages)
-    training.record("least squares", stages)
-    training.notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
+    training["least squares"], solve = stages_of(own, console), DISTURBANCES[config.invariant_disturbance]
+    source = trained["invariant"].source
+    trained["least_squares"] = models.least_squares(source, solve, own, training["least squares"])
     return trained
 
 
@@ -143,7 +122,6 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
 
 
 def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
-    """Fly scenarios with one controller, or find them in the cache."""
     return flights.flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
 
 
@@ -158,20 +136,21 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
 
 def write(
     config: ClosedLoopConfig,
+    trained: dict[str, Trained],
     flown: Sequence[Flown],
     ablation: Sequence[Flown],
-    speeds: Mapping[str, Mapping[str, float]],
     training: Training,
 ) -> None:
-    """Write the report and its figures, and print the tables."""
-    out, few, every = config.out / NAME, min(config.sizes), [*flown, *ablation]
-    rows, ablated, call = results_of(flown), results_of(ablation), speeds[Agent("hybrid", few).name]
+    out, few, every, timed = config.out / NAME, min(config.sizes), [*flown, *ablation], speeds(config, trained)
+    rows, ablated, call = results_of(flown), results_of(ablation), timed[Agent("hybrid", few).name]
     count = sum(len(each.scenario.keys()) for each in every)
     spent, worked = sum(each.seconds for each in every), sum(each.processor_seconds for each in every)
     clocked = call["processor_ms"], call["median_ms"], config.seconds * count, spent, worked, every[0].devices
     verdicts = evaluate(claims(few), Evidence(rows, Speed(*clocked)))
     drawn, missing = draw(rows, ablated, flown, few)
-    seconds = dict(training.seconds)
+    notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
+    notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
+    seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}
     for each in every:  # the ablation repeats some
         stage = f"flights {each.scenario.name}"
         seconds[stage] = seconds.get(stage, 0.0) + each.seconds
@@ -183,10 +162,10 @@ def write(
         rows=rows,
         claims=verdicts,
         figures=save_figures(out, drawn),
-        notes=[*missing, *training.notes],
-        extra={"ablation": ablated.rows, "speed": speeds},
+        notes=[*missing, *notes],
+        extra={"ablation": ablated.rows, "speed": timed},
         head=HEAD.strip(),
-        tables=[*titled, speed_table(speeds)],
+        tables=[*titled, speed_table(timed)],
         more_rows=ablated,
     )
     write_report(out, report, Console())

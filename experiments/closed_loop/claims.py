@@ -1,7 +1,7 @@
 """Hypotheses about closed-loop flight, as data: each text states the definition that its predicate evaluates."""
 
 import math
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from itertools import product
@@ -9,21 +9,10 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.results import (
-    LEARNED,
-    ORACLE,
-    REFERENCES,
-    SOURCES,
-    UNCHANGED,
-    Agent,
-    away,
-    gaps,
-    uncrashed,
-)
-from experiments.reporting.claims import Claim, Inconclusive, all_of
-from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
-from experiments.reporting.results import Results
-from experiments.reporting.stats import mean_difference
+from experiments.closed_loop.results import LEARNED, ORACLE, REFERENCES, SOURCES, Agent, away, gaps, uncrashed
+from experiments.reporting.claims import Claim, Inconclusive, Part, all_of
+from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
+from experiments.reporting.results import Results, mean_difference
 
 THREE = ("hover", "figure_eight", "low_pass")
 WIND_FACTOR, GAP_SHARE, COST_TOLERANCE, AWAY_FACTOR = 4.0, 0.9, 0.1, 1.1
@@ -69,20 +58,13 @@ class Evidence:
         return [name for name in REFERENCES if name in own]
 
 
-Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
-
-
 def claims(few: int) -> list[Claim[Evidence]]:
     """All hypotheses, those on a model for each of SOURCES; `few` is the smallest N."""
-    made = [Claim(*claim) for claim in SPEED_CLAIMS]
+    made: list[Claim[Evidence]] = [Claim(id, text, lambda e, f=fast: f(e.speed)) for id, text, fast in SPEED_CLAIMS]
     for (number, text, parts), (letter, model) in product(CLAIMS, zip("abc", SOURCES, strict=True)):
-        predicate = partial(_in_all, parts, Agent(SOURCES[model]), Agent(model, few))
-        made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", predicate))
+        own = partial(parts, Agent(SOURCES[model]), Agent(model, few))
+        made.append(Claim(f"R{number}{letter}", f"{LEARNED[model]}: {text}", lambda e, own=own: all_of(own(e))))
     return sorted(made, key=lambda claim: claim.id)
-
-
-def _in_all(parts: Callable[..., Iterable[Part]], source: Agent, adapted: Agent, e: Evidence) -> Part:
-    return all_of(parts(source, adapted, e))
 
 
 def _smaller_in_wind(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
@@ -142,13 +124,12 @@ def _same_away(source: Agent, adapted: Agent, e: Evidence) -> Iterator[Part]:
         yield there <= AWAY_FACTOR * home, words
 
 
-def _fast_call(e: Evidence) -> Part:
-    words = f"{e.speed.call_ms:.2f} ms of processor time, {e.speed.median_ms:.2f} ms on the clock (median)"
-    return e.speed.call_ms <= CALL_MS, words
+def _fast_call(speed: Speed) -> Part:
+    words = f"{speed.call_ms:.2f} ms of processor time, {speed.median_ms:.2f} ms on the clock (median)"
+    return speed.call_ms <= CALL_MS, words
 
 
-def _fast_flights(e: Evidence) -> Part:
-    speed = e.speed
+def _fast_flights(speed: Speed) -> Part:
     share = FLIGHTS * FLIGHT_SECONDS / speed.flown_seconds / 60
     minutes, alone = share * speed.seconds, share * speed.processor_seconds / speed.devices
     words = f"{minutes:.1f} minutes on {speed.devices} devices, {alone:.1f} if they did nothing else"
@@ -156,7 +137,6 @@ def _fast_flights(e: Evidence) -> Part:
 
 
 def _equal(one: float, other: float) -> bool:
-    """Whether two errors [cm] differ by no more than rounding."""
     return abs(one - other) <= 100 * RESOLUTION
 
 
@@ -193,7 +173,7 @@ CLAIMS: list[tuple[int, str, Callable[[Agent, Agent, Evidence], Iterator[Part]]]
         f"smallest N is not above that of the source model on any reference ({_SIGNIFICANT}).",
      lambda source, adapted, e: _none_worse(replace(source, observer=True), replace(adapted, observer=True), e)),
 ]  # fmt: skip
-SPEED_CLAIMS: list[tuple[str, str, Callable[[Evidence], Part]]] = [
+SPEED_CLAIMS: list[tuple[str, str, Callable[[Speed], Part]]] = [
     ("R7", f"A call of the controller with the adapted hybrid takes at most {CALL_MS:g} ms on one core (processor "
            "time).", _fast_call),
     ("R8", f"{FLIGHTS} flights of {FLIGHT_SECONDS:g} s take at most {FLIGHT_MINUTES:g} minutes (without compiling).",

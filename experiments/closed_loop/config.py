@@ -1,7 +1,7 @@
 """Options of the closed-loop experiment, and its presets."""
 
-from dataclasses import dataclass, fields, replace
-from typing import Any, Literal, get_args
+from dataclasses import dataclass, replace
+from typing import Literal, get_args
 
 from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
 from experiments.runner.options import Count, Positive, distinct
@@ -77,7 +77,6 @@ class ClosedLoopConfig(Config):
 
     @property
     def flown_away(self) -> tuple[Reference, ...]:
-        """References flown away from home."""
         if self.away_references is not None:
             return self.away_references
         return tuple(name for name in ABLATED if name in self.references)
@@ -102,17 +101,13 @@ class ClosedLoopConfig(Config):
         )
 
     def ablated(self) -> Config:
-        """The configuration that trains the ablation's networks."""
         return self._limited(self.ends[:1], self.ablation_source, self.ablation_epochs)
 
     def _limited(self, sizes: tuple[int, ...], source: int, epochs: int) -> Config:
         """The options of all experiments in simulation, so that their stages are shared, with the own rate of bias."""
-        known: dict[str, Any] = {field.name: getattr(self, field.name) for field in fields(Config)}
-        known |= {"sizes": sizes, "pool": self.pooled()}
-        known |= {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
-        if self.invariant_offset is not None:
-            known["rates"] = replace(self.rates, offset=self.invariant_offset)
-        return Config(**known)
+        rates = self.rates if self.invariant_offset is None else replace(self.rates, offset=self.invariant_offset)
+        most = {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
+        return preset_like(Config, self, sizes=sizes, pool=self.pooled(), rates=rates, **most)
 
 
 PRESETS = {

@@ -16,19 +16,9 @@ from matplotlib.lines import Line2D
 
 from experiments.closed_loop.claims import COST_TOLERANCE
 from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
-from experiments.reporting.plots import (
-    COLOURS,
-    STYLE,
-    Line,
-    error_legend,
-    error_panel,
-    legend_below,
-    name_lines,
-    note,
-    tick_errors,
-)
-from experiments.reporting.results import Results
-from experiments.reporting.stats import Interval
+from experiments.reporting import plots
+from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note, subplots
+from experiments.reporting.results import Interval, Results
 
 COLOURS_OF = {
     "nominal": "0.45",
@@ -63,11 +53,11 @@ def errors(rows: Results, domain: str, ablation: bool = False) -> Figure:
         drawn = {agent: np.maximum(100 * own.numbers(ERROR), SMALLEST_ERROR) for agent, own in group.items()}
         marks = {ORACLE: "the true vehicle as its own model"}
         lines = [Line(label(a), values, COLOURS_OF[a.model], marks.get(a, "")) for a, values in drawn.items()]
-        error_panel(axes, lines, REFERENCES[reference] + away(distance))
+        plots.error_panel(axes, lines, REFERENCES[reference] + away(distance))
         axes.set_xlabel(XLABEL)
     note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
     title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
-    return error_legend(figure, title, any(rows["crashed"]))
+    return plots.error_legend(figure, title, any(rows["crashed"]))
 
 
 @mpl.rc_context(STYLE)
@@ -79,8 +69,7 @@ def away_from_home(rows: Results) -> Figure:
         raise ValueError("rows must not be empty: nothing was flown both at home and away from it")
     domains, references = (list(dict.fromkeys(cell[i] for cell in cells)) for i in (0, 1))
     height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(by_agent(found[cell])) for cell in cells))
-    figure = Figure(figsize=(3.6 * len(references) + 2, height), layout="constrained")
-    panels = figure.subplots(len(domains), len(references), squeeze=False, sharey="row")
+    figure, panels = subplots((3.6 * len(references) + 2, height), len(domains), len(references), sharey="row")
     smallest = math.inf
     for domain, reference, distance in cells:
         axes = panels[domains.index(domain), references.index(reference)]
@@ -112,7 +101,7 @@ def shares(rows: Results, domain: str) -> Figure:
             axes.axvline(x, color="0.4", linestyle=":", linewidth=1)
             axes.text(x, -0.66, words, fontsize=7, color="0.4", ha="center", va="bottom")
         for y, (agent, line) in enumerate(found.items()):
-            _draw_share(axes, y, line.get(name, Interval(*[math.nan] * 3)), COLOURS_OF[agent.model])
+            _draw_share(axes, y, line.get(name, Interval()), COLOURS_OF[agent.model])
     what = "share of the gap from source to true vehicle (bar: 95 %; hollow: gap not significant)"
     figure.suptitle(f"{DOMAINS[domain].capitalize()}: {what}", fontsize=12)
     return figure
@@ -124,8 +113,7 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
     found = {domain: rows.where(domain=domain, distance=0.0) for domain in DOMAINS if domain in rows["domain"]}
     if not any(agent in by_agent(group) for group in found.values() for agent in agents):
         raise ValueError("rows must hold one of the agents: there is nothing to draw")
-    figure = Figure(figsize=(4.4 * len(found) + 2.2, 4.6), layout="constrained")
-    panels = figure.subplots(1, len(found), squeeze=False, sharex=True, sharey=True)[0]
+    figure, (panels,) = subplots((4.4 * len(found) + 2.2, 4.6), 1, len(found), sharex=True, sharey=True)
     for axes, (domain, group) in zip(panels, found.items(), strict=True):
         _draw_costs(axes, group, agents)
         axes.set(title=DOMAINS[domain].capitalize(), xlabel="predicted cost of a plan", ylabel="actual cost, open loop")
@@ -149,12 +137,11 @@ def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure
     columns = 2 if count == 4 else min(count, 3)
     rows, room = -(-count // columns), 0.085 * max(map(len, labels))
     size = width * columns + room, rows * (1.0 + 0.25 * len(set(labels))) + 0.9
-    figure = Figure(figsize=size, layout="constrained")
-    panels = list(figure.subplots(rows, columns, squeeze=False).ravel())
-    for i, axes in enumerate(panels):
+    figure, panels = subplots(size, rows, columns)
+    for i, axes in enumerate(panels.flat):
         axes.tick_params(labelleft=i % columns == 0)
         axes.set_visible(i < count)
-    return figure, panels
+    return figure, list(panels.flat)
 
 
 def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, Results]) -> float:
@@ -164,7 +151,7 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, 
     finite = [max(value, SMALLEST_ERROR) for value in values if math.isfinite(value)] or [1.0]
     edge = max(finite) * 1.8
     axes.set(xscale="log", xlim=(min(finite) / 1.4, edge), xlabel=XLABEL)
-    tick_errors(axes.xaxis, *axes.get_xlim())
+    plots.tick_errors(axes.xaxis, *axes.get_xlim())
     name_lines(axes, [agent.name for agent in means])
     for y, (agent, (here, error)) in enumerate(means.items()):
         start, end = max(here, SMALLEST_ERROR), min(max(error, SMALLEST_ERROR), edge)

@@ -93,7 +93,6 @@ class Scenario:
 
     @property
     def name(self) -> str:
-        """In messages and file names."""
         return f"{self.domain.name} {self.reference}{away(self.distance).replace(',', '')}"
 
     def keys(self) -> list[tuple[Agent, int]]:
@@ -137,7 +136,6 @@ class Flown:
 
 
 def results_of(scenarios: Sequence[Flown]) -> Results:
-    """The rows of all flights."""
     return Results([row for each in scenarios for row in each.rows()], TAGS)
 
 
@@ -221,7 +219,6 @@ def _simulate(
     reference, x0 = references[flight.path] + offset, starts[flight.path] + offset
 
     def force(x, u, t, parameters) -> Wrench:
-        """The sum of FORCES, each times its share."""
         wrenches = [each(x, u, t, parameters) for each in FORCES]
         return Wrench(*(jnp.tensordot(flight.shares, jnp.stack(parts), 1) for parts in zip(*wrenches, strict=True)))
 

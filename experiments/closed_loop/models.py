@@ -2,36 +2,33 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
 from experiments.closed_loop.flights import DOMAINS, ModelSet
 from experiments.closed_loop.results import SOURCES, Agent
-from experiments.closed_loop.true_model import true_field
+from experiments.paper import study
 from experiments.paper.config import Config, ResidualInputs, ResidualOutputs
 from experiments.paper.lanes import Fit
-from experiments.paper.study import (
-    adapted,
-    domain_name,
-    flown,
-    places,
-    pretrained,
-    solved,
-    source_splits,
-    target_splits,
-)
 from experiments.runner.stages import Stages
+from hybrid_jax import rotation
 from hybrid_jax.adaptation import Method
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
-from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
+from hybrid_jax.io import portable
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sim.forces import WIND_MEAN, drag, ground_effect, parameters_of, wind
+from hybrid_jax.state import QUATERNION, VELOCITY, Input, State
 from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, Vehicle
 
 # The networks of the ablation; those COMPARED are also flown with its other options.
 PAPER, INVARIANT = "paper: all of x → all 13", "invariant: no p_x, p_y, yaw → v̇, ω̇"
@@ -56,8 +53,10 @@ class Trained:
 
 def train(model: str, config: Config, stages: Stages) -> Trained:
     """Pre-train a model (an id in `experiments.paper.conditions`) and adapt it to each domain."""
-    start = pretrained(model, IRIS, config, stages, flown(SOURCE, source_splits(config), config, stages)).fields
-    return _adapt(start, config, stages, lambda target: adapted(model, "fine_tuned", start, config, stages, target))
+    source = study.flown(SOURCE, study.source_splits(config), config, stages)
+    start = study.pretrained(model, IRIS, config, stages, source).fields
+    fit = partial(study.adapted, model, "fine_tuned", start, config, stages)
+    return _adapt(start, config, stages, fit)
 
 
 def least_squares(source: AbstractVectorField, method: Method, config: Config, stages: Stages) -> Trained:
@@ -65,17 +64,17 @@ def least_squares(source: AbstractVectorField, method: Method, config: Config, s
     own = replace(config, sizes=(min(config.sizes),), pool=config.pooled())
 
     def fit(target: Dataset) -> Fit:
-        return solved(f"least squares {domain_name(target)}", method, source, own, stages, target)
+        return study.solved(f"least squares {target.config['domain']}", method, source, own, stages, target)
 
     return _adapt(source, own, stages, fit)
 
 
 def _adapt(start: AbstractVectorField, config: Config, stages: Stages, fit: Callable[[Dataset], Fit]) -> Trained:
-    sizes, _ = places(config.sizes, config)
-    found = {}
+    found, seeds = {}, config.seeds
     for domain in DOMAINS:
-        fields = fit(flown(domain, target_splits(config), config, stages)).fields
-        found |= {(domain.name, n): lane(fields, np.flatnonzero(np.equal(sizes, n))) for n in config.sizes}
+        fields = fit(study.flown(domain, study.target_splits(config), config, stages)).fields
+        for i, n in enumerate(config.sizes):
+            found[domain.name, n] = lane(fields, np.arange(i * seeds, (i + 1) * seeds))
     return Trained(start, found)
 
 
@@ -165,3 +164,31 @@ def variants(
 def _variant(network: str, n_train: int, what: str = "") -> Agent:
     name = network.partition(":")[0] + what if what else network
     return Agent("invariant" if network.startswith("invariant") else "hybrid", n_train, variant=name)
+
+
+@portable
+class TrueField(AbstractVectorField):
+    """ẋ = f_p(x, u) + (drag, ground effect, a constant force)."""
+
+    body: RigidBody  # f_p
+    drag: Float[Array, ""]  # coefficient [kg/s]
+    push: Float[Array, "3"]  # constant force [N, world]
+
+    def __call__(self, x: State, u: Input) -> State:
+        vehicle, theta = self.body.vehicle, self.body.theta()
+        known = eqx.tree_at(lambda p: p.drag_coefficient, parameters_of(vehicle), self.drag)
+        now = jnp.zeros((), x.dtype)  # neither force depends on time
+        air, ground = drag(x, u, now, known), ground_effect(x, u, now, known)
+        torque = rotation.rotate(rotation.conjugate(x[QUATERNION]), ground.torque)
+        inertia = jnp.stack([theta["Ix"], theta["Iy"], jnp.asarray(vehicle.inertia[2], x.dtype)])
+        force = air.force + ground.force + self.push
+        still = jnp.zeros_like(x, shape=VELOCITY.start)
+        return self.body(x, u) + jnp.concatenate([still, force / vehicle.mass, torque / inertia])
+
+
+def true_field(domain: Domain, vehicle: Vehicle) -> TrueField:
+    """The true vehicle of a domain under its forces, of the wind only the mean; `vehicle` is that of the models."""
+    truth = nominal(domain.vehicle)
+    body = RigidBody({name: jnp.log(truth[name] / value) for name, value in nominal(vehicle).items()}, vehicle)
+    push = jnp.array([0.0, WIND_MEAN if wind in domain.forces else 0.0, 0.0])
+    return TrueField(body, jnp.asarray(domain.drag_coefficient), push)

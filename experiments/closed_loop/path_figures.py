@@ -15,7 +15,7 @@ from experiments.closed_loop.figures import COLOURS_OF, floor_note
 from experiments.closed_loop.flights import DRAW_EVERY, PATHS, Flown
 from experiments.closed_loop.results import DOMAINS, EXTERNAL_FORCE, KNOWN, REFERENCES, Agent
 from experiments.render import FRAME_HEIGHT, FRAME_WIDTH, frames
-from experiments.reporting.plots import STYLE, legend_below, tick_errors
+from experiments.reporting.plots import STYLE, legend_below, subplots, tick_errors
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.state import POSITION
 from hybrid_jax.vehicle import IRIS
@@ -35,15 +35,15 @@ def paths(
     """A row per reference: left the path, right the distance from it. Both are given as states every dt [s]."""
     if not flights:
         raise ValueError("flights must not be empty: there is nothing to draw")
-    figure = Figure(figsize=(9.5, 0.9 + 2.9 * len(flights)), layout="constrained")
-    panels = figure.subplots(len(flights), 2, squeeze=False, width_ratios=(1, 1.25))
+    figure, panels = subplots((9.5, 0.9 + 2.9 * len(flights)), len(flights), 2, width_ratios=(1, 1.25))
     smallest = math.inf
     for (left, right), (reference, flown) in zip(panels, flights.items(), strict=True):
         wanted = references[reference][:, POSITION]
         view = VIEWS.get(reference, TOP_VIEW)
         left.plot(*wanted[:, view].T, color="0.6", linestyle="--", linewidth=2.5, label="reference")
         for agent, states in flown.items():
-            style = {"color": COLOURS_OF[agent.model], "linestyle": _dash(agent), "label": agent.name}
+            dash = ":" if agent.observer else "-" if agent.n_train or agent.model in KNOWN else "--"
+            style = {"color": COLOURS_OF[agent.model], "linestyle": dash, "label": agent.name}
             left.plot(*states[:, POSITION][:, view].T, linewidth=1.2, **style)
             error = 100 * np.linalg.norm(states[:, POSITION] - wanted, axis=1)
             smallest = np.fmin(smallest, np.nanmin(error))
@@ -60,8 +60,7 @@ def paths(
 @mpl.rc_context(STYLE)
 def strip(flights: Mapping[str, tuple[Images, Sequence[float]]], times: Sequence[float], title: str) -> Figure:
     """A row per flight, of which images and the distance from the mark [m] in each are given; a column per time [s]."""
-    figure = Figure(figsize=(1.75 * len(times) + 0.6, 1.75 * len(flights) + 0.5), layout="constrained")
-    panels = figure.subplots(len(flights), len(times), squeeze=False)
+    figure, panels = subplots((1.75 * len(times) + 0.6, 1.75 * len(flights) + 0.5), len(flights), len(times))
     for row, (name, (images, errors)) in zip(panels, flights.items(), strict=True):
         for axes, image, error in zip(row, images, errors, strict=True):
             axes.imshow(image)
@@ -116,7 +115,3 @@ def _frame(axes: Axes, wanted: Float[np.ndarray, "t 2"], top: bool) -> None:
         return
     (x, y), half = (low + high) / 2, max(0.6, 0.62 * (high - low).max())
     axes.set(xlim=(x - half, x + half), ylim=(y - 0.6 * half, y + 0.6 * half), aspect="equal")
-
-
-def _dash(agent: Agent) -> str:
-    return ":" if agent.observer else "-" if agent.n_train or agent.model in KNOWN else "--"

@@ -5,13 +5,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT
-from experiments.reporting.results import Results, Row
-from experiments.reporting.stats import Interval, share_of_gap
+from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
+from experiments.reporting.results import Interval, Results, Row, share_of_gap
 from experiments.reporting.tables import EMPTY, Cell, Table, cross_table, mean_over_seeds, spread_text
 
-UNCHANGED = "source"  # the domain of the vehicle before the change
-DOMAINS = {UNCHANGED: "unchanged vehicle"} | {name: LABELS[name] for name in (PARAMETER_SHIFT, EXTERNAL_FORCE)}
+DOMAINS = {name: LABELS[name] for name in (UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE)}
 REFERENCES = {
     "hover": "hover",
     "figure_eight": "figure-8, 3.5 m/s",
@@ -42,7 +40,6 @@ class Agent:
 
     @property
     def name(self) -> str:
-        """Label in tables and figures."""
         size = f"N = {self.n_train}" if self.n_train else "source"
         name = KNOWN[self.model] if self.model in KNOWN else f"{LEARNED[self.model]}, {size}"
         return (f"{self.variant}, {name}" if self.variant else name) + (" + observer" if self.observer else "")

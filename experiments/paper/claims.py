@@ -9,10 +9,9 @@ from typing import Any
 
 from experiments.paper.lanes import DOMAINS, cells, gain
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, all_of, evaluate
+from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, all_of, evaluate
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
-from experiments.reporting.results import Results
-from experiments.reporting.stats import Spread
+from experiments.reporting.results import Results, Spread
 
 COMPARISON = "comparison"  # the experiment on both domains (Table 2)
 DOMAINS_OF = {"param_shift": DOMAINS[:1], "external_force": DOMAINS[1:], COMPARISON: DOMAINS}
@@ -47,15 +46,12 @@ class Evidence:
         return rows
 
     def mse(self, *cell: Any, **seeds: int) -> Spread:
-        """The spread of the test error of `rows`."""
         return self.rows(*cell, **seeds).spread("test_mse")
 
     def rho(self, model: str, n: int) -> float:
-        """The mean ρ of a fine-tuned model."""
         return self.rows(model, n).spread(gain).mean
 
 
-Part = tuple[bool, str]  # whether a claim holds in one case, and the numbers behind that
 Predicate = Callable[[Evidence], Iterator[Part]]
 
 
@@ -114,9 +110,8 @@ def _falls_with_n(e: Evidence) -> Iterator[Part]:
 
 
 def _beats_source_only(e: Evidence) -> Iterator[Part]:
-    for n in e.sizes():
-        mean = e.rho(HYBRID, n)
-        yield mean > 0, f"N = {n}: ρ = {mean:.3g}"
+    means = {n: e.rho(HYBRID, n) for n in e.sizes()}
+    return ((mean > 0, f"N = {n}: ρ = {mean:.3g}") for n, mean in means.items())
 
 
 def _pretraining_helps_when_small(e: Evidence) -> Iterator[Part]:

@@ -36,7 +36,6 @@ PHYSICS, NETWORK, SUBSET, PRETRAINING, ADAPTATION, ENCODER, AUGMENTATION = range
 
 
 def settings(config: Config) -> Settings:
-    """The settings that all runs of the experiment share."""
     return Settings(config.batch_size, REGULARISERS.get(config.regulariser), SOLVERS[config.solver])
 
 
@@ -87,12 +86,11 @@ def pretraining(
 
 def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, RunConfig]:
     """One run for each size and seed, in this order, from the seeds' fields; the subsets of a seed are nested."""
-    subsets = [sampled_indices(seed, config) for seed in range(config.seeds)]
-    one = lane(fields, 0)
+    one, drawn = lane(fields, 0), subsets(config)
     plans = [
         _with_offset(_plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size), one, config)
         for size in config.sizes
-        for subset in subsets
+        for subset in drawn
     ]
     seeds = np.tile(np.arange(config.seeds), len(config.sizes))
     return _starts(lane(fields, seeds), seeds, ADAPTATION), stack(plans)
@@ -114,9 +112,9 @@ def augmentation(
     return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
 
 
-def sampled_indices(seed: int, config: Config) -> np.ndarray:
-    """The order in which a seed takes target trajectories from the pool, as indices."""
-    return np.asarray(jax.random.permutation(_key(seed, SUBSET), config.pooled()))
+def subsets(config: Config) -> Int[np.ndarray, "seeds pool"]:
+    """The indices of target trajectories in the order in which each seed takes them from the pool."""
+    return stack([jax.random.permutation(_key(seed, SUBSET), config.pooled()) for seed in range(config.seeds)])
 
 
 def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[float, Stopping]:

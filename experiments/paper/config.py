@@ -5,16 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner.options import (
-    Count,
-    CountFromZero,
-    NotNegative,
-    Positive,
-    Run,
-    check_numbers,
-    distinct,
-    factors,
-)
+from experiments.runner.options import Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
@@ -138,10 +129,8 @@ class Config(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        check_numbers("--", self)
         factors("--guess", self.guess)
-        if not self.sizes or len({*self.sizes}) < len(self.sizes):
-            raise ValueError(f"--sizes must be at least one, each different, got {self.sizes}")
+        distinct("--sizes", self.sizes)
         batch = f"--batch-size {self.batch_size}"
         if min(self.sizes) < self.batch_size:
             raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
@@ -166,7 +155,6 @@ class Config(Run):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
     def pooled(self) -> int:
-        """The number of target trajectories from which a seed draws."""
         return max(self.sizes) if self.pool is None else self.pool
 
 

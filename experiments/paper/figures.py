@@ -16,7 +16,7 @@ from experiments.paper.lanes import THETA, Cell, adapted_sizes, by_domain, cells
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import DRAWABLE, STYLE, Line, colour, error_legend, error_panel, legend_below
+from experiments.reporting.plots import DRAWABLE, STYLE, Line, colour, error_legend, error_panel, legend_below, subplots
 from experiments.reporting.results import Column, Results, Row
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
@@ -46,8 +46,7 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
-    figure = Figure(figsize=(9, 4.8), layout="constrained")
-    left, right = figure.subplots(1, 2)
+    figure, ((left, right),) = subplots((9, 4.8), 1, 2)
     _draw_errors(left, _curves(rows, "test_mse"), floor)
     _draw_gains(right, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
     sizes = adapted_sizes(rows)
@@ -62,10 +61,14 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
     sizes = adapted_sizes(known)
-    figure = Figure(figsize=(9, 4.1), layout="constrained")
-    panels = figure.subplots(1, len(THETA))
+    figure, (panels,) = subplots((9, 4.1), 1, len(THETA))
     for axes, name in zip(panels, THETA, strict=True):
-        _draw_biases(axes, _curves(known, lambda row, name=name: _bias(row, name, truth)))
+
+        def bias(row: Row, name: str = name) -> float:
+            value = row["theta"][name]
+            return math.inf if value is None else 100 * (value / truth[name] - 1)
+
+        _draw_biases(axes, _curves(known, bias))
         axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
         axes.set_xticks(sizes, [str(n) for n in sizes])
     panels[0].set_ylabel("recovered / true − 1  [%]")
@@ -107,9 +110,9 @@ def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
 @mpl.rc_context(STYLE)
 def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapping[str, float]) -> Figure:
     counts = [len(lines) for lines in panels.values()]
-    figure = Figure(figsize=(9, 0.8 + sum(0.9 + 0.3 * count for count in counts)), layout="constrained")
-    column = figure.subplots(len(panels), 1, squeeze=False, height_ratios=counts)[:, 0]
-    for axes, (domain, lines) in zip(column, panels.items(), strict=True):
+    height = 0.8 + sum(0.9 + 0.3 * count for count in counts)
+    figure, column = subplots((9, height), len(panels), 1, height_ratios=counts)
+    for axes, (domain, lines) in zip(column.flat, panels.items(), strict=True):
         error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
     failed = any(np.isinf(line.errors).any() for lines in panels.values() for line in lines)
     return error_legend(figure, title, failed)
@@ -194,9 +197,3 @@ def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, co
         box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5}
         style = {"va": align, "fontsize": 8, "color": colour, "bbox": box, "zorder": 6}
         axes.annotate(words, (at, y), offset, textcoords="offset points", **style)
-
-
-def _bias(row: Row, name: str, truth: Mapping[str, float]) -> float:
-    """recovered / true − 1 [%]."""
-    value = row["theta"][name]
-    return math.inf if value is None else 100 * (value / truth[name] - 1)

@@ -10,7 +10,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.reporting.names import HYBRID, label
-from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below
+from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below, subplots
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, VELOCITY
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
@@ -25,8 +25,7 @@ def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], ti
 
     The truth alone sets the view; a prediction, N → model → its states, that leaves it is cut, and the panel says so.
     """
-    figure = Figure(figsize=(3.1 * max(len(predicted), 2), 4.1), layout="constrained")
-    panels = figure.subplots(1, len(predicted), sharey=True, squeeze=False)[0]
+    figure, (panels,) = subplots((3.1 * max(len(predicted), 2), 4.1), 1, len(predicted), sharey=True)
     for axes, (n, models) in zip(panels, sorted(predicted.items()), strict=True):
         _draw_paths(axes, truth, models)
         axes.set(title=f"N = {n} trajectories", xlabel="x [m]")

@@ -50,7 +50,6 @@ class Lanes:
 
 
 def fit_of(final: FitState) -> Fit:
-    """The best models of a sweep."""
     return Fit(final.best, final.best_mse, final.epoch, final.status)
 
 
@@ -58,19 +57,20 @@ def lanes_of(
     domain: str,
     model: str,
     mode: str,
-    where: tuple[Sequence[int], Sequence[int]],
+    sizes: Sequence[int],
     fit: Fit,
     errors: np.ndarray,
     theta: Mapping[str, np.ndarray] | None = None,
     intervals: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Models tested in a domain: their sizes and seeds (see `study.places`), and L^T_MSE on the test flights.
+    """Models tested in a domain, one for each size and, in it, seed.
 
     Args:
+        errors: L^T_MSE on the test flights.
         theta: name → the value of each, instead of that in the models.
         intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
     """
-    theta = theta_of(fit.fields) if theta is None else theta
+    theta, seeds = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
 
     def row(i: int) -> Row:
         ends = {name: pair[i] for name, pair in (intervals or {}).items()}
@@ -80,8 +80,8 @@ def lanes_of(
             "domain": domain,
             "model": model,
             "mode": mode,
-            "n_train": int(where[0][i]),
-            "seed": int(where[1][i]),
+            "n_train": sizes[i // seeds],
+            "seed": i % seeds,
             "test_mse": float(errors[i]),
             "rho": None,  # see `with_rho`
             "val_mse": float(fit.val_mse[i]),
@@ -106,7 +106,6 @@ def theta_of(field: AbstractVectorField) -> Mapping[str, np.ndarray]:
 
 
 def rows_of(groups: Sequence[Lanes]) -> Results:
-    """The rows of all models, with ρ."""
     return with_rho(Results([row for lanes in groups for row in lanes.rows], TAGS))
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, Literal
 
 import equinox as eqx
@@ -9,10 +10,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.conditions import adaptation, settings
+from experiments.paper.conditions import adaptation, settings, subsets
 from experiments.paper.config import Config
 from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, physics_in, source_of, theta_of
-from experiments.paper.study import SOLVED, domain_name, places, solved, subsets
+from experiments.paper.study import SOLVED, solved
 from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import covariance_of, intervals
@@ -46,8 +47,7 @@ class Case:
 
     @property
     def name(self) -> str:
-        """The target domain."""
-        return domain_name(self.target)
+        return self.target.config["domain"]
 
     def tested(self, name: str, fields: Any) -> np.ndarray:
         """L^T_MSE of stacked fields on the steps after the past."""
@@ -56,10 +56,9 @@ class Case:
 
 
 def source_only(case: Case, model: str) -> Lanes:
-    """A pre-trained model, unchanged."""
     fit, mode = case.pretrained[model], names.SOURCE_ONLY
     errors = case.tested(f"{mode} {model}", fit.fields)
-    return lanes_of(case.name, model, mode, places((0,), case.config), fit, errors)
+    return lanes_of(case.name, model, mode, (0,), fit, errors)
 
 
 def adapted(case: Case, method: Method) -> Lanes:
@@ -79,7 +78,7 @@ def adapted(case: Case, method: Method) -> Lanes:
         fit = fit._replace(fields=unfreeze(fit.fields))
     errors = case.tested(method, fit.fields)
     known = _intervals_of(case, method, fit.fields)
-    return lanes_of(case.name, method, mode, places(config.sizes, config), fit, errors, intervals=known)
+    return lanes_of(case.name, method, mode, config.sizes, fit, errors, intervals=known)
 
 
 def _augmented(case: Case) -> Lanes:
@@ -87,12 +86,9 @@ def _augmented(case: Case) -> Lanes:
     name, experts, windows = names.EXPERT_AUGMENTATION, case.experts, case.target.splits["test_with_past"]
     assert experts is not None
 
-    def test():
-        return jax.device_get(_encoded(experts.fields, windows, settings(case.config).solver))
-
-    errors, physics = case.stages.timed(f"test {name} {case.name}", test)
-    where = places((0,), case.config)
-    return lanes_of(case.name, name, names.SOURCE_ONLY, where, experts, errors, theta_of(physics))
+    encoded = partial(_encoded, experts.fields, windows, settings(case.config).solver)
+    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: jax.device_get(encoded()))
+    return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), experts, errors, theta_of(physics))
 
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
@@ -118,7 +114,7 @@ def _intervals_of(case: Case, method: Method, fields: Any) -> Mapping[str, np.nd
 
     def of_size(index: int, size: int):
         own = lane(fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
-        return jax.device_get(_intervals((own, subsets(size, config)), pool, settings(config).solver))
+        return jax.device_get(_intervals((own, subsets(config)[:, :size]), pool, settings(config).solver))
 
     parts = case.stages.timed(
         f"intervals {method} {case.name}", lambda: [of_size(index, size) for index, size in enumerate(config.sizes)]

@@ -24,7 +24,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
@@ -108,7 +108,6 @@ def paper_report(
 
 
 def introduction(experiment: str, rows: Results) -> str:
-    """Title and introduction of a report, Markdown."""
     domains = list(by_domain(rows))
     sizes = ", ".join(str(n) for n in sorted({*rows["n_train"]} - {0})) or "none"
     where = f" in each of {len(domains)} targets ({', '.join(map(label, domains))})" if len(domains) > 1 else ""

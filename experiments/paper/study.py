@@ -1,6 +1,6 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -15,7 +15,7 @@ import numpy as np
 from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
-from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, sampled_indices, settings
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, settings, subsets
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, rows_of, source_of
 from experiments.reporting import names
@@ -32,7 +32,6 @@ from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import evaluate, sweep
 from hybrid_jax.training.fitting import STOPPED
 from hybrid_jax.training.objective import Settings
@@ -86,7 +85,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
                 lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
             fields = learned[start].fields
             if model in SOLVED:
-                name = f"{FINE_TUNED} {model} {domain_name(target)}"
+                name = f"{FINE_TUNED} {model} {target.config['domain']}"
                 finals = {FINE_TUNED: solved(name, SOLVED[model], fields, config, stages, target)}
             else:
                 starts = {FINE_TUNED: fields, TARGET_ONLY: fresh_fields(model, vehicle, config)}
@@ -106,8 +105,8 @@ def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, sou
 
 
 def adapted(model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Fit:
-    """A model after training on target flight, one run for each size and seed; see `places`."""
-    name, lanes = f"{mode} {model} {domain_name(target)}", adaptation(model, mode, fields, config)
+    """A model after training on target flight, one run for each size and, in it, seed."""
+    name, lanes = f"{mode} {model} {target.config['domain']}", adaptation(model, mode, fields, config)
     return fit_of(stages.run(name, *lanes, settings(config), target, capacity(config)))
 
 
@@ -118,7 +117,7 @@ def solved(
     windows = target.splits["train"], target.splits["validation"]
 
     def of_size(size: int) -> Fit:
-        return jax.device_get(_solved(method, settings(config), (fields, subsets(size, config)), *windows))
+        return jax.device_get(_solved(method, settings(config), (fields, subsets(config)[:, :size]), *windows))
 
     parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
@@ -137,17 +136,12 @@ def _solved(method: Method, shared: Settings, lanes: Any, pool: Trajectories, va
     return jax.lax.map(one, lanes)
 
 
-def subsets(size: int, config: Config) -> np.ndarray:
-    """The indices of the target trajectories of each seed (seeds, size)."""
-    return stack([sampled_indices(seed, config)[:size] for seed in range(config.seeds)])
-
-
 def tested(model: str, mode: str, fit: Fit, config: Config, stages: Stages, target: Dataset) -> Lanes:
     """The models with their L^T_MSE on the test flights."""
     windows, count = target.splits["test"], capacity(config)[0]
     errors = stages.timed(f"test {mode} {model}", lambda: evaluate(fit.fields, windows, EVERY, settings(config), count))
-    where = places((0,) if mode == SOURCE_ONLY else config.sizes, config)
-    return lanes_of(domain_name(target), model, mode, where, fit, errors)
+    sizes = (0,) if mode == SOURCE_ONLY else config.sizes
+    return lanes_of(target.config["domain"], model, mode, sizes, fit, errors)
 
 
 def flown(
@@ -173,18 +167,12 @@ def flown(
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
-    """The splits of the source."""
     return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
     """The splits of the target; every seed draws from the train split."""
-    return adaptation_splits(config) | {"test": SplitSpec(config.test, 100)}
-
-
-def adaptation_splits(config: Config) -> dict[str, SplitSpec]:
-    """The splits of the target for adaptation."""
-    return source_splits(config) | {"train": SplitSpec(config.pooled(), 10)}
+    return source_splits(config) | {"train": SplitSpec(config.pooled(), 10), "test": SplitSpec(config.test, 100)}
 
 
 def capacity(config: Config) -> tuple[int, int]:
@@ -211,13 +199,3 @@ def placeholder(spec: SplitSpec) -> Trajectories:
     x = np.zeros((spec.windows, spec.steps, STATE_SIZE), np.float32)
     x[..., QUATERNION] = [1, 0, 0, 0]
     return Trajectories(x[:, 0], np.zeros((*x.shape[:2], INPUT_SIZE), np.float32), x, dt=DT)
-
-
-def places(sizes: Sequence[int], config: Config) -> tuple[list[int], list[int]]:
-    """The size and the seed of each run, in the order of `conditions`."""
-    return [n for n in sizes for _ in range(config.seeds)], [*range(config.seeds)] * len(sizes)
-
-
-def domain_name(dataset: Dataset) -> str:
-    """The domain of a dataset."""
-    return str(dataset.config["domain"])

@@ -8,8 +8,7 @@ from experiments.paper.claims import FEW
 from experiments.paper.lanes import MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.results import Results, Row
-from experiments.reporting.stats import spread
+from experiments.reporting.results import Results, Row, spread
 from experiments.reporting.tables import EMPTY, Table, cross_table, mean_over_seeds, over_seeds, spread_text, tabulate
 
 TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
@@ -158,7 +157,6 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
 
 
 def value_label(row: Row) -> str:
-    """The value of an ablation, the default marked."""
     return f"{row['value']} (default)" if row["default"] else row["value"]
 
 

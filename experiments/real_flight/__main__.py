@@ -7,15 +7,9 @@ from pathlib import Path
 
 from rich.console import Console
 
+from experiments.real_flight import logs
 from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
-from experiments.real_flight.logs import (
-    LogSet,
-    evenly_spaced,
-    hold_out_validation,
-    load_logs,
-    require_distinct,
-    write_logs,
-)
+from experiments.real_flight.logs import LogSet
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.report import failed_checks, write_report
 from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
@@ -71,19 +65,17 @@ def split_lists(arguments: Sequence[str]) -> list[str]:
 
 
 def run(config: RealFlightConfig, console: Console) -> None:
-    """Run the experiment from the logs to the report."""
     experiment = prepare(config, console)
-    results = run_folds(experiment)
+    outputs = run_folds(experiment)
     if hosts.is_main_process():
-        write_report(NAME, experiment, results, Console())
+        write_report(NAME, experiment, outputs, Console())
 
 
 def prepare(config: RealFlightConfig, console: Console) -> Experiment:
-    """Load the vehicle and all logs, and check them."""
     path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
     folders = {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:
-        path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
+        path, folders = logs.write_logs(config.out / NAME / "logs", config.data_seed)
     if path is None or "source" not in folders:
         raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
     before, after, chooses_lag = load_vehicle_models(path, config)
@@ -93,21 +85,21 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
             f"learn: {LAG} is chosen on flights of --source, and without --target these are test flights as well; "
             f"give --target, or state {LAG} under [terms]"
         )
-    logs: dict[str, LogSet] = {}
+    sets: dict[str, LogSet] = {}
     for name, folder in folders.items():
         model = before if name == "source" else after
         time_constant = 0.0 if chooses_lag else model.terms.motor_time_constant
-        logs[name] = load_logs(name, folder, model.vehicle, time_constant, config)
-    require_distinct(list(logs.values()), config)
-    dt = require_common_interval([log for each in logs.values() for log in each.logs], "--cleaning.resample ")
+        sets[name] = logs.load_logs(name, folder, model.vehicle, time_constant, config)
+    logs.require_distinct(list(sets.values()), config)
+    dt = require_common_interval([log for each in sets.values() for log in each.logs], "--cleaning.resample ")
     if chooses_lag:
-        chosen = choose_lag(logs["source"], before, config)
+        chosen = choose_lag(sets["source"], before, config)
         console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
-        logs = {name: each.with_lag(chosen) for name, each in logs.items()}
-    for flight, check in failed_checks([record for each in logs.values() for record in each.records]):
+        sets = {name: each.with_lag(chosen) for name, each in sets.items()}
+    for flight, check in failed_checks([record for each in sets.values() for record in each.records]):
         line = f"{flight}: {check['name']}: {check['suggestion']}"  # the report holds the whole table
         console.print(line, highlight=False, soft_wrap=True, style="yellow")
-    return Experiment(config, before, after, logs, dt, stages_of(config, console))
+    return Experiment(config, before, after, sets, dt, stages_of(config, console))
 
 
 def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
@@ -121,13 +113,13 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
     """Choose the rotors' time constant [s]: physics fitted to the source's training flights predicts the others."""
-    train, validation = hold_out_validation(source.logs, config)
+    train, validation = logs.hold_out_validation(source.logs, config)
     baseline = thrust_baseline(model)
 
-    def error(logs: list[FlightLog]) -> float:
-        parts = logs[: len(train)], logs[len(train) :]
+    def error(cleaned: list[FlightLog]) -> float:
+        parts = cleaned[: len(train)], cleaned[len(train) :]
         known, unknown = (cut_windows(part, INTERVAL_STEPS).windows for part in parts)
-        field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
+        field = fit_least_squares(model.physics(), logs.evenly_spaced(known, LAG_WINDOWS)).field
         return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
 
     return choose_time_constant([*train, *validation], error)[0]

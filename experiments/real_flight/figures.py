@@ -16,7 +16,7 @@ from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, STYLE, legend_below, tick_errors
+from experiments.reporting.plots import COLOURS, STYLE, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
 from hybrid_jax.flights.log import segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, require_length
@@ -54,8 +54,7 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
 def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     """A panel for each quantity: the error of the main cells against the time since the start of the prediction."""
     measure, power, kind = ("mean error", 1, 1) if experiment.config.protocol == "nanodrone" else ("RMSE", 2, 0)
-    figure = Figure(figsize=(9.5, 7.2), layout="constrained")
-    panels = figure.subplots(2, 2, sharex=True)
+    figure, panels = subplots((9.5, 7.2), 2, 2, sharex=True)
     most = max(outputs.table["n_train"])
     curves_of = {tuple(row[tag] for tag in TAGS): errors[kind] for row, errors in outputs.tests}
     for cell, group in cells(outputs.table).items():
@@ -84,8 +83,7 @@ def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
     """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
     found, labels = cells(rows), score_labels(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    figure = Figure(figsize=(12, 0.9 + 2.7 * len(labels)), layout="constrained")
-    panels = figure.subplots(len(labels), len(QUANTITIES), squeeze=False, sharex=True)
+    figure, panels = subplots((12, 0.9 + 2.7 * len(labels)), len(labels), len(QUANTITIES), sharex=True)
     for label, line in zip(labels, panels, strict=True):
         when = "summed over 50 steps" if label == SUM else f"{int(label) * dt:.3g} s"
         for (name, unit), axes in zip(QUANTITIES.items(), line, strict=True):
@@ -118,8 +116,7 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     for cell, field in fields.items():
         predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
         states[cell] = np.concatenate([windows.x0[:, None], predicted, gap], axis=1)
-    figure = Figure(figsize=(12, 6), layout="constrained")
-    panels = figure.subplots(2, 3, sharex=True)
+    figure, panels = subplots((12, 6), 2, 3, sharex=True)
     names = ("vx", "vy", "vz", "ωx", "ωy", "ωz")
     for axes, place, name in zip(panels.flat, range(VELOCITY.start, BODY_RATES.stop), names, strict=True):
         axes.plot(time, truth[:, place], color="black", linewidth=1.6, label="measured")

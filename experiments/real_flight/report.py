@@ -20,10 +20,9 @@ from experiments.real_flight.train import Experiment
 from experiments.reporting import report
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.plots import save_figures
-from experiments.reporting.results import Results
-from experiments.reporting.stats import spread
+from experiments.reporting.results import Results, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
-from experiments.runner.environment import environment
+from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.flights.consistency import FAILS
 from hybrid_jax.flights.windows import flight_of
@@ -73,7 +72,6 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
 
 
 def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
-    """Introduce the report to a reader who knows nothing of the experiment."""
     config, logs = experiment.config, experiment.logs
     flights = ", ".join(f"{len(each.logs)} {label}" for label, each in logs.items())
     of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
@@ -181,7 +179,6 @@ def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mappi
 
 
 def _errors(label: str) -> dict[str, Callable[[Results], str]]:
-    """The columns of a score: the error in each quantity."""
 
     def text(quantity: str, rows: Results) -> str:
         return spread_text(spread(pooled(rows, label, quantity)), ".4g", ".2g")

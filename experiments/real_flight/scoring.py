@@ -1,18 +1,13 @@
-"""Test models on held-out flights: the table of results, one row for each model tested in one fold, and hypotheses.
+"""Test models on held-out flights: a row for each model tested in one fold, and hypotheses.
 
-Columns:
-
-- fold: the flights tested on; model, mode: of MODELS and MODES; n_train: target windows trained on, 0 if none; seed.
-- recipe: how the model was trained, empty for a baseline; val_loss, epochs, status: of its training.
-- windows: number of test windows.
-- scores: "10", "50", … (RMSE after so many intervals) and "sum" → quantity → error in the units of QUANTITIES.
-- theta: learned physical parameters by name in SI units, None for a model without; theta_interval: their 95 % intervals
-  [low, high], None without intervals.
+Columns besides TAGS: recipe (empty for a baseline), val_loss, epochs, status of the training; windows, how many were
+tested; scores: "10", "50", … (RMSE after so many intervals) and "sum" → quantity → error; theta: θ_p by name in SI
+units; theta_interval: their 95 % intervals [low, high]. Both are None where there are none.
 """
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from itertools import groupby
+from itertools import groupby, product
 from typing import Any
 
 import equinox as eqx
@@ -26,7 +21,7 @@ from experiments.real_flight.logs import non_overlapping
 from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate
+from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
@@ -198,23 +193,16 @@ def verdicts(rows: Results) -> list[Verdict]:
 def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cells]:
     """Claim that a cell has a smaller error than each of the others, in every quantity and at every horizon."""
 
-    def predicate(found: Cells) -> tuple[bool, str]:
+    def predicate(found: Cells) -> Part:
         known = [found[other] for other in others if other in found]
         if not known:
             raise Inconclusive("none of these was run")
-        ratios = {
-            f"{'summed' if label == SUM else f'step {label}'} {quantity}": max(
-                _ratio(found[cell], other, label, quantity) for other in known
-            )
-            for label in score_labels(found[cell])
-            for quantity in QUANTITIES
-        }
+        ratios = {}
+        for label, quantity in product(score_labels(found[cell]), QUANTITIES):
+            own, *theirs = (float(np.mean(pooled(rows, label, quantity))) for rows in (found[cell], *known))
+            worst = max(own / other if math.isfinite(own) else math.inf for other in theirs)
+            ratios[f"{'summed' if label == SUM else f'step {label}'} {quantity}"] = worst
         words = ", ".join(f"{where} {ratio:.3f}" for where, ratio in ratios.items())
         return all(ratio < 1 for ratio in ratios.values()), f"error over that of the best of them: {words}"
 
     return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", predicate)
-
-
-def _ratio(rows: Results, others: Results, label: str, quantity: str) -> float:
-    own, other = (float(np.mean(pooled(group, label, quantity))) for group in (rows, others))
-    return own / other if math.isfinite(own) else math.inf

@@ -22,14 +22,11 @@ from hybrid_jax.flights.windows import count_windows, cut_windows
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
 
-
 Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 
 
 @dataclass(frozen=True)
 class Outputs:
-    """What an experiment found."""
-
     folds: list[Fold]
     tests: list[Test] = field(default_factory=list)
     # Of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
@@ -38,7 +35,6 @@ class Outputs:
 
     @property
     def table(self) -> Results:
-        """The table of results."""
         return Results([row for row, _ in self.tests], TAGS)
 
 

@@ -29,8 +29,6 @@ from hybrid_jax.trajectories import Trajectories, concatenate
 
 @dataclass(frozen=True)
 class Experiment:
-    """What an experiment is given."""
-
     config: RealFlightConfig
     before: VehicleModel  # the source's vehicle
     after: VehicleModel  # that of target and test
@@ -65,7 +63,6 @@ class TrainedModel:
     status: Any = ()  # of the last stage
 
     def run(self, index: int) -> AbstractVectorField:
-        """The field of one run."""
         return lane(self.fields, index)
 
     def __len__(self) -> int:
@@ -115,7 +112,6 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
 
 
 def transfer(experiment: Experiment, source: TrainedModel) -> TrainedModel:
-    """Move a source model to the vehicle after the change, without training."""
     return replace(source, mode="zero_shot", fields=models.move_to_vehicle(source.fields, experiment.after.vehicle))
 
 

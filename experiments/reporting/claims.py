@@ -7,6 +7,7 @@ from typing import Any, Generic, TypeVar
 from experiments.reporting.tables import Table
 
 Evidence = TypeVar("Evidence")
+Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
 OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– inconclusive"}
 
 
@@ -16,15 +17,11 @@ class Inconclusive(Exception):
 
 @dataclass(frozen=True)
 class Claim(Generic[Evidence]):
-    """A hypothesis, and a function that decides it.
-
-    The predicate returns whether the evidence supports the hypothesis and the numbers behind that; it raises
-    `Inconclusive` if the evidence cannot decide.
-    """
+    """A hypothesis, and a function that decides it or raises `Inconclusive`."""
 
     id: str  # such as "C1"
     text: str
-    predicate: Callable[[Evidence], tuple[bool, str]]
+    predicate: Callable[[Evidence], Part]
 
 
 @dataclass(frozen=True)
@@ -37,14 +34,13 @@ class Verdict:
     measured: str
 
 
-def all_of(parts: Iterable[tuple[bool, str]]) -> tuple[bool, str]:
+def all_of(parts: Iterable[Part]) -> Part:
     """Whether all parts of a hypothesis hold, and their numbers."""
     holds, measured = zip(*parts, strict=True)
     return all(holds), "; ".join(measured)
 
 
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
-    """The verdict on each claim."""
 
     def verdict(claim: Claim[Evidence]) -> Verdict:
         try:
@@ -57,7 +53,6 @@ def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verd
 
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
-    """A line per claim."""
     lines = [(each.id, each.text, OUTCOMES[each.holds], each.measured) for each in verdicts]
     return Table(title, ("", "claim", "verdict", "measured"), lines)
 

@@ -1,4 +1,4 @@
-"""The keys of models, modes and target domains in results and caches, and their labels for readers."""
+"""The keys of models, modes and domains in results and caches, and their labels for readers."""
 
 HYBRID, NO_PHYSICS, PHYSICS_ONLY = "hybrid", "no_physics", "physics_only"
 EXPERT_AUGMENTATION, LAST_LAYER, LINEAR_RESIDUAL = "expert_augmentation", "last_layer", "linear_residual"
@@ -7,7 +7,7 @@ LEAST_SQUARES, CONSTANT_DISTURBANCE = "least_squares", "constant_disturbance"
 THRUST, HOLD = "thrust", "hold"
 FINE_TUNED, TARGET_ONLY, SOURCE_ONLY = "fine_tuned", "target_only", "source_only"
 SCRATCH, ZERO_SHOT, NOMINAL = "scratch", "zero_shot", "nominal"
-PARAMETER_SHIFT, EXTERNAL_FORCE = "parameter_shift", "external_force"
+UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE = "source", "parameter_shift", "external_force"
 LABELS = {
     HYBRID: "hybrid",
     NO_PHYSICS: "no-physics",
@@ -25,6 +25,7 @@ LABELS = {
     ZERO_SHOT: "zero-shot",
     TARGET_ONLY: "target-only",
     SOURCE_ONLY: "source-only",
+    UNCHANGED: "unchanged vehicle",
     PARAMETER_SHIFT: "parameter shift",
     EXTERNAL_FORCE: "external force",
 }

@@ -46,8 +46,6 @@ FLOOR_LABEL = "floor: error that no model here can see"
 
 
 class Line(NamedTuple):
-    """A line of an error panel."""
-
     name: str
     errors: np.ndarray  # of each seed, not finite where it failed
     colour: str
@@ -55,8 +53,13 @@ class Line(NamedTuple):
 
 
 def colour(model: str) -> str:
-    """The colour that a model has in every figure."""
     return COLOURS.get(model, OTHERS)
+
+
+def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any) -> tuple[Figure, np.ndarray]:
+    """A figure [inches] and its panels, (rows, columns)."""
+    figure = Figure(figsize=size, layout="constrained")
+    return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 def save_figure(figure: Figure, path: str | Path) -> list[Path]:

@@ -20,8 +20,6 @@ JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
 
 @dataclass(frozen=True)
 class Report:
-    """One experiment's outcome."""
-
     experiment: str
     config: Mapping[str, Any]
     environment: Mapping[str, Any]
@@ -51,7 +49,6 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
 
 
 def to_json(report: Report) -> dict[str, Any]:
-    """The content of report.json."""
     own = {"format": FORMAT, "experiment": report.experiment, "config": report.config}
     own |= {"environment": report.environment, "tags": report.rows.tags, "rows": report.rows.rows}
     own |= claims.to_json(report.claims) | {"figures": report.figures, "notes": report.notes}

@@ -9,8 +9,7 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.reporting.results import Results
-from experiments.reporting.stats import Spread
+from experiments.reporting.results import Results, Spread
 
 EMPTY = "–"
 STYLES = {"✓ holds": "green", "✗ fails": "bold red"}
@@ -61,8 +60,8 @@ def spread_text(values: Spread, form: str = ".3g", std_form: str = "", what: str
     The standard deviation has by default the format of the mean.
     """
     if values.non_finite:
-        mean, median = _number(values.mean, form), _number(values.median, form)
-        return f"{mean} ({values.non_finite} of {values.count} seeds {what}, median {median})"
+        of = f"{values.non_finite} of {values.count} seeds {what}"
+        return f"{values.mean:{form}} ({of}, median {values.median:{form}})".replace("-inf", "−∞").replace("inf", "∞")
     return f"{values.mean:{form}}" + ("" if math.isnan(values.std) else f" ± {values.std:{std_form or form}}")
 
 
@@ -79,13 +78,11 @@ def mean_over_seeds(results: Results) -> str:
 
 
 def markdown(table: Table) -> str:
-    """A table of Markdown, without its title."""
     lines = [table.header, ["---"] * len(table.header), *table.lines]
     return "\n".join(f"| {' | '.join(plain(cell) for cell in line)} |" for line in lines)
 
 
 def print_tables(console: Console, tables: Sequence[Table]) -> None:
-    """Print tables to a terminal."""
     for table in tables:
         # As Text, or the brackets of a unit would be read as markup.
         printed = RichTable(title=Text(table.title), title_justify="left")
@@ -99,7 +96,3 @@ def print_tables(console: Console, tables: Sequence[Table]) -> None:
 def plain(text: str) -> str:
     """Text that ends neither a table's cell nor a line of Markdown."""
     return " ".join(text.replace("|", "\\|").split())
-
-
-def _number(value: float, form: str) -> str:
-    return f"{value:{form}}".replace("-inf", "−∞").replace("inf", "∞")

@@ -9,7 +9,7 @@ from typing import Any, Self
 
 import numpy as np
 
-from experiments.runner.environment import PACKAGES
+from experiments.runner.run_record import PACKAGES
 from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path
@@ -61,7 +61,6 @@ class Checkpoints:
             self._folder.rmdir()
 
     def _paths(self) -> list[Path]:
-        """From the oldest to the newest."""
         return sorted(path for path in self._folder.glob("*.npz") if path.stem.isdecimal())
 
 
@@ -103,9 +102,7 @@ class DeferredSignals(AbstractContextManager):
 class Autosave:
     """Save a sweep between blocks, within its share of the time, and whenever a signal is pending.
 
-    Args:
-        spent: seconds that earlier runs spent on the sweep.
-        share: largest share of the time that saving may take.
+    `spent` are the seconds that earlier runs spent on the sweep.
     """
 
     def __init__(self, checkpoints: Checkpoints, signals: DeferredSignals, name: str, spent: float, share: float):

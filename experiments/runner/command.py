@@ -3,12 +3,10 @@
 import argparse
 import contextlib
 import io
-import os
 import signal
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
-from pathlib import Path
 from typing import Any, TypeVar
 
 import tyro
@@ -17,6 +15,7 @@ from rich.console import Console
 
 from experiments.runner.options import Run
 from experiments.runner.run_record import OtherRun, recorded
+from hybrid_jax import checks
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
@@ -45,7 +44,7 @@ def run(
     fresh = " without --fresh" if "--fresh" in given else ""
     with _exit_codes(name, f"interrupted; the same command{fresh} goes on from here"):
         config = read(name, about, given, presets)
-        check_folder("--out", config.out)
+        checks.writable_folder("--out", config.out)
         configure(config.cache)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
@@ -91,17 +90,6 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
         if not stop.code:
             raise  # --help
         raise ValueError(f"{_message(output.getvalue())}; see --help") from None
-
-
-def check_folder(option: str, folder: Path) -> None:
-    """Create a folder and check that it can be written, before work begins."""
-    probe = folder / f".writable.{os.getpid()}"
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        probe.touch()
-        probe.unlink()
-    except OSError as error:
-        raise ValueError(f"{option} {folder}: cannot be written: {error.strerror}") from error
 
 
 @contextlib.contextmanager

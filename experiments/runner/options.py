@@ -35,7 +35,7 @@ class Run:
     """Start anew: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
     saving: float = 0.02
     """Largest share of a sweep's time spent on saving checkpoints; a smaller share means more work lost by a kill."""
-    seeds: int = 10
+    seeds: Count = 10
     """Trials of each condition: initialisation, order of minibatches, which N trajectories are drawn."""
     distributed: bool = False
     """Be one of several processes, on one machine or many, that share the runs: start the same command for each.
@@ -50,13 +50,11 @@ class Run:
     def __post_init__(self):
         if not self.distributed and (self.coordinator, self.processes, self.process_id) != (None, None, None):
             raise ValueError("--coordinator, --processes and --process-id need --distributed")
-        if self.seeds < 1:
-            raise ValueError(f"--seeds must be at least 1, got {self.seeds}")
         if not 0 < self.saving <= 1:
             raise ValueError(f"--saving must be a share above 0 and at most 1, got {self.saving}")
+        check_numbers("--", self)
 
     def described(self) -> dict[str, Any]:
-        """The options that determine the results."""
         return {name: value for name, value in asdict(self).items() if name not in UNFIXED}
 
 
@@ -76,8 +74,8 @@ def _rules(hint: Any) -> list[Any]:
     return own + [rule for part in get_args(hint) for rule in _rules(part)]
 
 
-def distinct(option: str, names: Sequence[str]) -> None:
-    """Raise ValueError if an option lists no names, or one twice."""
+def distinct(option: str, names: Sequence[Any]) -> None:
+    """Raise ValueError if an option lists nothing, or something twice."""
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{option} must be at least one, each different, got {tuple(names)}")
 

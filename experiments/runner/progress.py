@@ -57,5 +57,4 @@ class Line(AbstractContextManager):
 
 
 def clock(seconds: float) -> str:
-    """Minutes and seconds."""
     return f"{int(seconds) // 60}:{int(seconds) % 60:02d}"

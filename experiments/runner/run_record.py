@@ -1,4 +1,4 @@
-"""run.json in a results folder: the configuration of the run, so that only the same run can resume."""
+"""What a run was: its environment, and run.json with its configuration, so that only the same run can resume."""
 
 import hashlib
 from collections.abc import Callable, Iterator, Mapping
@@ -8,14 +8,25 @@ from pathlib import Path
 from typing import Any
 
 from experiments.reporting.results import leaves
-from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
+from hybrid_jax.runtime import hardware
 
+PACKAGES = ("jax", "jaxlib", "equinox", "diffrax", "optax", "mujoco", "mujoco-mjx", "numpy", "hybrid_jax")
 FILE = "run.json"
 HINT = "  --fresh starts anew and moves it aside; another --out leaves it as it is"
 FIXED = ("config", "versions", "flights")  # a run resumes only if these are equal
+
+
+def environment(stages: Mapping[str, float]) -> dict[str, Any]:
+    """Versions, hardware, seconds of each stage and the date (UTC, ISO 8601), as JSON values."""
+    return {
+        "date": datetime.now(UTC).isoformat(timespec="seconds"),
+        "versions": versions(*PACKAGES),
+        "hardware": hardware(),
+        "seconds": {stage: round(float(seconds), 3) for stage, seconds in stages.items()},
+    }
 
 
 class OtherRun(ValueError):
@@ -24,9 +35,7 @@ class OtherRun(ValueError):
 
 @contextmanager
 def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
-    """Record that a run began in a folder, and at the end that it finished.
-
-    A run that ends in bad input restores the previous record.
+    """Record that a run began in a folder, and at the end that it finished; bad input restores the previous record.
 
     Raises:
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
@@ -65,7 +74,6 @@ def describe(config: Run) -> dict[str, Any]:
 
 
 def require_same(what: str, old: Mapping[str, Any], new: Mapping[str, Any]) -> None:
-    """Compare two records of runs."""
     before, now = (dict(leaves({name: each.get(name, {}) for name in FIXED}, ".")) for each in (old, new))
     lines = [
         f"  {name}: {before.get(name, 'absent')} → {now.get(name, 'absent')}"

@@ -9,10 +9,9 @@ from typing import Any, TypeVar
 from rich.console import Console
 
 from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
-from experiments.runner.environment import PACKAGES
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
-from experiments.runner.run_record import require_same
+from experiments.runner.run_record import PACKAGES, require_same
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
 from hybrid_jax.io.files import backup_path
@@ -32,9 +31,7 @@ Result = TypeVar("Result")
 class Stages:
     """The stages of an experiment: training sweeps cached in a folder, and the time that each stage took.
 
-    Args:
-        saving: largest share of a sweep's time spent on checkpoints.
-        fresh: move unfinished sweeps, and finished ones of other versions, to a backup and run them anew.
+    `saving` is as in `Run`; with `fresh`, unfinished sweeps, and those of other versions, are moved aside and run anew.
     """
 
     def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
@@ -148,7 +145,6 @@ def stages_of(config: Run, console: Console) -> Stages:
 
 
 def summary(states: FitState) -> str:
-    """One line about a finished sweep."""
     epochs, best = states.epoch, states.best_mse.min()
     return f"{len(epochs)} runs, {epochs.min()} to {epochs.max()} epochs, best validation loss {best:.3g}"
 
@@ -158,7 +154,6 @@ def _stem(name: str) -> str:
 
 
 def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:
-    """A hash of everything that determines the result."""
     regulariser = None if settings.regulariser is None else settings.regulariser.__name__
     shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
     objective: Any = settings.objective

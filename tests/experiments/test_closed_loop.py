@@ -18,10 +18,9 @@ from smoke import command, experiments
 
 import hybrid_jax as hj
 from experiments.closed_loop.flights import PATHS, Scenario, flown
-from experiments.closed_loop.models import as_stack, fused, with_statistics_of
+from experiments.closed_loop.models import as_stack, fused, true_field, with_statistics_of
 from experiments.closed_loop.results import TAGS, Agent
 from experiments.closed_loop.timing import use_one_core
-from experiments.closed_loop.true_model import true_field
 from experiments.reporting.results import Results
 from hybrid_jax.control import Controller, fly, performance, sample
 from hybrid_jax.networks.factory import make_residual

@@ -17,7 +17,7 @@ from experiments.paper.tables import parameters, run_notes
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import spread_text
-from experiments.runner.environment import PACKAGES
+from experiments.runner.run_record import PACKAGES
 
 
 def test_report_json_keeps_the_contract(tmp_path):

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from experiments.reporting.stats import mean_difference, share_of_gap
+from experiments.reporting.results import mean_difference, share_of_gap
 
 REPEATS, SEEDS = 2000, 10
 
