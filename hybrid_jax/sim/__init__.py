@@ -25,14 +25,8 @@ check_versions(versions("mujoco", "mujoco-mjx"))
 with contextlib.redirect_stdout(io.StringIO()):
     import mujoco.mjx  # noqa: F401
 
-from hybrid_jax.sim.domain import (  # noqa: E402
-    EXTERNAL_FORCE,
-    PARAMETER_SHIFT,
-    SOURCE,
-    Domain,
-    Quadrotor,
-)
-from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402  # noqa: E402
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain, Quadrotor  # noqa: E402
+from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402
 
 __all__ = [
     "EXTERNAL_FORCE",
