@@ -11,6 +11,8 @@ from importlib.metadata import version
 
 import pytest
 
+pytest.register_assert_rewrite("any_system")
+
 # JAX reads these when it is imported, so it must not be imported here. The last three are as in `runtime.configure`.
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
 KEEP_ALL = {

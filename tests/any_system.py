@@ -1,4 +1,7 @@
-"""Any system goes from fit to file: fit, adapt by every method, save, load elsewhere, predict, export."""
+"""Any system goes from fit to file: fit, adapt by every method, save, load elsewhere, predict, export.
+
+The modules that import these tests say of which systems, in a fixture `adapted`: two, as each runs on one core.
+"""
 
 from dataclasses import replace
 from pathlib import Path
@@ -13,8 +16,6 @@ from systems import SYSTEMS
 
 import hybrid_jax as hj
 from hybrid_jax.export import casadi_step, export_step, load_program
-
-pytestmark = pytest.mark.slow
 
 # Few epochs: what is checked is that every method goes through, not how well it does.
 METHODS = {
@@ -39,16 +40,15 @@ def attempt(call, *arguments, **options):
         return str(error)
 
 
-@pytest.fixture(scope="module", params=SYSTEMS)
-def adapted(request):
+def adapted_by_all(name):
     """A system, its source model and what each method made of it."""
-    system = SYSTEMS[request.param]()
+    system = SYSTEMS[name]()
     source = hj.fit(system.model, system.train, system.validation, jax.random.key(0), max_epochs=60)
     results = {
         name: attempt(hj.adapt, source.best, system.target, method=method, validation=system.validation)
         for name, method in METHODS.items()
     }
-    return SimpleNamespace(name=request.param, system=system, source=source, results=results)
+    return SimpleNamespace(name=name, system=system, source=source, results=results)
 
 
 def fields(adapted):
