@@ -81,7 +81,7 @@ def away_from_home(rows: Results) -> Figure:
         "at home": Line2D([], [], marker="o", markersize=5, **style),
         away(cells[0][2])[2:]: Line2D([], [], marker=">", markersize=7, **style),
     }
-    title = "The same flights at home and away from it" + floor_note(smallest, SMALLEST_ERROR, " (", ")")
+    title = "The same flights at home and away from it" + floor_note(smallest, SMALLEST_ERROR, "\n(", ")")
     return legend_below(figure, title, "mean over seeds", 2, entries)
 
 
@@ -162,7 +162,8 @@ def _draw_away(axes: Axes, home: Mapping[Agent, Results], there: Mapping[Agent, 
         if crashed:
             note(axes, f"{crashed} of {len(there[agent])} crash", (end, y), (-8, 4), va="bottom", ha="right")
         else:
-            note(axes, f"{error:.2g}" if error >= SMALLEST_ERROR else f"{error:.2f}", (end, y), (7, 0), va="center")
+            shown = f"{error:.0f}" if error >= 100 else f"{error:.2g}" if error >= SMALLEST_ERROR else f"{error:.2f}"
+            note(axes, shown, (end, y), (7, 0), va="center")
     return min(values)
 
 
