@@ -8,6 +8,7 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import casadi
+import equinox as eqx
 import jax
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from systems import SYSTEMS
 
 import hybrid_jax as hj
 from hybrid_jax.export import casadi_step, export_step, load_program
+from hybrid_jax.metrics import rollout_mse
 
 # Few epochs: what is checked is that every method goes through, not how well it does.
 METHODS = {
@@ -54,6 +56,11 @@ def adapted_by_all(name):
 def fields(adapted):
     """Name of the method → adapted field, where the method applies."""
     return {name: found.field for name, found in adapted.results.items() if not isinstance(found, str)}
+
+
+def test_a_fit_beats_the_model_s_own_physics(adapted):
+    system = adapted.system
+    assert adapted.source.best_mse < eqx.filter_jit(rollout_mse)(system.model.physics, system.validation)
 
 
 def test_every_method_adapts_or_refuses_in_one_line(adapted):

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).parents[2]
-KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "5"))
+KILLS = int(os.environ.get("HYBRID_JAX_KILLS", "3"))
 EPOCHS = "300"
 TRIES = 5
 SMALL = [

@@ -7,7 +7,7 @@ import numpy as np
 import optax
 import pytest
 from pendulum import DAMPING, LENGTH, pendulum, swings
-from systems import SYSTEMS, Dense
+from systems import Dense
 
 from hybrid_jax import Hybrid, Settings, fit, load, residual_network, save
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -256,11 +256,3 @@ def test_progress_is_shown_on_stderr_only_when_asked_for(capsys):
         trained(pendulum(0.8, DAMPING), max_epochs=2, progress=progress)
         said = capsys.readouterr()
         assert (said.out, "2/2" in said.err) == ("", bool(progress))
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", SYSTEMS)
-def test_fit_with_defaults_beats_the_model_s_own_physics(name):
-    system = SYSTEMS[name]()
-    result = fit(system.model, system.train, system.validation, KEY, max_epochs=150)
-    assert result.best_mse < eqx.filter_jit(rollout_mse)(system.model.physics, system.validation)
