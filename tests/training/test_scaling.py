@@ -1,5 +1,7 @@
 """Laws of the scaling that `fit` reads off the training windows."""
 
+from functools import cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -14,8 +16,12 @@ from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
 from hybrid_jax.networks.standardise import with_scaling
 
 KEY = jax.random.key(0)
-CAR = SYSTEMS["car"]()
-SCALED = with_scaling(CAR.model, CAR.train)
+car = SYSTEMS["car"]  # cached
+
+
+@cache
+def scaled():
+    return with_scaling(car().model, car().train)
 
 
 def samples(windows):
@@ -24,17 +30,17 @@ def samples(windows):
 
 
 def test_every_input_has_mean_zero_and_deviation_one():
-    z = jax.vmap(SCALED.residual.inputs)(*samples(CAR.train))
+    z = jax.vmap(scaled().residual.inputs)(*samples(car().train))
     np.testing.assert_allclose(jnp.mean(z, axis=0), 0, atol=1e-3)
     np.testing.assert_allclose(jnp.std(z, axis=0), 1, rtol=1e-3)  # float32 means of hundreds
 
 
 def test_a_unit_of_the_state_changes_nothing_that_the_network_reads():
-    x, u = samples(CAR.train)
+    x, u = samples(car().train)
     unit = np.array([1e-3, 1, 1, 1, 1, 1], np.float32)
-    windows = hj.Trajectories(CAR.train.x0 * unit, CAR.train.u, CAR.train.x * unit, CAR.train.dt)
+    windows = hj.Trajectories(car().train.x0 * unit, car().train.u, car().train.x * unit, car().train.dt)
     network = hj.residual_network(6, 2, KEY, hidden=4)
-    metres, kilometres = with_scaling(network, CAR.train), with_scaling(network, windows)
+    metres, kilometres = with_scaling(network, car().train), with_scaling(network, windows)
     read = jax.vmap(kilometres.inputs)(x * unit, u)
     np.testing.assert_allclose(jax.vmap(metres.inputs)(x, u), read, rtol=1e-3, atol=1e-3)
     np.testing.assert_allclose(kilometres.scaling.output[0], 1e-3 * metres.scaling.output[0], rtol=1e-3)
@@ -42,27 +48,27 @@ def test_a_unit_of_the_state_changes_nothing_that_the_network_reads():
 
 def test_a_scaling_that_was_given_or_set_stays():
     given = hj.residual_network(6, 2, KEY, scaling=InputScaling(1.0, 2.0))
-    for field in (given, SCALED, CAR.model.physics):
-        assert with_scaling(field, CAR.validation) is field
+    for field in (given, scaled(), car().model.physics):
+        assert with_scaling(field, car().validation) is field
 
 
 def test_networks_inside_other_fields_are_scaled():
     network = hj.residual_network(6, 2, KEY, hidden=4)
     for field in (Gain(jnp.zeros(()), network), LinearSkip(jnp.zeros((6, 8)), network)):
-        scaling = with_scaling(hj.Hybrid(CAR.model.physics, field), CAR.train).residual.field.scaling
-        assert scaling == SCALED.residual.scaling
+        scaling = with_scaling(hj.Hybrid(car().model.physics, field), car().train).residual.field.scaling
+        assert scaling == scaled().residual.scaling
 
 
 def test_constant_channels_are_left_their_size():
-    still = eqx.tree_at(lambda w: w.u, CAR.train, jnp.zeros_like(CAR.train.u))
-    assert with_scaling(CAR.model, still).residual.scaling.scale[-2:] == (1.0, 1.0)
+    still = eqx.tree_at(lambda w: w.u, car().train, jnp.zeros_like(car().train.u))
+    assert with_scaling(car().model, still).residual.scaling.scale[-2:] == (1.0, 1.0)
 
 
 @pytest.mark.parametrize("skip", [False, True], ids=["network", "skip"])
 def test_every_way_to_evaluate_a_scaled_network_agrees(skip):
-    field = SCALED.residual
+    field = scaled().residual
     field = LinearSkip(jax.random.normal(KEY, (6, 8)), field) if skip else field
-    x, u = CAR.test.x0, CAR.test.u[:, 0]
+    x, u = car().test.x0, car().test.u[:, 0]
     expected = jax.vmap(field)(x, u)
     np.testing.assert_allclose(infer_batch(field, x.T, u.T).T, expected, rtol=1e-4, atol=1e-5)
     fused = fuse_for_inference(field)
@@ -75,7 +81,7 @@ def test_every_way_to_evaluate_a_scaled_network_agrees(skip):
 
 
 def test_training_leaves_the_scaling_and_a_file_keeps_it(tmp_path):
-    trained = hj.fit(CAR.model, CAR.train, CAR.validation, KEY, max_epochs=2).best
-    assert trained.residual.scaling == SCALED.residual.scaling != ChannelScaling()
+    trained = hj.fit(car().model, car().train, car().validation, KEY, max_epochs=2).best
+    assert trained.residual.scaling == scaled().residual.scaling != ChannelScaling()
     hj.save(tmp_path / "car.npz", trained)
     assert eqx.tree_equal(hj.load(tmp_path / "car.npz").field, trained)
