@@ -137,10 +137,12 @@ class Config(Run):
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
         if self.pooled() + self.source_train + self.validation + self.test > MOST:
-            raise ValueError(f"trajectories: --sizes, --pool, --source-train, --validation, --test: at most {MOST}")
+            options = "--sizes, --pool, --source-train, --validation and --test"
+            raise ValueError(f"{options} must ask for at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
-            raise ValueError(f"--sizes must each be more than the {FITTED} parameters of constant_disturbance")
+            needed = f"more than the {FITTED} parameters of {CONSTANT_DISTURBANCE}"
+            raise ValueError(f"--sizes must each be {needed}, got {self.sizes}")
         if NO_PHYSICS in chosen and self.residual_outputs != "all":
             refused = f"--residual-outputs {self.residual_outputs}"
             raise ValueError(f"{refused}: no_physics must write all derivatives, leave it out")
