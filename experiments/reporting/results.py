@@ -9,8 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, overload
 
 import numpy as np
-from scipy.special import stdtrit
-from scipy.stats import ttest_rel
+import scipy
 
 from hybrid_jax.io.files import json_value
 
@@ -59,7 +58,7 @@ def mean_difference(first: Values, second: Values, level: float = LEVEL) -> Inte
         return Interval(value)
     if np.ptp(one - other) == 0:  # the test has no statistic
         return Interval(value, value, value)
-    low, high = ttest_rel(one, other).confidence_interval(level)
+    low, high = scipy.stats.ttest_rel(one, other).confidence_interval(level)
     return Interval(value, float(low), float(high))
 
 
@@ -77,7 +76,7 @@ def share_of_gap(before: Values, after: Values, reachable: Values, level: float 
     value = float(closed.mean() / gap.mean())
     if len(gap) < 2:
         return Interval(value)
-    t = float(stdtrit(len(gap) - 1, (1 + level) / 2))
+    t = float(scipy.special.stdtrit(len(gap) - 1, (1 + level) / 2))
     covariance = np.cov(closed, gap) * t**2 / len(gap)
     a = gap.mean() ** 2 - covariance[1, 1]
     b = closed.mean() * gap.mean() - covariance[0, 1]

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 
 import numpy as np
-from scipy import signal
+import scipy
 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import GAP, FlightLog, at_rest, even_segments, repeats, runs_of, segments
@@ -70,15 +70,16 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     rate = 1 / log.dt
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"cutoff must lie between 0 and half the sampling frequency {rate / 2:.6g} Hz, got {cutoff!r}")
-    sections = signal.butter(2, cutoff, fs=rate, output="sos")
+    sections = scipy.signal.butter(2, cutoff, fs=rate, output="sos")
     log, all_samples = log[~repeats(log)], len(log)  # filtered, they could no longer be recognised
     x, u = log.x.copy(), log.u.copy()
     for part in even_segments(log):
         both = np.concatenate([x[part], u[part]], axis=1)
         if causal:
-            both, _ = signal.sosfilt(sections, both, axis=0, zi=signal.sosfilt_zi(sections)[..., None] * both[0])
+            start = scipy.signal.sosfilt_zi(sections)[..., None] * both[0]
+            both, _ = scipy.signal.sosfilt(sections, both, axis=0, zi=start)
         else:
-            both = signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
+            both = scipy.signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
         x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
@@ -120,7 +121,7 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
         kept = np.exp(-step)
         for part in parts:
             held = log.u[part]
-            speed, _ = signal.lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
+            speed, _ = scipy.signal.lfilter([0.0, 1 - kept], [1.0, -kept], held, axis=0, zi=held[:1])
             u[part] = held + (speed - held) * (1 - kept) / step
     done = f"rotors follow the log's motors with a time constant of {1000 * time_constant:.1f} ms"
     return FlightLog(log.t, log.x, u, log.name), done

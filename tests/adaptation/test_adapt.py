@@ -5,6 +5,7 @@ import json
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -20,8 +21,12 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, physics_of
 from hybrid_jax.metrics import rollout_mse
 
-NETWORK = jax.tree.map(lambda leaf: 0.1 * leaf, hj.residual_network(2, 1, jax.random.key(0), hidden=4, norm="none"))
 PUSH = jnp.array([0.0, 1.5])
+
+
+@cache
+def network():
+    return jax.tree.map(lambda leaf: 0.1 * leaf, hj.residual_network(2, 1, jax.random.key(0), hidden=4, norm="none"))
 
 
 def noisy(trajectories, seed=0, size=0.01):
@@ -38,8 +43,8 @@ def flown(truth, count=40, seed=0):
 
 
 def test_the_pendulum_s_length_is_found_and_no_disturbance():
-    truth = hj.Hybrid(pendulum(LENGTH), NETWORK)
-    result = adapt(hj.Hybrid(pendulum(0.7), NETWORK), noisy(flown(truth)))
+    truth = hj.Hybrid(pendulum(LENGTH), network())
+    result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))
     assert result.converged
     assert result.disturbance is None
     assert list(result.parameters) == ["log_length"]
@@ -47,13 +52,13 @@ def test_the_pendulum_s_length_is_found_and_no_disturbance():
     found = result.parameters["log_length"]
     assert abs(found.value - np.log(LENGTH)) < 4 / 1.96 * (found.high - found.value)
     assert 0 < found.high - found.low < 0.1
-    assert eqx.tree_equal(result.field.residual, NETWORK)
+    assert eqx.tree_equal(result.field.residual, network())
     assert result.mse_after < 0.1 * result.mse_before
 
 
 def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
-    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), NETWORK)
-    result = adapt(hj.Hybrid(pendulum(0.7), NETWORK), noisy(flown(truth)))
+    truth = hj.Hybrid(disturbed(pendulum(LENGTH), PUSH), network())
+    result = adapt(hj.Hybrid(pendulum(0.7), network()), noisy(flown(truth)))
     np.testing.assert_allclose(result.disturbance, PUSH, atol=0.2)
     assert list(result.parameters) == ["log_length", "disturbance[0]", "disturbance[1]"]
     assert result.parameters["disturbance[1]"].low > 1
@@ -85,10 +90,10 @@ def test_units_of_the_states_do_not_matter():
 
 @pytest.mark.parametrize("name", sorted(METHODS))
 def test_every_method_has_the_same_result(name):
-    data = flown(hj.Hybrid(pendulum(LENGTH), NETWORK))
+    data = flown(hj.Hybrid(pendulum(LENGTH), network()))
     method = METHODS[name]
     method = replace(method, max_epochs=3) if isinstance(method, FineTune) else name
-    result = adapt(hj.Hybrid(pendulum(0.55), NETWORK), data, method=method)
+    result = adapt(hj.Hybrid(pendulum(0.55), network()), data, method=method)
     assert isinstance(result, Adaptation)
     assert np.isfinite(result.mse_after)
     assert jax.tree.structure(physics_of(result.field)) == jax.tree.structure(pendulum())
@@ -108,8 +113,8 @@ def test_a_method_maps_over_stacked_fields():
 
 @pytest.mark.parametrize(("frozen", "moves"), [("residual", "physics"), ("physics", "residual")])
 def test_what_is_frozen_stays(frozen, moves):
-    field = hj.Hybrid(pendulum(0.55), NETWORK)
-    result = adapt(field, flown(hj.Hybrid(pendulum(LENGTH), NETWORK)), method=FineTune(frozen=frozen, max_epochs=3))
+    field = hj.Hybrid(pendulum(0.55), network())
+    result = adapt(field, flown(hj.Hybrid(pendulum(LENGTH), network())), method=FineTune(frozen=frozen, max_epochs=3))
     assert eqx.tree_equal(getattr(result.field, frozen), getattr(field, frozen))
     assert not eqx.tree_equal(getattr(result.field, moves), getattr(field, moves))
 

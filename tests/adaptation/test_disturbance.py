@@ -1,6 +1,7 @@
 """A constant disturbance is told apart from θ_p, the network stays, and it is fitted where windows need one."""
 
 from dataclasses import replace
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -24,6 +25,7 @@ PUSH = jnp.array([0.3, 2.7, -0.5, 0.2, -0.1, 0.05])
 RATIOS = {"Ix": 0.6, "Iy": -0.3, "k": 0.05}
 
 
+@cache
 def network():
     made = make_residual(jax.random.key(0), inputs="no_xy_yaw", outputs="accelerations", hidden=8, norm="none")
     return jax.tree.map(lambda leaf: 0.1 * leaf, made)
@@ -42,8 +44,11 @@ def flights(field, count=20, steps=10):
     return hj.Trajectories(x0, u, rollout_batch(field, x0, u, 0.01), dt=0.01)
 
 
-HYBRID = hj.Hybrid(body(), network())
-CHANGED = hj.Hybrid(body(**RATIOS), network())
+@cache
+def hybrid(**ratios):
+    return hj.Hybrid(body(**ratios), network())
+
+
 NOISE = np.repeat(np.array([0.001, 0.0, 0.02, 0.02], np.float32), [3, 4, 3, 3])  # m, –, m/s, rad/s; as sensors have it
 
 
@@ -52,7 +57,7 @@ def disturbed_by(push):
 
 
 def test_parameters_and_push_are_found_together_and_the_network_stays():
-    found = fit_least_squares(with_disturbance(HYBRID), flights(disturbed_by(PUSH)))
+    found = fit_least_squares(with_disturbance(hybrid()), flights(disturbed_by(PUSH)))
     assert found.converged
     for name, ratio in RATIOS.items():
         np.testing.assert_allclose(found.field.physics.physics.log_ratios[name], ratio, atol=2e-3)
@@ -87,8 +92,8 @@ def test_left_out_of_a_linear_problem_is_a_fit_to_the_others():
 def test_what_a_network_gets_wrong_is_not_taken_for_a_push():
     """Six numbers more fit these windows better, and the next ones worse: they are left at zero, and θ_p is alone."""
     windows = flights(hj.Hybrid(hj.Hybrid(body(**RATIOS), Drag()), network()))
-    found, alone = select_disturbance(HYBRID, windows), fit_least_squares(HYBRID, windows)
-    assert fit_least_squares(with_disturbance(HYBRID), windows).mse < 0.95 * alone.mse
+    found, alone = select_disturbance(hybrid(), windows), fit_least_squares(hybrid(), windows)
+    assert fit_least_squares(with_disturbance(hybrid()), windows).mse < 0.95 * alone.mse
     assert not found.needed
     np.testing.assert_array_equal(found.fit.field.physics.residual.value, 0.0)
     assert eqx.tree_equal(found.fit.field.physics.physics, alone.field.physics, rtol=1e-5, atol=1e-6)
@@ -97,8 +102,8 @@ def test_what_a_network_gets_wrong_is_not_taken_for_a_push():
 
 @pytest.mark.slow
 def test_noise_is_seldom_taken_for_a_push_and_hides_none_that_is_felt():
-    quiet, pushed = flights(CHANGED), flights(disturbed_by(jnp.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])))
-    fit = jax.jit(jax.vmap(lambda windows: select_disturbance(HYBRID, windows).needed))
+    quiet, pushed = flights(hybrid(**RATIOS)), flights(disturbed_by(jnp.array([0.0, 0.3, 0.0, 0.0, 0.0, 0.0])))
+    fit = jax.jit(jax.vmap(lambda windows: select_disturbance(hybrid(), windows).needed))
     alarms = fit(stack([measured(quiet, seed) for seed in range(20)]))
     # Six numbers that mean nothing gain more than a standard error in a few cases of a hundred.
     assert alarms.sum() <= 4

@@ -10,12 +10,16 @@ from hybrid_jax.export import load_program
 
 ca = pytest.importorskip("casadi")
 X, U = np.array([0, 0, 1, 1.0, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1]), np.full(4, 650.0)
-FIELD = hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
 
 
-def test_all_that_is_written_is_the_model(tmp_path, capsys):
+@pytest.fixture(scope="module")
+def field():
+    return hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+
+
+def test_all_that_is_written_is_the_model(field, tmp_path, capsys):
     model, out = tmp_path / "model.npz", tmp_path / "out"
-    hj.save(model, FIELD, {"seed": 3, "dt": 0.02})
+    hj.save(model, field, {"seed": 3, "dt": 0.02})
     command.main([str(model), "--out", str(out), "--casadi"])
     names = ["field.npz", "step.npz", "field.casadi", "step.casadi"]
     assert capsys.readouterr().out.split() == [str(out / name) for name in names]
@@ -40,8 +44,8 @@ def test_all_that_is_written_is_the_model(tmp_path, capsys):
     ],
     ids=str,
 )
-def test_bad_input_ends_in_one_line(about, options, message, tmp_path, capsys):
-    hj.save(tmp_path / "model.npz", FIELD, about)
+def test_bad_input_ends_in_one_line(about, options, message, field, tmp_path, capsys):
+    hj.save(tmp_path / "model.npz", field, about)
     with pytest.raises(SystemExit, match="2"):
         command.main([str(tmp_path / "model.npz"), "--out", str(tmp_path / "out"), *options])
     printed = capsys.readouterr().err

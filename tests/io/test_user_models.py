@@ -16,7 +16,7 @@ import pytest
 import user_modules
 from pendulum import pendulum
 from smoke import script
-from user_modules import fields, prediction
+from user_modules import MAKERS, made, prediction
 
 import hybrid_jax as hj
 import hybrid_jax.adaptation.expert_augmentation  # defines two of the old classes
@@ -25,7 +25,6 @@ from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.models import FORMAT
 
 KEY = jax.random.key(1)
-FIELDS = fields()
 OLD_FILES = sorted((Path(__file__).parent / "saved_by_version_1").glob("*.npz"))
 
 
@@ -33,8 +32,8 @@ OLD_FILES = sorted((Path(__file__).parent / "saved_by_version_1").glob("*.npz"))
 def in_fresh_process(tmp_path_factory):
     """Predictions of all models, saved here and loaded in another process."""
     folder = tmp_path_factory.mktemp("models")
-    for name, field in FIELDS.items():
-        hj.save(folder / f"{name}.npz", field)
+    for name in MAKERS:
+        hj.save(folder / f"{name}.npz", made(name))
     path = os.pathsep.join([str(Path(__file__).parent), *sys.path])
     code = "import sys, user_modules; user_modules.predict_all(sys.argv[1])"
     script("-c", code, folder, env=os.environ | {"PYTHONPATH": path})
@@ -42,18 +41,18 @@ def in_fresh_process(tmp_path_factory):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", MAKERS)
 def test_a_fresh_process_predicts_the_same(name, in_fresh_process):
-    np.testing.assert_array_equal(in_fresh_process[name], prediction(name, hj.Model(FIELDS[name])))
+    np.testing.assert_array_equal(in_fresh_process[name], prediction(name, hj.Model(made(name))))
 
 
-@pytest.mark.parametrize("name", FIELDS)
+@pytest.mark.parametrize("name", MAKERS)
 def test_a_loaded_model_is_the_saved_one(name, tmp_path):
-    path, field = tmp_path / "model.npz", FIELDS[name]
+    path, field = tmp_path / "model.npz", made(name)
     assert hj.check_savable(field) is None
     with warnings.catch_warnings(action="error"):
         hj.save(path, field)
-    for loaded in (hj.load(path).field, hj.load(path, like=fields()[name]).field):
+    for loaded in (hj.load(path).field, hj.load(path, like=MAKERS[name]()).field):
         assert eqx.tree_equal(named_leaves(loaded), named_leaves(field))
         assert describe(loaded) == describe(field)
 
@@ -135,21 +134,22 @@ def local_field(gain=2.0, size=3, dtype=np.float32):
 
 
 def with_activation(function):
-    return eqx.tree_at(lambda field: field.network.activation, FIELDS["perceptron"], function)
+    return eqx.tree_at(lambda field: field.network.activation, made("perceptron"), function)
 
 
+ACTIVATION = "field/network/activation"
 # Name → model that a file cannot rebuild, the same with other weights, and the part that is the reason.
 SKELETONS = {
-    "local class": (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
-    "lambda": (with_activation(lambda z: z), with_activation(lambda z: z), "field/network/activation"),
-    "partial": (with_activation(functools.partial(jax.nn.gelu)), FIELDS["perceptron"], "field/network/activation"),
-    "own function": (with_activation(prediction), FIELDS["perceptron"], "field/network/activation.*prediction"),
+    "local class": lambda: (local_field(), local_field(5.0), r"field: .*<locals>\.Local"),
+    "lambda": lambda: (with_activation(lambda z: z), with_activation(lambda z: z), ACTIVATION),
+    "partial": lambda: (with_activation(functools.partial(jax.nn.gelu)), made("perceptron"), ACTIVATION),
+    "own function": lambda: (with_activation(prediction), made("perceptron"), f"{ACTIVATION}.*prediction"),
 }
 
 
 @pytest.mark.parametrize("name", SKELETONS)
 def test_what_a_file_cannot_rebuild_is_filled_into_a_skeleton(name, tmp_path):
-    path, (field, like, reason) = tmp_path / "model.npz", SKELETONS[name]
+    path, (field, like, reason) = tmp_path / "model.npz", SKELETONS[name]()
     like = jax.tree.map(lambda leaf: leaf + 1 if eqx.is_inexact_array(leaf) else leaf, like)
     assert re.fullmatch(rf"{reason}.*", hj.check_savable(field))
     with pytest.warns(UserWarning, match=rf"like=.*{reason}"):
@@ -176,8 +176,8 @@ def test_a_skeleton_that_does_not_fit_is_refused_by_its_first_leaf(tmp_path):
 
 
 def test_a_skeleton_with_other_static_values_is_refused(tmp_path):
-    hj.save(tmp_path / "model.npz", FIELDS["wrapper"])
-    other = user_modules.Scaled(FIELDS["wrapper"].inner, (1.0, 3.0))
+    hj.save(tmp_path / "model.npz", made("wrapper"))
+    other = user_modules.Scaled(made("wrapper").inner, (1.0, 3.0))
     with pytest.raises(ValueError, match=r"field/scale/1 is 2\.0, but 3\.0 in `like`$"):
         hj.load(tmp_path / "model.npz", like=other)
 
@@ -185,7 +185,7 @@ def test_a_skeleton_with_other_static_values_is_refused(tmp_path):
 def test_what_cannot_be_saved_is_refused_with_its_path(tmp_path):
     reason = r"field/layers/1 is of type .*TextIOWrapper, which cannot be saved"
     with Path(__file__).open() as file:
-        field = eqx.tree_at(lambda field: field.layers[1], FIELDS["convolution"], file)
+        field = eqx.tree_at(lambda field: field.layers[1], made("convolution"), file)
         assert re.match(reason, hj.check_savable(field))
         with pytest.raises(ValueError, match=reason):
             hj.save(tmp_path / "model.npz", field)
@@ -241,8 +241,8 @@ def test_no_code_of_a_users_class_runs(tmp_path):
 
 
 def test_a_description_names_classes_and_static_values_but_holds_no_arrays():
-    one = describe(FIELDS["nested"])
+    one = describe(made("nested"))
     assert one["class"] == "user_modules:Nested"
     assert one["fields"]["options"] == {"class": "@Options", "fields": {"gain": 0.7, "steps": {"tuple": [1, 2]}}}
     assert one == describe(user_modules.Nested(KEY))
-    assert one != describe(eqx.tree_at(lambda field: field.limits, FIELDS["nested"], (-1.0, 5.0)))
+    assert one != describe(eqx.tree_at(lambda field: field.limits, made("nested"), (-1.0, 5.0)))

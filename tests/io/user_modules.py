@@ -1,6 +1,7 @@
 """Models as a user writes them: none is known to the library."""
 
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 
 import equinox as eqx
@@ -81,17 +82,21 @@ class Nested(hj.AbstractVectorField):
         return self.options.gain * jnp.clip(z, *self.limits)
 
 
-def fields():
-    """Name → model, each with random weights of one seed."""
-    key = jax.random.key(0)
-    return {
-        "perceptron": Dense(eqx.nn.MLP(3, 2, 8, 2, activation=jax.nn.gelu, key=key)),
-        "convolution": Convolution(key),
-        "wrapper": Scaled(hj.residual_network(2, 1, key, hidden=4), (1.0, 2.0)),
-        "pendulum": hj.Hybrid(pendulum(0.7), hj.residual_network(2, 1, key, hidden=4)),
-        "nested": Nested(key),
-        "no physics": hj.Hybrid(Kinematics(), hj.residual_network(13, 4, key, hidden=4)),
-    }
+KEY = np.zeros(2, np.uint32)  # jax.random.key(0)
+MAKERS = {
+    "perceptron": lambda: Dense(eqx.nn.MLP(3, 2, 8, 2, activation=jax.nn.gelu, key=KEY)),
+    "convolution": lambda: Convolution(KEY),
+    "wrapper": lambda: Scaled(hj.residual_network(2, 1, KEY, hidden=4), (1.0, 2.0)),
+    "pendulum": lambda: hj.Hybrid(pendulum(0.7), hj.residual_network(2, 1, KEY, hidden=4)),
+    "nested": lambda: Nested(jax.random.key(0)),  # which keeps its key
+    "no physics": lambda: hj.Hybrid(Kinematics(), hj.residual_network(13, 4, KEY, hidden=4)),
+}
+
+
+@cache
+def made(name):
+    """A model with random weights; the same at every call."""
+    return MAKERS[name]()
 
 
 def prediction(name, model):

@@ -1,5 +1,7 @@
 """Laws of training in stages."""
 
+from functools import cache
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -16,38 +18,42 @@ from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
 SETTINGS = Settings(batch_size=20)
-NETWORK = zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none"))
-FIELD = with_scaling(Hybrid(pendulum(0.6), NETWORK), TRAIN)
 
 
-def trained(stages, field=FIELD, train=TRAIN, **options):
-    return fit_in_stages(field, train, VALIDATION, KEY, stages, settings=SETTINGS, **options)
+@cache
+def hybrid():
+    network = zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none"))
+    return with_scaling(Hybrid(pendulum(0.6), network), TRAIN)
+
+
+def trained(stages, field=None, train=TRAIN, **options):
+    return fit_in_stages(field or hybrid(), train, VALIDATION, KEY, stages, settings=SETTINGS, **options)
 
 
 def test_groups_that_are_not_named_do_not_move():
     physics = trained([Stage({"physics": 0.03}, epochs=5)])[-1].best
-    assert physics.physics.log_length != FIELD.physics.log_length
-    assert eqx.tree_equal(physics.residual, FIELD.residual)
+    assert physics.physics.log_length != hybrid().physics.log_length
+    assert eqx.tree_equal(physics.residual, hybrid().residual)
     output = trained([Stage({"residual": 0.01, "residual/weight_in": 0.0}, epochs=5)])[-1].best
-    assert eqx.tree_equal(output.physics, FIELD.physics)
-    assert eqx.tree_equal(output.residual.weight_in, FIELD.residual.weight_in)
-    assert (output.residual.weight_out != FIELD.residual.weight_out).all()
+    assert eqx.tree_equal(output.physics, hybrid().physics)
+    assert eqx.tree_equal(output.residual.weight_in, hybrid().residual.weight_in)
+    assert (output.residual.weight_out != hybrid().residual.weight_out).all()
 
 
 def test_the_longest_group_that_fits_counts():
-    rates = rates_by_group(FIELD, {"": 1e-3, "residual": 1e-2, "residual/norm": 0.0})
+    rates = rates_by_group(hybrid(), {"": 1e-3, "residual": 1e-2, "residual/norm": 0.0})
     assert rates.physics.log_length == np.float32(1e-3)
     assert rates.residual.weight_in == np.float32(1e-2)
     assert rates.residual.norm.shift == 0
     assert eqx.tree_equal(make_run_config(rates, jnp.arange(3), 3, 0, 1, 1, 0.0).rates, rates)  # what a sweep takes
     with pytest.raises(ValueError, match="no learned array begins with 'resid', only physics/log_length, residual"):
-        rates_by_group(FIELD, {"resid": 1.0})
+        rates_by_group(hybrid(), {"resid": 1.0})
 
 
 def test_stages_go_on_from_each_other_and_never_get_worse():
     stages = [Stage({"physics": 0.03}, steps=2, epochs=30), Stage({"": 0.01}, epochs=60)]
     first, second = trained(stages)
-    start = float(rollout_mse(FIELD, VALIDATION))
+    start = float(rollout_mse(hybrid(), VALIDATION))
     assert second.best_mse < first.best_mse < start
     np.testing.assert_allclose(first.best_mse, rollout_mse(first.best, VALIDATION), rtol=1e-5)
     assert second.best_mse < 0.5 * first.best_mse  # the damping is the network's
