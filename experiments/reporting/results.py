@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple, overload
 
 import numpy as np
-import scipy
+import scipy  # which imports scipy.stats where it is first used
 
 from hybrid_jax.io.files import json_value
 

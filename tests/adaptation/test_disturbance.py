@@ -23,6 +23,7 @@ from hybrid_jax.sweep.lanes import stack
 
 PUSH = jnp.array([0.3, 2.7, -0.5, 0.2, -0.1, 0.05])
 RATIOS = {"Ix": 0.6, "Iy": -0.3, "k": 0.05}
+NOISE = np.repeat(np.array([0.001, 0.0, 0.02, 0.02], np.float32), [3, 4, 3, 3])  # m, –, m/s, rad/s; as sensors have it
 
 
 @cache
@@ -47,9 +48,6 @@ def flights(field, count=20, steps=10):
 @cache
 def hybrid(**ratios):
     return hj.Hybrid(body(**ratios), network())
-
-
-NOISE = np.repeat(np.array([0.001, 0.0, 0.02, 0.02], np.float32), [3, 4, 3, 3])  # m, –, m/s, rad/s; as sensors have it
 
 
 def disturbed_by(push):
