@@ -25,6 +25,7 @@ from hybrid_jax.adaptation import (
     covariance_of,
     fit_least_squares,
     intervals,
+    pool,
 )
 from hybrid_jax.dynamics import (
     AbstractVectorField,
@@ -57,4 +58,4 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
-__all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows"]
+__all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]

@@ -31,6 +31,13 @@ def rollout_mse(
     Raises:
         ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
     """
+    return jnp.mean(window_mse(field, windows, every, solver, chunk))
+
+
+def window_mse(
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
+) -> Float[Array, " n"]:
+    """L_MSE of each window; see `rollout_mse`."""
     check(windows, "windows")
     checks.count("chunk", chunk)
     checks.count("every", every)
@@ -41,15 +48,21 @@ def rollout_mse(
         predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
-    return mean_over(windows, errors, chunk)
+    return over(windows, errors, chunk)
 
 
 def mean_over(
     windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
 ) -> Float[Array, ""]:
     """The mean over windows of `errors`, which is evaluated on `chunk` windows at a time."""
+    return jnp.mean(over(windows, errors, chunk))
+
+
+def over(
+    windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
+) -> Float[Array, " n"]:
     whole = len(windows) // chunk * chunk
     chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, chunk, *leaf.shape[1:]), windows)
     rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
     parts = [jax.lax.map(errors, chunks).ravel()] if whole else []
-    return jnp.mean(jnp.concatenate([*parts, errors(rest)] if len(rest) else parts))
+    return jnp.concatenate([*parts, errors(rest)] if len(rest) else parts)

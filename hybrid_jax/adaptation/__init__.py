@@ -5,14 +5,17 @@
     print(result.report())
     result.parameters["log_length"].value, result.parameters["log_length"].low
 
-By default least squares fits the physical parameters θ_p and, if the windows need one, a constant disturbance; the
-network stays as it is. `METHODS` lists the other methods by name; `Method` says how to write one.
+By default the windows choose: the source as it is, its physical parameters θ_p by least squares, with these a constant
+disturbance and, of a rigid body, drag and the rotors' efficiencies, and last the network, held at the source's weights
+(`Auto`). `METHODS` lists the other methods by name; `Method` says how to write one.
 """
 
-from hybrid_jax.adaptation.adapting import Adaptation, Parameter, adapt
+from hybrid_jax.adaptation.adapting import METHODS, Adaptation, Parameter, adapt
+from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
-from hybrid_jax.adaptation.methods import METHODS, FineTune, LeastSquares, Method, Ridge, Solution, Source
+from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
+from hybrid_jax.adaptation.pooling import pool
 from hybrid_jax.adaptation.uncertainty import (
     DisturbanceSelection,
     Interval,
@@ -21,6 +24,7 @@ from hybrid_jax.adaptation.uncertainty import (
     select_disturbance,
 )
 
-__all__ = ["METHODS", "Adaptation", "Augmentation", "DisturbanceSelection", "ExpertAugmented", "FineTune", "Interval"]
-__all__ += ["LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
-__all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "select_disturbance"]
+__all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "DisturbanceSelection", "ExpertAugmented", "FineTune"]
+__all__ += ["Interval", "LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
+__all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "pool"]
+__all__ += ["select_disturbance"]

@@ -1,7 +1,9 @@
 """`adapt`: one call that adapts any field to windows of a changed system, by any method; one result for all methods."""
 
 import warnings
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
+from dataclasses import field as attribute
 from typing import Any
 
 import equinox as eqx
@@ -10,12 +12,18 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax import checks
+from hybrid_jax.adaptation import ridge
+from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice
+from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.least_squares import check_windows
-from hybrid_jax.adaptation.methods import METHODS, Method, Solution, scale_of
+from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
+from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain
 from hybrid_jax.adaptation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.corrected_body import simplified
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
+from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
 from hybrid_jax.integrate import checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
@@ -28,12 +36,25 @@ HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGED: "diverged"}
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
-UNDETERMINED = "the windows do not determine the parameters"
+NOT_FITTED = "no parameter was fitted"
+UNDETERMINED = "the windows do not tell the parameters apart"
+
+METHODS: Mapping[str, Method] = {
+    "auto": Auto(),
+    "least_squares": LeastSquares(),
+    "theta_least_squares": LeastSquares(disturbance=False),
+    "fine_tune": FineTune(),
+    "theta_only": FineTune(frozen="residual"),
+    "residual_only": FineTune(frozen="physics"),
+    "last_layer": Ridge(ridge.last_layer),
+    "linear_residual": Ridge(ridge.linear_residual),
+    "source": Source(),
+}
 
 # Of a rigid body's parameters, and of its disturbance; another class may have a class attribute `units` like this.
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
 UNITS |= {"centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
-UNITS |= {"rate_damping": "N m s", "velocity_lag": "s"}
+UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s"}
 UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w{axis}]": "rad/s²" for axis in "xyz"}
 
 
@@ -66,6 +87,13 @@ class Adaptation:
     status: str  # one of `STATUS`
     level: float  # confidence level of the intervals
     without_intervals: str | None  # why there are none, if so
+    covariance: Float[np.ndarray, "p p"] | None = None  # of the parameters as the physics holds them
+    degrees: int | None = None  # of freedom of the covariance, one less than the clusters of windows that touch
+    candidates: dict[str, float] = attribute(default_factory=dict)  # of "auto": error on left-out windows, by name
+    chosen: str | None = None  # of these
+    expected: Expected = attribute(default_factory=dict)  # of "auto": errors on a flight that was not seen
+    rigid: bool = False  # whether the states are those of a rigid body
+    outside: dict[str, float] = attribute(default_factory=dict)  # share of samples unlike those learned from
 
     @property
     def converged(self) -> bool:
@@ -79,11 +107,29 @@ class Adaptation:
             f"Adapted to {self.windows} windows by {self.method}: {self.status}{after}.",
             f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after.",
         ]
+        if self.chosen is not None:
+            known = {
+                name: f"{error:.3g}" if np.isfinite(error) else "undetermined"
+                for name, error in self.candidates.items()
+            }
+            others = ", ".join(f"{name} {error}" for name, error in known.items() if name != self.chosen)
+            chosen = f"{self.chosen} {self.candidates[self.chosen]:.3g}"
+            lines.append(f"Chosen by the error on left-out windows: {chosen} (others: {others}).")
+        if self.expected:
+            lines.append("RMSE to expect on a flight not seen (80% intervals, from blocks left out of these windows):")
+            lines += lines_of(self.expected, self.rigid)
+        for name, share in self.outside.items():
+            if share > WARN:
+                lines.append(
+                    f"Warning: {name} is outside of what the source learned from in {share:.0%} of the samples."
+                )
         if self.parameters:
             note = f"{self.level:.0%} confidence intervals" if self.without_intervals is None else "no intervals"
             width = max(map(len, self.parameters))
             lines.append(f"Parameters ({note}):")
             lines += [f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items()]
+            if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
+                lines.append(f"Warning: these windows do not depend on {', '.join(unseen)}; any value fits them.")
         lines.append(f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}.")
         if self.parameters and self.without_intervals is not None:
             lines.append(f"No intervals: {self.without_intervals}.")
@@ -93,7 +139,9 @@ class Adaptation:
         """Everything but the field, as JSON values."""
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
         disturbance = None if self.disturbance is None else self.disturbance.tolist()
+        covariance = None if self.covariance is None else self.covariance.tolist()
         found = vars(self) | {"converged": self.converged, "disturbance": disturbance, "parameters": parameters}
+        found |= {"covariance": covariance}
         return {name: value for name, value in found.items() if name != "field"}
 
 
@@ -101,8 +149,9 @@ def adapt(
     field: AbstractVectorField,
     windows: Trajectories,
     *,
-    method: str | Method = "least_squares",
+    method: str | Method = "auto",
     validation: Trajectories | None = None,
+    learned_from: Trajectories | None = None,
     settings: Settings | None = None,
     level: float = 0.95,
 ) -> Adaptation:
@@ -114,6 +163,7 @@ def adapt(
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
+        learned_from: windows that the source was trained on; the report warns where these windows are unlike them.
         settings: by default RK4, minibatches of at most 100, and `scaled_loss`, so that units do not matter.
         level: confidence level of the intervals.
 
@@ -122,6 +172,8 @@ def adapt(
     """
     name, method = _named(method)
     check_windows(field, windows)
+    if learned_from is not None:
+        check_windows(field, learned_from, "learned_from")
     check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     check_windows(field, held_out, "validation")
@@ -137,25 +189,44 @@ def adapt(
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
-    adapted, found, status = solution.field, disturbance_of(solution.field), int(solution.status)
-    disturbance = None if found is None else np.asarray(found.vector(windows.x0.shape[-1]))
-    if disturbance_of(field) is None and not np.any(disturbance):  # the windows need none
-        adapted, disturbance = without_disturbance(adapted), None
-    parameters, missing = _parameters(adapted, train, settings, level, exact and status != DIVERGED)
-    mse = eqx.filter_jit(rollout_mse)
+    adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
+    choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
+    exact = exact and int(solution.status) != DIVERGED and choice.get("chosen") not in NETWORKS
+    free = None if solution.choice is None else _fitted(solution.choice, adapted)
+    found, mse = disturbance_of(adapted), eqx.filter_jit(rollout_mse)
     return Adaptation(
         field=adapted,
         method=name,
-        parameters=parameters,
-        disturbance=disturbance,
+        disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
         mse_before=float(mse(field, windows, solver=settings.solver)),
         mse_after=float(mse(adapted, windows, solver=settings.solver)),
         windows=len(windows),
         steps=int(solution.steps),
-        status=STATUS[status],
+        status=STATUS[int(solution.status)],
         level=level,
-        without_intervals=missing,
+        outside={} if learned_from is None else shares_outside(motion_of(learned_from), motion_of(windows)),
+        **choice,
+        **_parameters(adapted, train, settings, level, exact, free),
     )
+
+
+def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any]:
+    """The attributes of `Adaptation` that say what was chosen, and the errors to expect of it."""
+    seconds = windows.horizon * windows.dt
+    chain = seconds * longest_chain(windows, choice.errors.mse.shape[1])
+    ends = np.asarray(choice.errors.ends[choice.taken])
+    return {
+        "candidates": dict(zip(choice.names, geometric_mean(choice.errors.mse).tolist(), strict=True)),
+        "chosen": choice.names[int(choice.taken)],
+        "expected": expected_errors(ends, (round(seconds, 9), round(chain, 9)), rigid),
+        "rigid": rigid,
+    }
+
+
+def _fitted(choice: Choice, adapted: AbstractVectorField) -> np.ndarray:
+    """Which parameters of the adapted field were fitted (p,)."""
+    free = dict(zip(choice.parameters, np.asarray(choice.free[choice.taken]).tolist(), strict=True))
+    return np.array([free[name] for name in named_parameters(adapted)])
 
 
 def _named(method: str | Method) -> tuple[str, Method]:
@@ -185,21 +256,27 @@ def _size(field: AbstractVectorField) -> int:
 
 
 def _parameters(
-    field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, exact: bool
-) -> tuple[dict[str, Parameter], str | None]:
-    """The parameters by name, and why they have no intervals, if they have none."""
+    field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, exact: bool, free
+) -> dict[str, Any]:
+    """The attributes of `Adaptation` about the parameters: why there are no intervals, if there are none."""
     if not 0 < _size(field) <= NAMED:
-        return {}, NOT_LEAST_SQUARES
+        return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own = physics_of(without_disturbance(field))
     known = UNITS if isinstance(own, AbstractRigidBody) else getattr(own, "units", {})
     values = named_parameters(field)
     units = {name: known.get(name, known.get(name.split("[")[0])) for name in values}
     alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
     if not exact:
-        return alone, NOT_LEAST_SQUARES
-    scale = scale_of(settings.objective, windows.x0.shape[-1])
-    covariance = covariance_of(field, windows, solver=settings.solver, scale=scale)
-    if not np.isfinite(covariance).all():
-        return alone, UNDETERMINED
-    found = intervals(field, covariance, level)
-    return {name: Parameter(*map(float, found[name]), unit=units[name]) for name in values}, None
+        return {"parameters": alone, "without_intervals": NOT_LEAST_SQUARES}
+    if free is not None and not free.any():
+        return {"parameters": alone, "without_intervals": NOT_FITTED}
+    scale, cluster = scale_of(settings.objective, windows.x0.shape[-1]), correlated(windows)
+    degrees = None if cluster == 1 else -(-len(windows) // cluster) - 1
+    covariance = covariance_of(field, windows, solver=settings.solver, scale=scale, free=free, cluster=cluster)
+    if np.isnan(covariance).any():
+        return {"parameters": alone, "without_intervals": UNDETERMINED}
+    found = intervals(field, covariance, level, degrees)
+    fitted = [*values] if free is None else [name for name, one in zip(values, free, strict=True) if one]
+    bounded = {name: Parameter(*map(float, found[name]), unit=units[name]) for name in fitted}
+    result = {"parameters": alone | bounded, "without_intervals": None}
+    return result | {"covariance": np.asarray(covariance), "degrees": degrees}

@@ -60,7 +60,7 @@ def fit_least_squares(
     """
     check_windows(field, windows)
     checks.count("max_steps", max_steps)
-    return _fit_least_squares(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
+    return fit_free(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
@@ -70,15 +70,30 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
         check_attitudes(windows, name)
 
 
-def check_determined(field: AbstractVectorField, n: int) -> None:
-    """Refuse n windows if the physics has as many parameters or more, or none."""
-    p, name = ravel_parameters(field)[0].size, type(physics_of(field)).__name__
+def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:
+    """Refuse n windows if as many parameters or more are fitted, by default all of the physics, or if it has none."""
+    size, name = ravel_parameters(field)[0].size, type(physics_of(field)).__name__
+    p = size if fitted is None else fitted
     if n <= p:
         raise ValueError(f"windows: {n} are too few for the {p} parameters of {name}, at least {p + 1} are needed")
 
 
+def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
+    """How far rounding moves all states: a parameter with less effect than that cannot be fitted."""
+    x = windows.x if scale is None else windows.x / scale
+    return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
+
+
 @eqx.filter_jit
-def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale) -> LeastSquaresFit:
+def fit_free(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    solver: Solver,
+    max_steps: int,
+    scale: Scale,
+    free: Bool[Array, " p"] | None = None,
+) -> LeastSquaresFit:
+    """`fit_least_squares` without its checks; parameters that are not free, or have no effect, stay as they are."""
     start, unravel = ravel_parameters(field)
 
     def residuals(theta: Theta) -> Float[Array, "n t d"]:
@@ -92,7 +107,9 @@ def _fit_least_squares(field, windows: Trajectories, solver: Solver, max_steps: 
     at_start, push = jax.linearize(residuals, start)
     size = _nonzero(jnp.linalg.norm(at_start))
     effects = jax.vmap(push)(jnp.eye(start.size, dtype=start.dtype))
-    unit = size / _nonzero(jnp.linalg.norm(effects.reshape(start.size, -1), axis=1))
+    effect = jnp.linalg.norm(effects.reshape(start.size, -1), axis=1)
+    seen = effect > rounding(windows, scale)
+    unit = jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0)
 
     def theta_at(z: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)

@@ -1,13 +1,14 @@
 """Methods of adaptation: values that turn a source field and target windows into an adapted field."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar, Literal, NamedTuple, Protocol
+from functools import cache
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optax
 from jaxtyping import Array, Int, PyTree
 
 from hybrid_jax.adaptation import ridge
@@ -16,7 +17,7 @@ from hybrid_jax.adaptation.uncertainty import select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.training.channels import ChannelLoss
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED, make_run_config, run, start
+from hybrid_jax.training.fitting import ADAM, CAPPED, DIVERGED, STOPPED, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings
 from hybrid_jax.trajectories import Trajectories
 
@@ -27,6 +28,7 @@ class Solution(NamedTuple):
     field: AbstractVectorField
     steps: Int[Array, ""] | int = 0
     status: Int[Array, ""] | int = STOPPED
+    choice: Any = None  # of `Auto`
 
 
 class Method(Protocol):
@@ -91,6 +93,7 @@ class FineTune:
     patience: int = 20
     max_epochs: int = 2000
     regulariser_weight: float = 1e-3  # λ of `settings.regulariser`, if there is one
+    l2_sp: float = 0.0  # weight of half the squared distance from the source's parameters, see `held_at_start`
     seed: int = 0  # of the order of minibatches
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
@@ -106,9 +109,20 @@ class FineTune:
         config = make_run_config(rates, jnp.arange(n), n, *rule)
         settings = replace(settings, batch_size=min(settings.batch_size, n))
         data, held_out = (settings.objective.prepare(windows, "windows") for windows in (train, validation))
-        state = start(marked, jax.random.key(self.seed))
-        state, _ = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs)
+        optimiser = held_at_start(self.l2_sp) if self.l2_sp else ADAM
+        state = start(marked, jax.random.key(self.seed), optimiser)
+        state, _ = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs, optimiser)
         return Solution(replace(state.best, **kept), state.epoch, state.status)
+
+
+@cache  # the same object for the same weight, so that its program is compiled once
+def held_at_start(weight: float) -> optax.GradientTransformation:
+    """Adam with a penalty weight / 2 · ‖θ − θ₀‖², θ₀ the parameters at the start (L2-SP; Li et al., ICML 2018)."""
+
+    def pull(updates, state, params=None):
+        return jax.tree.map(lambda g, p, start: g + weight * (p - start), updates, params, state), state
+
+    return optax.chain(optax.GradientTransformation(lambda params: params, pull), ADAM)
 
 
 @dataclass(frozen=True)
@@ -131,18 +145,6 @@ class Source:
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         return Solution(field)
-
-
-METHODS: Mapping[str, Method] = {
-    "least_squares": LeastSquares(),
-    "theta_least_squares": LeastSquares(disturbance=False),
-    "fine_tune": FineTune(),
-    "theta_only": FineTune(frozen="residual"),
-    "residual_only": FineTune(frozen="physics"),
-    "last_layer": Ridge(ridge.last_layer),
-    "linear_residual": Ridge(ridge.linear_residual),
-    "source": Source(),
-}
 
 
 def scale_of(objective: Objective, d: int) -> Scale:

@@ -12,7 +12,8 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+import scipy
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import least_squares
@@ -59,11 +60,14 @@ def covariance_of(
     chunk: int = CHUNK,
     error: ErrorLoss | None = None,
     scale: Scale = None,
+    free: Bool[Array | np.ndarray, " p"] | None = None,
+    cluster: int = 1,
 ) -> Float[Array, "p p"]:
     """The covariance of θ_p of a field fitted to the windows, given θ_d, in the physics' own parametrisation.
 
     Rows are in the order of `ravel_parameters`; for a `RigidBody`: log Ix, log Iy, log k. Pure: it compiles and maps
-    over stacked fields. It is not finite where the windows do not determine the parameters.
+    over stacked fields. A parameter that changes nothing in the windows has an infinite variance; where they do not
+    tell two parameters apart, nothing is finite.
 
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
@@ -75,27 +79,42 @@ def covariance_of(
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
+        free: which parameters were fitted, all by default; the others are known and have no variance.
+        cluster: so many consecutive windows may be correlated, as those of one flight are; with the sandwich their
+            J_iᵀr_i are summed before they enter M (Liang and Zeger 1986), and intervals need Student's t.
 
     Raises:
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
     """
     least_squares.check_windows(field, windows)
-    least_squares.check_determined(field, len(windows))
+    fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
+    if not checks.is_traced(fitted):
+        least_squares.check_determined(field, len(windows), int(fitted))
     checks.count("chunk", chunk)
+    checks.count("cluster", cluster)
     if kind not in Kind.__args__:
         raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
     if error is not None and kind == "homoscedastic":
         raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
-    return _covariance(normal_equations(field, windows, solver, chunk, error, scale), kind, windows.x[0].size)
+    equations = normal_equations(field, windows, solver, chunk, error, scale)
+    seen = has_effect(equations, windows, scale)
+    equations = masked(equations, seen if free is None else free & seen)
+    unknown = ~seen if free is None else free & ~seen
+    found = _covariance(equations, kind, windows.x[0].size, fitted, cluster)
+    return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
 @eqx.filter_jit
-def _covariance(equations: NormalEquations, kind: Kind, entries: int) -> Float[Array, "p p"]:
+def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
     gram, score, square = equations
-    n, p = score.shape
+    n = len(score)
     bread = inverse(jnp.sum(gram, axis=0))
     if kind == "homoscedastic":
         return jnp.sum(square) / (n * entries - p) * bread
+    if cluster > 1:
+        clusters = -(-n // cluster)
+        score = jax.ops.segment_sum(score, np.arange(n) // cluster, clusters)
+        score = jnp.sqrt(clusters / (clusters - 1) * (n - 1) / n) * score
     half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
     return n / (n - p) * half.T @ half
 
@@ -124,24 +143,36 @@ def normal_equations(
     return jax.lax.map(one, windows, batch_size=min(chunk, len(windows)))
 
 
-def intervals(field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95) -> dict[str, Interval]:
+def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
+    """The normal equations of the free parameters; of the others, such that they stay as they are."""
+    gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
+    return NormalEquations(gram, jnp.where(free, equations.score, 0.0), equations.square)
+
+
+def intervals(
+    field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95, degrees: int | None = None
+) -> dict[str, Interval]:
     """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
 
     The error is taken as normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter
-    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
+    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is. With `degrees`
+    of freedom, one less than the clusters of the covariance, z is Student's quantile.
 
     Raises:
-        ValueError: a level not between 0 and 1, or a covariance of another shape, not finite or of negative variance.
+        ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
     """
     check_level(level)
     theta, unravel = ravel_parameters(physics := physics_of(field))
-    array, p = checks.floating("covariance", covariance), theta.size
+    array, p = jnp.asarray(checks.real_array("covariance", covariance), float), theta.size
     if array.shape != (p, p):
         raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
     variances = jnp.diagonal(array)
-    if not checks.is_traced(variances) and (variances < 0).any():
+    if not checks.is_traced(variances) and not (variances >= 0).all():
         raise ValueError(f"covariance must have variances of at least 0, got {variances}")
-    away = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2) * jnp.sqrt(variances)
+    quantile = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2)
+    if degrees is not None:
+        quantile = float(scipy.special.stdtrit(degrees, (1 + level) / 2))
+    away = quantile * jnp.sqrt(variances)
     left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
     return {
         name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
@@ -179,6 +210,11 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
         for name, value in values.items()
         for at in np.ndindex(value.shape)
     }
+
+
+def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
+    """Which parameters change the predictions by more than rounding does."""
+    return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
 
 
 def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:

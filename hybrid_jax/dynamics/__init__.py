@@ -5,7 +5,7 @@
 and `vehicle_file` reads all of them from a TOML file.
 """
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable, unfreeze
+from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid, trainable, unfreeze
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
@@ -13,7 +13,7 @@ from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, rig
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
-__all__ = ["AbstractVectorField", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
+__all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
 __all__ += ["ConstantDisturbance", "disturbed", "with_disturbance"]
 __all__ += ["ForcedBody", "Multirotor", "RigidBody", "Terms", "VehicleModel"]
 __all__ += ["load_vehicle_model", "multirotor", "perturbed", "rigid_body", "with_vehicle"]

@@ -6,6 +6,7 @@ of an `AbstractVectorField`, whose defaults serve code for one sample; a subclas
 """
 
 from abc import abstractmethod
+from collections.abc import Iterable
 from typing import ClassVar, Self
 
 import equinox as eqx
@@ -136,6 +137,38 @@ class Hybrid(AbstractVectorField):
         return Hybrid(fuse_for_inference(self.physics), fuse_for_inference(self.residual))
 
 
+class Blend(AbstractVectorField):
+    """ẋ = the mean of several fields, such as models between which the data cannot decide."""
+
+    fields: tuple[AbstractVectorField, ...]
+
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        return self._mean(field(x, u) for field in self.fields)
+
+    def train_batch(self, x, u):
+        return self._mean(train_batch(field, x, u) for field in self.fields)
+
+    def infer_batch(self, x, u):
+        return self._mean(infer_batch(field, x, u) for field in self.fields)
+
+    def update_running_stats(self, x, u):
+        return Blend(tuple(update_running_stats(field, x, u) for field in self.fields))
+
+    def apply_residual(self, x, residual):
+        return self._mean(apply_residual(field, x, residual) for field in self.fields)
+
+    def linearize(self, x, u, dx, du):
+        values, columns = zip(*(linearize(field, x, u, dx, du) for field in self.fields), strict=True)
+        return self._mean(values), self._mean(columns)
+
+    def fuse_for_inference(self):
+        return Blend(tuple(fuse_for_inference(field) for field in self.fields))
+
+    def _mean(self, parts: Iterable[Array]) -> Array:
+        first, *others = parts
+        return sum(others, start=first) / len(self.fields)
+
+
 class AbstractWrapper(AbstractVectorField):
     """ẋ = write(x, f(read(x), u)) for the field f inside."""
 
@@ -189,6 +222,8 @@ def features_first(field: AbstractVectorField) -> bool:
     """Whether some part of a sum has a batched form, so that the batch is best kept on the last axis."""
     if isinstance(field, Hybrid):
         return features_first(field.physics) or features_first(field.residual)
+    if isinstance(field, Blend):
+        return any(map(features_first, field.fields))
     return features_first(field.field) if isinstance(field, Frozen) else getattr(field, "accepts_batch", False)
 
 

@@ -108,10 +108,14 @@ class SplitSpec:
 
     windows: int
     steps: int
+    flights: int = 0  # the windows are the first ones of so many flights, in order; by default at random of many
 
     def __post_init__(self):
         checks.count("windows", self.windows)
         checks.count("steps", self.steps)
+        checks.count("flights", self.flights, least=0)
+        if self.flights and (self.windows % self.flights or self.windows * self.steps > self.flights * SECONDS / DT):
+            raise ValueError(f"windows must be as many of each of {self.flights} flights of {SECONDS:g} s")
         if self.steps > round(SECONDS / DT):
             raise ValueError(f"steps must be at most {round(SECONDS / DT)}, a whole flight, got {self.steps}")
 
@@ -147,14 +151,19 @@ def make_dataset(
 
 
 def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[Trajectories, Counter[str]]:
-    """Shuffled, non-overlapping windows of as many flights as needed."""
+    """Shuffled, non-overlapping windows of as many flights as needed; or the first ones of some whole flights."""
     key_flights, key_order = jax.random.split(key)
     tally, parts = Counter[str](), []
-    while tally["windows"] < SPARE * spec.windows:
+    each = spec.windows // spec.flights if spec.flights else 0
+    while tally["windows"] < SPARE * spec.windows if not spec.flights else len(parts) < spec.flights:
         flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally["flights"]))
-        parts += cut(flights, spec.steps, tally, domain.nominal)
+        found = cut(flights, spec.steps, tally, domain.nominal)
+        whole = round(SECONDS / DT) // spec.steps  # windows of a flight of which none is dropped
+        parts += [part[:each] for part in found if len(part) == whole] if spec.flights else found
         if not parts:
             raise ValueError(f"domain {domain.name}: none of {tally['flights']} flights stayed in bounds")
+    if spec.flights:
+        return concatenate(parts[: spec.flights]), tally
     windows = concatenate(parts)
     order = np.asarray(jax.random.permutation(key_order, len(windows)))[: spec.windows]
     return windows[order], tally
@@ -194,11 +203,16 @@ def survey(windows: Trajectories) -> dict[str, float]:
     }
 
 
+def _described(spec: SplitSpec) -> dict[str, int]:
+    """Its fields; flights only where they are asked for, as earlier datasets knew none."""
+    return {name: value for name, value in asdict(spec).items() if name != "flights" or value}
+
+
 def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> dict[str, Any]:
     """Everything that determines the windows, as JSON values."""
     return domain.describe() | {
         "recipe": RECIPE,
-        "splits": {name: asdict(spec) for name, spec in splits.items()},
+        "splits": {name: _described(spec) for name, spec in splits.items()},
         "dt": DT,
         "flight_seconds": SECONDS,
         "seed": seed,

@@ -10,11 +10,12 @@ from functools import lru_cache
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
@@ -73,7 +74,7 @@ def sweep(
     states, plans = jax.device_get((states, plans))
     shared = settings.objective.prepare(train, "train"), settings.objective.prepare(validation, "validation")
     check_minibatch(states.field, settings)
-    _check(plans, shared[0], settings)
+    _check(plans, *shared, settings)
     plans, shared = _padded(plans, shared, min_capacity[1])
     shapes = _shapes(lane((states, plans), 0), shared)
     block = _block(settings, width, max(count(states), min_capacity[0]), shapes)
@@ -97,6 +98,13 @@ def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
     """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`."""
+    return evaluate_windows(fields, windows, every, settings, min_lanes)[0]
+
+
+def evaluate_windows(
+    fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
+) -> tuple[Float[np.ndarray, " lanes"], Float[np.ndarray, "lanes windows"]]:
+    """`evaluate`, and what it is the mean of: the error of each window."""
     lanes = count(fields := jax.device_get(fields))
     errors = _evaluation(settings, every, max(lanes, min_lanes), _shapes(lane(fields, 0), windows))
     return errors(fields, (windows,), np.ones(lanes), range(lanes))
@@ -129,8 +137,9 @@ def _block(settings: Settings, width: int | None, lanes: int, shapes: tuple) -> 
 
 @lru_cache(PROGRAMS)
 def _evaluation(settings: Settings, every: int, lanes: int, shapes: tuple) -> LaneMap:
-    def errors(field: AbstractVectorField, windows: Trajectories) -> Float[Array, ""]:
-        return rollout_mse(field, windows, every, settings.solver)
+    def errors(field: AbstractVectorField, windows: Trajectories) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+        each = window_mse(field, windows, every, settings.solver)
+        return jnp.mean(each), each
 
     return LaneMap(errors, min_capacity=lanes, compiler=FAST_COMPILE)
 
@@ -162,13 +171,16 @@ def _progress(states: FitState, plans: RunConfig, seconds: float) -> Progress:
     )
 
 
-def _check(plans: RunConfig, train: PyTree, settings: Settings) -> None:
+def _check(plans: RunConfig, train: PyTree, validation: PyTree, settings: Settings) -> None:
     batch, listed = settings.batch_size, plans.subset.shape[-1]
     for size in np.unique(plans.n_train):
         if not batch <= size <= min(listed, len(train)):
             windows = f"the number of windows: {len(train)} in train, {listed} in subset"
             raise ValueError(f"n_train={size} must lie between batch_size={batch} and {windows}")
-    # A gather would clamp such an index and silently train on another window.
-    outside = plans.subset[(plans.subset < 0) | (plans.subset >= len(train))]
-    if outside.size:
-        raise ValueError(f"subset holds {outside[0]}, which is not an index of the {len(train)} windows of train")
+    # A gather would clamp such an index and silently use another window.
+    for name, split, windows in (("subset", "train", train), ("validate_on", "validation", validation)):
+        index = np.asarray(getattr(plans, name) if getattr(plans, name) is not None else (), int)
+        outside = index[(index < 0) | (index >= len(windows))]
+        if outside.size:
+            words = f"which is not an index of the {len(windows)} windows of {split}"
+            raise ValueError(f"{name} holds {outside[0]}, {words}")

@@ -30,6 +30,7 @@ class RunConfig(eqx.Module):
     patience: Int[Array, ""]
     max_epochs: Int[Array, ""]
     regulariser_weight: Float[Array, ""]  # λ
+    validate_on: Int[Array, " v"] | None = None  # indices of the validation windows to use, by default all
 
 
 class FitState(eqx.Module):
@@ -102,7 +103,8 @@ def _epoch(
 
     arrays, adam, total = jax.lax.fori_loop(0, batches, update, (arrays, state.adam, jnp.zeros(())))
     field = eqx.combine(arrays, rest)
-    error = settings.objective.validate(field, validation, settings)
+    own = validation if plan.validate_on is None else validation[plan.validate_on]
+    error = settings.objective.validate(field, own, settings)
     return _updated(state, plan, field, adam, key, total / batches, error), error
 
 

@@ -1,8 +1,5 @@
 """Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
 
-import contextlib
-import io
-import json
 from dataclasses import replace
 
 import equinox as eqx
@@ -14,8 +11,8 @@ from pendulum import pendulum, swings
 from rich.console import Console
 from test_least_squares import Brake, Push, log_lengths, pushes
 
-from experiments import coverage as command
-from experiments.coverage import Config, coverage
+from experiments.paper import known_body
+from experiments.paper.known_body import KnownBody, coverage, known_body_table
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import Hybrid
@@ -94,6 +91,20 @@ def test_an_interval_is_the_value_times_and_over_a_factor(level, z):
             np.testing.assert_allclose([high / value, value / low], np.exp(z * error), rtol=1e-5)  # float32
 
 
+def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
+    windows, _ = pushes(30, 0.1)
+    still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.float32([1, 0]))
+    first = np.float32([1, np.inf])  # the second state, which the second gain moves as well, does not count
+    found = fit_least_squares(Push(jnp.array([1.0, 7.0])), still, scale=first)
+    covariance = covariance_of(found.field, still, scale=first)
+    assert tuple(intervals(found.field, covariance)["gains[1]"]) == (7, -np.inf, np.inf)
+    # The other one is found as it is where the second is known.
+    known = covariance_of(found.field, still, scale=first, free=np.array([True, False]))
+    assert found.converged
+    assert 0 < known[0, 0] < np.inf
+    np.testing.assert_allclose(covariance[0, 0], known[0, 0] * 29 / 28, rtol=1e-5)  # the factor n / (n - p)
+
+
 def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
         covariance_of(pendulum(), SWINGS[:1])
@@ -110,16 +121,13 @@ REPEATS = 100
 
 
 @pytest.fixture(scope="module")
-def said_and_written(tmp_path_factory):
-    folder, said = tmp_path_factory.mktemp("runs"), io.StringIO()
-    with contextlib.redirect_stdout(said):
-        command.main(["--repeats", str(REPEATS), "--out", str(folder)])
-    return said.getvalue(), json.loads((folder / "coverage" / "coverage.json").read_text())
+def found():
+    return coverage(KnownBody(repeats=REPEATS), Console(quiet=True))
 
 
 @pytest.fixture(scope="module")
-def rows(said_and_written):
-    return {(row["case"], row["noise_on"], row["parameter"]): row for row in said_and_written[1]["rows"]}
+def rows(found):
+    return {(row["case"], row["noise_on"], row["parameter"]): row for row in found}
 
 
 @pytest.mark.slow
@@ -145,53 +153,35 @@ def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_n
 
 
 @pytest.mark.slow
-def test_the_command_prints_and_writes_every_case(said_and_written, rows):
-    said, written = said_and_written
-    assert written["config"]["repeats"] == REPEATS
-    assert len(rows) == 12  # two truths, noise on targets or on all, three parameters
-    assert "Does the 95 % interval contain the truth?" in said
-    for row in rows.values():
-        assert f"{100 * row['coverage']:.1f} ±" in said
+def test_the_table_has_a_line_for_every_case(found, rows):
+    lines = {tuple(line[:3]): line[3] for line in known_body_table(found, 0.95).lines}
+    assert lines.keys() == rows.keys()  # two truths, noise on targets or on all, three parameters
+    assert all(text.startswith(f"{100 * rows[case]['coverage']:.1f} ±") for case, text in lines.items())
 
 
 @pytest.mark.parametrize(
     ("changed", "said"),
     [
-        ({"n_train": 3}, "--n-train must be more than the 3 parameters, got 3"),
-        ({"repeats": 0}, "--repeats must be an integer of at least 1, got 0"),
-        ({"seed": -1}, "--seed must be an integer of at least 0, got -1"),
-        ({"level": 95.0}, "--level must be between 0 and 1, got 95.0"),
-        ({"noise_on": ()}, "--noise-on must be targets, all or both, got nothing"),
-        ({"noise": command.Noise(body_rates=-1.0)}, "--noise.body-rates must be a finite number of at least 0"),
-        ({"drag": float("nan")}, "--drag must be a finite number of at least 0, got nan"),
+        ({"n_train": 3}, "--known.n-train must be more than the 3 parameters, got 3"),
+        ({"repeats": 0}, "--known.repeats must be an integer of at least 1, got 0"),
+        ({"seed": -1}, "--known.seed must be an integer of at least 0, got -1"),
+        ({"level": 95.0}, "--known.level must be between 0 and 1, got 95.0"),
+        ({"noise_on": ()}, "--known.noise-on must be targets, all or both, got nothing"),
+        (
+            {"noise": known_body.Noise(body_rates=-1.0)},
+            "--known.noise.body-rates must be a finite number of at least 0",
+        ),
+        ({"drag": float("nan")}, "--known.drag must be a finite number of at least 0, got nan"),
     ],
 )
 def test_options_that_make_no_sense_are_refused(changed, said):
     with pytest.raises(ValueError, match=said):
-        coverage(replace(Config(), **changed), Console(quiet=True))
-
-
-def test_bad_input_ends_in_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        command.main(["--level", "2", "--out", str(tmp_path)])
-    assert stop.value.code == 2
-    assert capsys.readouterr().err == "coverage: --level must be between 0 and 1, got 2.0\n"
+        coverage(replace(KnownBody(), **changed), Console(quiet=True))
 
 
 @pytest.mark.parametrize(("repeats", "batch"), [(100, 1), (25, 1), (25, 4), (3, 8)])
 def test_parts_of_one_size_hold_every_repeat_in_its_order(repeats, batch):
-    parts = command._parts(Config(repeats=repeats, batch=batch))
+    parts = known_body._parts(KnownBody(repeats=repeats, batch=batch))
     together = np.concatenate([jax.random.key_data(part) for part in parts])
     assert {len(part) for part in parts} == {len(together) // len(parts)}
     np.testing.assert_array_equal(together[:repeats], jax.random.key_data(jax.random.split(jax.random.key(0), repeats)))
-
-
-def test_an_interrupt_ends_in_one_line(tmp_path, capsys, monkeypatch):
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(command, "_repeats", interrupted)
-    with pytest.raises(SystemExit) as stop:
-        command.main(["--out", str(tmp_path)])
-    assert stop.value.code == 130
-    assert capsys.readouterr().err == "coverage: interrupted, nothing was written\n"

@@ -82,6 +82,19 @@ def test_nested_wrappers_and_several_networks_are_trained_as_their_hybrid():
     assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), base.Hybrid(network(1), network(2)))
 
 
+def test_a_blend_is_the_mean_of_its_fields():
+    (x, u), fields = batch(), (base.Hybrid(network(1), network(2)), Gain(network(3)))
+    blend = base.Blend(fields)
+    for evaluate in (base.train_batch, base.infer_batch):
+        parts = [evaluate(field, x, u[0]) for field in fields]
+        np.testing.assert_allclose(evaluate(blend, x, u[0]), np.mean(parts, axis=0), rtol=1e-11)
+    at, ways = (x[:, 0], u[0, :, 0]), (jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
+    parts = zip(*(base.linearize(field, *at, *ways) for field in fields), strict=True)
+    for found, part in zip(base.linearize(blend, *at, *ways), parts, strict=True):
+        np.testing.assert_allclose(found, np.mean(part, axis=0), rtol=1e-11)
+    assert_trained_alike(base.Blend((network(), network())), base.Blend((Gain(network()), network())))
+
+
 def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():
     (x, u), field = batch(), Gain(base.Frozen(network()))
     np.testing.assert_allclose(base.train_batch(field, x, u[0]), base.infer_batch(network(), x, u[0]), rtol=1e-12)

@@ -9,7 +9,7 @@ import numpy as np
 from choices import PAIRS
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed
@@ -82,6 +82,7 @@ FIELDS = {
     "linear residual": lambda: Hybrid(body(), moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
     "frozen rates": lambda: FrozenRates(per_rotor()),
     "frozen": lambda: Frozen(body()),
+    "blend": lambda: Blend((body(), with_residual("body_motion", "angular_acceleration"))),
     "hold": HoldState,
     "one's own": lambda: Dragged(body(), jnp.asarray(0.3)),
     "function": lambda: plain,

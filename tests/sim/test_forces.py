@@ -1,11 +1,21 @@
 """Laws of the forces that the physics model does not know."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from hybrid_jax.rotation import from_axis_angle
-from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, rotor_altitudes, thrust_gain, wind
+from hybrid_jax.sim.forces import (
+    drag,
+    ground_effect,
+    gusty_wind,
+    parameters_of,
+    rotor_altitudes,
+    thrust_gain,
+    weak_rotor,
+    wind,
+)
 from hybrid_jax.vehicle import IRIS
 
 T0 = jnp.asarray(0.0)
@@ -54,3 +64,22 @@ def test_drag_opposes_velocity():
 def test_wind_blows_along_y_with_a_period_of_three_seconds(t, force):
     found = wind(hovering(1.0), U, jnp.asarray(t), parameters_of(IRIS)).force
     np.testing.assert_allclose(found, [0, force, 0], atol=1e-14)
+
+
+def test_gusts_come_and_go_about_a_mean():
+    times = jnp.linspace(0.0, 2000.0, 40_001)
+    forces = jnp.stack([gusty_wind(hovering(1.0), U, t, parameters_of(IRIS)).force for t in times[:2]])
+    assert (forces[0] != forces[1]).any()
+    blown = jax.vmap(lambda t: gusty_wind(hovering(1.0), U, t, parameters_of(IRIS)).force)(times)
+    np.testing.assert_allclose(blown.mean(axis=0), [2.0, -2.5, 0.6], atol=0.01)
+    np.testing.assert_allclose(blown.std(axis=0), np.sqrt([0.445, 0.445, 0.065]), rtol=0.02)  # two sines each
+
+
+def test_a_weak_rotor_loses_thrust_and_reaction_torque():
+    parameters = parameters_of(IRIS)
+    wrench = weak_rotor(hovering(1.0), U, T0, parameters)
+    lost = 0.15 * IRIS.thrust_coefficient * 600.0**2
+    np.testing.assert_allclose(wrench.force, [0, 0, -lost], rtol=1e-5)
+    x, y = IRIS.rotor_positions[0]
+    reaction = 0.15 * IRIS.spin[0] * IRIS.torque_coefficient * 600.0**2
+    np.testing.assert_allclose(wrench.torque, [-y * lost, x * lost, -reaction], rtol=1e-5)

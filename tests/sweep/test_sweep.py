@@ -16,7 +16,7 @@ from smoke import script
 
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.sweep.lanes import LaneMap, lane, stack
-from hybrid_jax.sweep.training import evaluate, sweep
+from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
 from hybrid_jax.training.objective import Settings
@@ -190,7 +190,9 @@ def test_progress_says_what_is_left():
 
 def test_evaluate_is_the_error_of_each_lane(final):
     test = swings(15, seed=2)
-    errors = evaluate(final.best, test, 2, SETTINGS)
+    errors, each = evaluate_windows(final.best, test, 2, SETTINGS)
+    np.testing.assert_array_equal(evaluate(final.best, test, 2, SETTINGS), errors)
+    np.testing.assert_allclose(each.mean(axis=1), errors, rtol=1e-5)
     for i in range(3):
         alone = rollout_mse(lane(final.best, i), test, 2)
         np.testing.assert_allclose(errors[i], alone, rtol=1e-4)  # another program for the same float32 sums
@@ -211,6 +213,17 @@ def test_subsets_that_point_outside_the_data_are_refused(place, index):
     wrong = replace(PLANS[1], subset=PLANS[1].subset.at[place].set(index))
     with pytest.raises(ValueError, match=f"subset holds {index}"):
         swept(starts(), [PLANS[0], wrong, PLANS[2]])
+
+
+def test_runs_stop_by_their_own_validation_windows():
+    """Indices into a larger validation set do what that part of it does alone."""
+    own = [replace(each, validate_on=jnp.arange(5, 15)) for each in PLANS]
+    parted, alone = swept(starts(), own), swept(starts(), PLANS, validation=VALIDATION[5:15])
+    np.testing.assert_array_equal(parted.best_epoch, alone.best_epoch)
+    np.testing.assert_allclose(parted.best_mse, alone.best_mse, rtol=1e-4)  # another program for the same float32 sums
+    wrong = replace(own[1], validate_on=own[1].validate_on.at[0].set(20))
+    with pytest.raises(ValueError, match="validate_on holds 20, which is not an index of the 20 windows of validation"):
+        swept(starts(), [own[0], wrong])
 
 
 def test_bad_data_are_refused_by_name():

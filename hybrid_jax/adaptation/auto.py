@@ -1,0 +1,165 @@
+"""Adaptation by the method that the windows themselves ask for."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import ClassVar, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hybrid_jax import checks
+from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
+from hybrid_jax.adaptation.least_squares import Scale, Solver, check_determined, ravel_parameters
+from hybrid_jax.adaptation.methods import Solution, scale_of
+from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
+from hybrid_jax.adaptation.uncertainty import named_parameters
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.corrected_body import corrected
+from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
+from hybrid_jax.training.objective import Settings
+from hybrid_jax.trajectories import Trajectories
+
+# What each candidate fits, as groups of parameters.
+OF_A_SYSTEM: Mapping[str, tuple[str, ...]] = {
+    "source": (),
+    "theta": ("theta",),
+    "disturbance": ("theta", "disturbance"),
+}
+OF_A_RIGID_BODY: Mapping[str, tuple[str, ...]] = {
+    "source": (),
+    "theta": ("theta",),
+    "force": ("theta", "force"),
+    "drag": ("theta", "drag"),
+    "efficiency": ("theta", "efficiency"),
+    "force_torque": ("theta", "force", "torque"),
+    "force_drag": ("theta", "force", "drag"),
+    "force_efficiency": ("theta", "force", "efficiency"),
+    "force_torque_drag": ("theta", "force", "torque", "drag"),
+    "all": ("theta", "force", "torque", "drag", "efficiency"),
+}
+NETWORKS = ("last_layer", "network")  # candidates that change the network
+# Parameters of a corrected rigid body by the beginning of their names; the others are its own, θ_p.
+GROUPS = {"disturbance[v": "force", "disturbance[w": "torque", "efficiency[": "efficiency", "added_drag[": "drag"}
+CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
+
+
+class Choice(NamedTuple):
+    """c candidates, their errors on b blocks that were left out, and which one was taken."""
+
+    names: tuple[str, ...]
+    errors: BlockErrors  # "c b"
+    taken: Int[Array, ""]
+    parameters: tuple[str, ...]  # names of those of the extended physics, see `extended`
+    free: Bool[Array, "c p"]  # which of these each candidate fitted
+    theta: Float[Array, "c p"]
+    change: Float[Array, "c w"] | None  # of the network's weights; None if there is no network
+
+
+@dataclass(frozen=True)
+class Auto:
+    """The simplest of several methods that predicts left-out windows as well as the best; see `selection`.
+
+    Of a rigid body: the source as it is; θ_p; with them steady forces and torques, drag and the rotors' efficiencies.
+    Of another system: the source, θ_p, θ_p and a constant disturbance. Then, starting from the one that was taken, the
+    output layer of the network, and the whole network, both held at the source's weights.
+    """
+
+    networks: bool = True  # whether the network may change
+    blocks: int = BLOCKS
+    max_steps: int = 100  # of each fit
+    uses_validation: ClassVar[bool] = False
+    has_intervals: ClassVar[bool] = True
+
+    def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
+        check_determined(field, len(train))
+        traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
+        # Of the settings these alone matter; as an array, another scale asks for no other program.
+        scale = scale_of(settings.objective, train.x0.shape[-1])
+        return (Auto._solution if traced else _compiled)(self, field, train, settings.solver, scale)
+
+    def _solution(self, field, train: Trajectories, solver: Solver, scale: Scale) -> Solution:
+        n, d = train.x0.shape
+        larger = extended(field, d, train.u.shape[-1])
+        fitted = free_parameters(larger)
+        left = n - blocks_of(n, self.blocks)[0].shape[1]  # windows that fit a block's prediction
+        fitted = {name: free for name, free in fitted.items() if name == "source" or free.sum() < left}
+        free, sizes = np.stack([*fitted.values()]), np.array([each.sum() for each in fitted.values()])
+        fits = fit_candidates(larger, train, free, solver, self.max_steps, scale, self.blocks)
+        own = simplest(fits.errors.mse, sizes)
+        choice = Choice((*fitted,), fits.errors, own, (*named_parameters(larger),), jnp.asarray(free), fits.theta, None)
+        if self.networks and has_network(larger):
+            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks)
+        finite = jnp.isfinite(fits.errors.mse[own]).all()
+        status = jnp.where(fits.converged[own], STOPPED, jnp.where(finite, CAPPED, DIVERGED))
+        return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
+
+
+# Equinox passes the options to jax.jit, but does not declare them.
+_compiled = eqx.filter_jit(Auto._solution, compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+
+
+def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
+    """The field of a candidate, from the extended source."""
+    adapted = ravel_parameters(larger)[1](choice.theta[index])
+    return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
+
+
+def extended(field: AbstractVectorField, d: int, m: int) -> AbstractVectorField:
+    """The field with all parameters that a candidate may fit, at values that change nothing."""
+    field = corrected(field, m) if moves_a_rigid_body(field) else field
+    return sized(with_disturbance(field), d)
+
+
+def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
+    """For each candidate, which of the parameters of an extended field it fits (p,)."""
+    names = [*named_parameters(field)]
+    if not moves_a_rigid_body(field):
+        group = ["disturbance" if name.startswith("disturbance[") else "theta" for name in names]
+        return {name: np.array([each in fitted for each in group]) for name, fitted in OF_A_SYSTEM.items()}
+    group = [next((g for start, g in GROUPS.items() if name.startswith(start)), "theta") for name in names]
+    lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
+    found = {}
+    for name, fitted in OF_A_RIGID_BODY.items():
+        free = np.array([each in fitted for each in group])
+        found[name] = free & ~lost if "efficiency" in fitted else free
+    return found
+
+
+def has_network(field: AbstractVectorField) -> bool:
+    """Whether a field is a hybrid whose residual is not a disturbance, and can be trained."""
+    return (
+        isinstance(field, Hybrid) and physics_of(field) is not field and any(jax.tree.leaves(trainable(field.residual)))
+    )
+
+
+def _with_network(larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks) -> Choice:
+    """The choice with two more candidates: the one taken so far with its output layer or its network changed."""
+    adapted, parts = candidate(larger, choice, choice.taken), parts_of(larger)
+    steps = fit_anchored(adapted, windows, np.stack([*parts.values()]), solver, scale, blocks=blocks)
+    # Penalties are in the order of their strength, so that the first of several as good changes least.
+    order = np.arange(steps.errors.mse.shape[1])
+    best = jnp.stack([simplest(errors, order) for errors in steps.errors.mse])
+    taken = jax.tree.map(lambda leaf: leaf[np.arange(len(parts)), best], steps.errors)
+    errors = jax.tree.map(lambda *both: jnp.concatenate(both), choice.errors, taken)
+    sizes = np.concatenate([sizes, sizes.max() + 1 + np.arange(len(parts))])
+    changes = steps.changes[np.arange(len(parts)), best]
+    unchanged = jnp.zeros((len(choice.names), changes.shape[1]), changes.dtype)
+
+    def repeated(values):
+        return jnp.concatenate([values, jnp.broadcast_to(values[choice.taken], (len(parts), *values.shape[1:]))])
+
+    return Choice(
+        (*choice.names, *parts),
+        errors,
+        simplest(errors.mse, sizes),
+        choice.parameters,
+        repeated(choice.free),
+        repeated(choice.theta),
+        jnp.concatenate([unchanged, changes]),
+    )

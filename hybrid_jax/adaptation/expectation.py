@@ -1,0 +1,60 @@
+"""The error to expect on a flight that was not seen, from blocks of windows that were left out of the fit."""
+
+from collections.abc import Mapping
+
+import numpy as np
+import scipy
+from jaxtyping import Float
+
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+
+LEVEL = 0.8
+ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
+# States of a rigid body, the factor from the norm of their error to the quantity, and its unit.
+QUANTITIES = {
+    "position": (POSITION, 1.0, "m"),
+    "velocity": (VELOCITY, 1.0, "m/s"),
+    "rotation": (QUATERNION, 2.0, "rad"),  # of a small angle θ the quaternion differs by θ / 2
+    "body rates": (BODY_RATES, 1.0, "rad/s"),
+}
+Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
+
+
+def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], rigid: bool) -> Expected:
+    """RMSE at the end of a window and of windows that touch, with the 80 % interval for a flight of as many blocks.
+
+    The mean over the blocks of another flight is taken to vary as that over these, so that their difference has twice
+    its variance (a prediction interval for a future mean; Hahn and Meeker, Statistical Intervals, 1991, Sec. 4.7), by
+    Student's t, for the logarithm of the mean square.
+
+    Args:
+        squares: for each block the mean squared error of each state at the end of a window, and of those that touch.
+        seconds: how long these are.
+    """
+    groups = QUANTITIES if rigid else {f"x[{i}]": (slice(i, i + 1), 1.0, "") for i in range(squares.shape[-1])}
+    blocks = len(squares)
+    reach = scipy.stats.t.ppf((1 + LEVEL) / 2, blocks - 1) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
+
+    def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:
+        power = np.maximum(factor**2 * squares[:, horizon, group].sum(axis=-1), np.finfo(np.float32).tiny)
+        away = reach * 0.5 * power.std(ddof=1) / power.mean() if blocks > 1 else reach
+        rmse = np.sqrt(power.mean())
+        return float(rmse), float(rmse * np.exp(-away)), float(rmse * np.exp(away))
+
+    return {
+        f"{seconds[horizon]:g} s": {name: around(group, factor, horizon) for name, (group, factor, _) in groups.items()}
+        for horizon in range(2 if seconds[1] > seconds[0] else 1)
+    }
+
+
+def lines_of(expected: Expected, rigid: bool) -> list[str]:
+    """A line for each horizon."""
+
+    def text(name: str, value: float, low: float, high: float) -> str:
+        unit = f" {QUANTITIES[name][2]}" if rigid else ""
+        return f"{name} {value:.3g} ({low:.2g} to {high:.2g}){unit}"
+
+    return [
+        f"  after {horizon}: {', '.join(text(name, *errors) for name, errors in found.items())}"
+        for horizon, found in expected.items()
+    ]

@@ -1,0 +1,167 @@
+"""Choose what to adapt by the prediction of windows that were left out.
+
+More parameters always fit the same windows better. So the windows are cut into blocks, each block is predicted by a fit
+to all others, and the simplest candidate is taken whose error is within one standard error, or a tenth, of the smallest
+(Breiman, Friedman, Olshen and Stone, Classification and Regression Trees, 1984, Sec. 3.4.3). Errors are compared as
+ratios: a block with large errors must not decide alone. Windows that touch are predicted as one, since a model that is
+good for 0.1 s can be bad after 1 s.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_free, ravel_parameters
+from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverse, masked, normal_equations
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import rollout
+from hybrid_jax.trajectories import Trajectories
+
+BLOCKS = 10
+TOLERANCE = 0.1  # relative difference of errors that does not count
+JOINED = 10  # windows that touch, at most so many, are predicted as one
+
+
+class BlockErrors(NamedTuple):
+    """Of one block, or of several, with windows that touch predicted as one."""
+
+    mse: Float[Array, "*b"]  # mean over the windows of the squared error at each step
+    ends: Float[Array, "*b 2 d"]  # mean squared error of each state at the end of a window, and of those that touch
+
+
+class Fits(NamedTuple):
+    """Least squares for each of c candidates, and how well it predicts each of b blocks that were left out."""
+
+    theta: Float[Array, "c p"]
+    errors: BlockErrors  # "c b"
+    steps: Int[Array, " c"]
+    converged: Bool[Array, " c"]
+
+
+@eqx.filter_jit
+def fit_candidates(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    free: Bool[np.ndarray, "c p"],
+    solver: Solver = None,
+    max_steps: int = 100,
+    scale: Scale = None,
+    blocks: int = BLOCKS,
+) -> Fits:
+    """Fit the parameters that each candidate leaves free; the others stay as they are.
+
+    A block is predicted with the parameters of one Gauss-Newton step, from the fit to all windows, on the other blocks.
+
+    Args:
+        free: for each candidate which of the parameters, in the order of `ravel_parameters`, are fitted.
+        windows: in the order of time.
+    """
+    _, at = ravel_parameters(field)
+    places, counted = blocks_of(len(windows), blocks)
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], windows)
+
+    def one(free: Bool[Array, " p"]):
+        found = fit_free(field, windows, solver, max_steps, scale, free)
+        theta = ravel_parameters(found.field)[0]
+        equations = normal_equations(found.field, windows, solver, CHUNK, None, scale)
+        equations = masked(equations, free & has_effect(equations, windows, scale))
+        without = theta + left_out_steps(equations.gram, equations.score, places, counted)
+        errors = jax.lax.map(lambda a: predict_block(at(a[0]), a[1], a[2], solver, scale), (without, own, counted))
+        return theta, errors, found.steps, found.converged
+
+    return Fits(*jax.lax.map(one, jnp.asarray(free)))
+
+
+def blocks_of(windows: int, blocks: int) -> tuple[Int[np.ndarray, "b m"], Bool[np.ndarray, "b m"]]:
+    """The indices of the windows of each block, consecutive ones, and which count: a short block repeats its last."""
+    each = -(-windows // min(blocks, windows))
+    index = np.arange(-(-windows // each) * each).reshape(-1, each)
+    return np.minimum(index, windows - 1), index < windows
+
+
+def left_out_steps(
+    gram: Float[Array, "n p p"],
+    score: Float[Array, "n p"],
+    places: Int[np.ndarray, "b m"],
+    counted: Bool[np.ndarray, "b m"],
+    held: Float[Array, "p p"] | float = 0.0,
+) -> Float[Array, "b p"]:
+    """The Gauss-Newton step on all blocks but one, for each block; `held` is the matrix of a penalty."""
+    weight = counted[..., None]
+    gram = jnp.sum(gram[places] * weight[..., None], axis=1)
+    score = jnp.sum(score[places] * weight, axis=1)
+    inverses = jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram + held)
+    return -jnp.einsum("bpq,bq->bp", inverses, jnp.sum(score, axis=0) - score)
+
+
+def predict_block(
+    field: AbstractVectorField,
+    block: Trajectories,
+    counted: Bool[Array, " m"],
+    solver: Solver = None,
+    scale: Scale = None,
+) -> BlockErrors:
+    """The errors of a field on the windows of a block that count."""
+
+    def one(carry, item):
+        end, recorded = carry
+        window, counted, i = item
+        touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
+        predicted = rollout(field, jnp.where(touches, end, window.x0), window.u, block.dt, solver)
+        alone = rollout(field, window.x0, window.u, block.dt, solver)[-1]
+        difference = predicted - window.x if scale is None else (predicted - window.x) / scale
+        error = jnp.mean(jnp.sum(jnp.square(difference), axis=-1))
+        ends = jnp.square(jnp.stack([alone, predicted[-1]]) - window.x[-1])
+        return (predicted[-1], window.x[-1]), (jnp.where(counted, error, 0.0), ends, touches)
+
+    start = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
+    _, (errors, ends, touches) = jax.lax.scan(one, (start, start), (block, counted, jnp.arange(len(counted))))
+    last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
+    weights = jnp.stack([counted / jnp.sum(counted), last / jnp.sum(last)], axis=1)
+    return BlockErrors(jnp.sum(errors) / jnp.sum(counted), jnp.einsum("mh,mhd->hd", weights, ends))
+
+
+def correlated(windows: Trajectories) -> int:
+    """How many consecutive windows to take as one cluster: a block where some touch, as those of one flight do."""
+    touching = (np.asarray(windows.x0)[1:] == np.asarray(windows.x)[:-1, -1]).all(axis=1)
+    return blocks_of(len(windows), BLOCKS)[0].shape[1] if touching.any() else 1
+
+
+def longest_chain(windows: Trajectories, blocks: int) -> int:
+    """How many windows that touch are predicted as one, at most."""
+    x0, x, longest = np.asarray(windows.x0), np.asarray(windows.x), 1
+    for places, counted in zip(*blocks_of(len(windows), blocks), strict=True):
+        own = places[counted]
+        touches = (x0[own[1:]] == x[own[:-1], -1]).all(axis=1)
+        length = 1
+        for i, touch in enumerate(touches, 1):
+            length = length + 1 if touch and i % JOINED else 1
+            longest = max(longest, length)
+    return longest
+
+
+def simplest(errors: Float[Array, "c b"], sizes: Int[np.ndarray, " c"]) -> Int[Array, ""]:
+    """The candidate of the smallest size whose log error is within one standard error, or a tenth, of the best.
+
+    Of several of this size, the best. A candidate with an error that is not finite is not taken; 0 if all are.
+    """
+    logs = _logarithm(errors)
+    mean = jnp.where(jnp.isfinite(logs).all(axis=1), jnp.mean(logs, axis=1), jnp.inf)
+    worse = logs - logs[jnp.argmin(mean)]
+    margin = jnp.std(worse, axis=1, ddof=1) / jnp.sqrt(errors.shape[1])
+    near = jnp.isfinite(mean) & (jnp.mean(worse, axis=1) <= jnp.maximum(margin, TOLERANCE))
+    order = np.asarray(sizes) * len(sizes) + jnp.argsort(jnp.argsort(mean))
+    return jnp.argmin(jnp.where(near, order, np.iinfo(np.int32).max))
+
+
+def geometric_mean(errors: Float[Array, "c b"]) -> Float[Array, " c"]:
+    """Over the blocks."""
+    return jnp.exp(jnp.mean(_logarithm(errors), axis=1))
+
+
+def _logarithm(errors: Float[Array, "c b"]) -> Float[Array, "c b"]:
+    return jnp.log(jnp.maximum(errors, jnp.finfo(errors.dtype).tiny))  # an exact prediction has none

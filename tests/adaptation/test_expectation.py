@@ -1,0 +1,87 @@
+"""Laws of the error to expect on a flight that was not seen."""
+
+from dataclasses import replace
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import LENGTH, pendulum, swings
+from test_auto import flown, hybrid
+
+import hybrid_jax as hj
+from hybrid_jax.adaptation.expectation import expected_errors, lines_of
+from hybrid_jax.adaptation.selection import longest_chain, predict_block
+from hybrid_jax.rotation import from_axis_angle
+
+
+def test_the_interval_holds_another_flight_s_error_in_four_of_five_cases():
+    """Blocks of one flight share a level, as those of one manoeuvre do."""
+    rng = np.random.default_rng(0)
+    flights = rng.gamma(2.0, size=(1000, 2, 10, 1, 1)) * np.exp(0.25 * rng.normal(size=(1000, 2, 1, 1, 1)))
+    held = []
+    for seen, other in flights:
+        ((_, low, high),) = expected_errors(np.broadcast_to(seen, (10, 2, 1)), (0.1, 0.1), False)["0.1 s"].values()
+        held.append(low <= np.sqrt(other.mean()) <= high)
+    assert 0.7 <= np.mean(held) <= 0.9
+
+
+def test_the_value_is_the_rmse_over_all_blocks():
+    squares = np.random.default_rng(0).gamma(2.0, size=(7, 2, 3))
+    found = expected_errors(squares, (0.1, 1.0), False)
+    assert [*found] == ["0.1 s", "1 s"]
+    for horizon, errors in enumerate(found.values()):
+        for i, (value, low, high) in enumerate(errors.values()):
+            assert value == pytest.approx(np.sqrt(squares[:, horizon, i].mean()))
+            assert low < value < high
+
+
+def test_a_small_rotation_is_given_in_radians():
+    turned = from_axis_angle(jnp.array([0.0, 0.6, 0.8]), jnp.asarray(0.02)) - jnp.array([1.0, 0, 0, 0])
+    squares = np.zeros((2, 2, 13))
+    squares[..., 3:7] = np.square(turned)
+    found = expected_errors(squares, (0.1, 0.1), True)
+    assert found["0.1 s"]["rotation"][0] == pytest.approx(0.02, rel=1e-3)
+    assert "rotation 0.02 (0.02 to 0.02) rad" in lines_of(found, True)[0]
+
+
+def test_one_block_bounds_nothing():
+    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), False)["0.1 s"].values()
+    assert (value, low, high) == (1.0, 0.0, np.inf)
+
+
+def test_errors_after_windows_that_touch_are_those_of_one_long_prediction():
+    whole = swings(1, steps=24)
+    parts = [replace(whole, x0=x0, u=whole.u[:, at : at + 8], x=whole.x[:, at : at + 8])
+             for x0, at in zip((whole.x0, whole.x[:, 7], whole.x[:, 15]), (0, 8, 16), strict=True)]  # fmt: skip
+    chained = hj.Trajectories(*(jnp.concatenate([getattr(p, n) for p in parts]) for n in ("x0", "u", "x")), whole.dt)
+    field = pendulum(0.8)
+    found = predict_block(field, chained, jnp.ones(3, bool)).ends
+    alone = hj.rollout_batch(field, chained.x0, chained.u, whole.dt)[:, -1] - chained.x[:, -1]
+    long = hj.rollout_batch(field, whole.x0, whole.u, whole.dt)[:, -1] - whole.x[:, -1]
+    np.testing.assert_allclose(found[0], np.square(alone).mean(axis=0), rtol=1e-4)
+    np.testing.assert_allclose(found[1], np.square(long).mean(axis=0), rtol=1e-4)
+    assert longest_chain(chained, 1) == 3
+    assert longest_chain(chained, 3) == 1  # blocks of one window
+    padded = predict_block(field, chained[np.array([0, 1, 2, 2])], jnp.array([True, True, True, False])).ends
+    np.testing.assert_allclose(padded, found, rtol=1e-5)
+
+
+def test_a_report_says_what_to_expect():
+    found = hj.adapt(hybrid(), flown(hybrid(LENGTH)))
+    assert "RMSE to expect on a flight not seen (80% intervals" in found.report()
+    rmse, _, _ = found.expected["0.4 s"]["x[0]"]
+    other = flown(hybrid(LENGTH), seed=5)
+    errors = hj.rollout_batch(found.field, other.x0, other.u, other.dt)[:, -1] - other.x[:, -1]
+    assert rmse == pytest.approx(float(jnp.sqrt(jnp.mean(errors[:, 0] ** 2))), rel=0.6)
+
+
+def test_a_flight_unlike_those_learned_from_is_named():
+    slow = flown(hybrid(LENGTH))
+    fast = replace(slow, x0=4 * slow.x0, x=4 * slow.x)
+    same = hj.adapt(hybrid(), slow, method="source", learned_from=slow)
+    assert max(same.outside.values()) < 0.03
+    assert "Warning" not in same.report()
+    other = hj.adapt(hybrid(), fast, method="source", learned_from=slow)
+    assert other.outside["x[1]"] > 0.3
+    assert other.outside["u[0]"] < 0.03
+    assert "Warning: x[1] is outside of what the source learned from" in other.report()

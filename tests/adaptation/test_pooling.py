@@ -1,0 +1,83 @@
+"""Laws of combining several sources' estimates."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from pendulum import LENGTH, pendulum, swings
+from test_least_squares import Push, pushes
+
+import hybrid_jax as hj
+from hybrid_jax.adaptation.pooling import combined
+
+
+def test_the_interval_holds_errors_within_and_between_sources():
+    """The truth is one more draw from where the sources' estimates lie, and all share the noise of the windows."""
+    rng = np.random.default_rng(0)
+    noise, draws = 0.1 * rng.normal(size=2000), 0.3 * rng.normal(size=(2000, 5))
+    found = [combined(own[1:] + shared, np.full(4, 0.1**2)) for shared, own in zip(noise, draws, strict=True)]
+    held = [abs(centre - own[0]) <= away for (centre, away), own in zip(found, draws, strict=True)]
+    assert np.mean(held) == pytest.approx(0.95, abs=0.02)
+
+
+def test_of_equal_estimates_it_is_the_interval_of_one():
+    centre, away = combined(np.full(3, 2.0), np.full(3, 0.25))
+    assert centre == 2.0
+    assert away == pytest.approx(1.96 * 0.5, rel=1e-3)
+
+
+def test_sources_that_differ_widen_the_interval():
+    exact = swings(40, damping=0.0)
+    noise = 0.02 * np.random.default_rng(0).normal(size=exact.x.shape).astype(np.float32)
+    windows = replace(exact, x=np.asarray(exact.x) + noise)
+    sources = [hj.Hybrid(pendulum(0.7), Bias(np.float32(bias))) for bias in (-0.05, 0.0, 0.06)]
+    results = [hj.adapt(source, windows, method="theta_least_squares") for source in sources]
+    pooled, alone = hj.pool(results)["log_length"], results[1].parameters["log_length"]
+    assert pooled.low < np.log(LENGTH) < pooled.high
+    assert pooled.high - pooled.low > 1.5 * (alone.high - alone.low)
+    assert pooled.value == pytest.approx(np.mean([each.parameters["log_length"].value for each in results]), abs=1e-5)
+
+
+class Bias(hj.AbstractVectorField):
+    rate: np.ndarray
+
+    def __call__(self, x, u):
+        return self.rate * np.array([0.0, 1.0], np.float32) * x
+
+
+def test_two_sources_or_one_without_intervals_are_refused():
+    results = [hj.adapt(pendulum(), swings(40), method="theta_least_squares")] * 3
+    with pytest.raises(ValueError, match="results must be of at least 3 sources, got 2"):
+        hj.pool(results[:2])
+    tuned = hj.adapt(pendulum(), swings(40), method=hj.FineTune(max_epochs=1))
+    with pytest.raises(ValueError, match=r"results\[2\] has no intervals: they are valid for least squares only"):
+        hj.pool([*results[:2], tuned])
+
+
+def test_few_degrees_of_freedom_widen_the_interval():
+    """Of equal estimates it is Student's, but for the correction of Barnard and Rubin."""
+    wide, narrow = (combined(np.full(3, 2.0), np.full(3, 0.25), degrees=degrees)[1] for degrees in (9, np.inf))
+    assert 2.26 / 1.96 * narrow < wide < 1.4 * narrow
+
+
+def test_windows_that_touch_are_one_cluster():
+    """Errors that several windows share make the sandwich of single windows too narrow."""
+    rng = np.random.default_rng(0)
+    held = {1: [], 10: []}
+    for _ in range(200):
+        windows, _ = pushes(100, noise=0.0)
+        drift = np.repeat(0.3 * rng.normal(size=(10, 1, 2)), 10, axis=0) * np.ones((1, 6, 1))
+        pushed = replace(windows, u=np.sort(windows.u, axis=0), x=windows.x + drift.astype(np.float32))
+        truth = _drifted(pushed.u) + drift.astype(np.float32)
+        for cluster in held:
+            data = replace(pushed, x=truth)
+            field = hj.fit_least_squares(Push(np.zeros(2, np.float32)), data).field
+            bounds = hj.intervals(field, hj.covariance_of(field, data, cluster=cluster), degrees=100 // cluster - 1)
+            held[cluster].append(bounds["gains[0]"].low <= 3.0 <= bounds["gains[0]"].high)
+    assert np.mean(held[10]) > 0.88
+    assert np.mean(held[1]) < np.mean(held[10])
+
+
+def _drifted(u):
+    reached = 0.1 * np.cumsum(u, axis=1)
+    return np.stack([3.0 * reached[..., 0] - 2.0 * reached[..., 1], 3.0 * 0 + -2.0 * reached[..., 0]], -1)

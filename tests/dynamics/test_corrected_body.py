@@ -1,0 +1,71 @@
+"""Laws of a rigid body with weakened rotors and added drag."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.corrected_body import CorrectedBody, corrected, simplified
+from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.rotation import from_axis_angle
+from hybrid_jax.sim.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
+from hybrid_jax.sim.domain import SOURCE
+from hybrid_jax.state import BODY_RATES, VELOCITY
+
+BODY = hj.rigid_body(hj.IRIS)
+U = jnp.array([640.0, 660.0, 650.0, 630.0])
+
+
+def moving():
+    tilted = from_axis_angle(jnp.array([0.6, 0.8, 0.0]), jnp.asarray(0.4))
+    return jnp.zeros(13).at[2].set(50.0).at[3:7].set(tilted).at[7:].set(jnp.array([1, -2, 0.5, 0.3, -0.2, 0.1]))
+
+
+def test_without_a_change_it_is_the_body_and_is_simplified_to_it():
+    larger = corrected(hj.Hybrid(BODY, hj.residual_network(13, 4, jax.random.key(0), hidden=4)), 4)
+    assert isinstance(larger.physics, CorrectedBody)
+    np.testing.assert_array_equal(larger.physics(moving(), U), BODY(moving(), U))
+    assert eqx.tree_equal(simplified(with_disturbance(larger)).physics, BODY)
+    weak = eqx.tree_at(lambda field: field.physics.log_efficiency, larger, jnp.array([-0.1, 0, 0, 0]))
+    assert isinstance(simplified(weak).physics, CorrectedBody)
+
+
+def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
+    weak = CorrectedBody(BODY, jnp.log(jnp.array([0.85, 1, 1, 1])), jnp.zeros(3))
+    slower = U.at[0].multiply(np.sqrt(0.85))  # both go with the square of the speed
+    np.testing.assert_allclose(weak(moving(), U), BODY(moving(), slower), rtol=1e-6, atol=1e-6)
+
+
+def test_drag_slows_along_the_axes_of_the_body():
+    dragged = CorrectedBody(BODY, jnp.zeros(4), jnp.full(3, 0.3))
+    change = dragged(moving(), U) - BODY(moving(), U)
+    np.testing.assert_allclose(change[VELOCITY], -0.3 * moving()[VELOCITY], atol=1e-6)  # alike along all axes
+    np.testing.assert_array_equal(change[BODY_RATES], 0.0)
+
+
+@pytest.mark.parametrize(
+    ("domain", "efficiency", "drag"),
+    [(WEAK_ROTOR, 0.85, SOURCE.drag_coefficient / hj.IRIS.mass), (DOUBLED_DRAG, 1.0, None)],
+    ids=["weak rotor", "doubled drag"],
+)
+def test_it_can_be_what_the_simulator_flies(domain, efficiency, drag):
+    """Far above the ground, where ground effect is none."""
+    c = 2 * SOURCE.drag_coefficient / hj.IRIS.mass if drag is None else drag
+    field = CorrectedBody(BODY, jnp.log(jnp.array([efficiency, 1, 1, 1])), jnp.full(3, c))
+    with jax.enable_x64(True):
+        x, u = moving().astype(float), U.astype(float)
+        after = domain.quadrotor().step(x, u, jnp.zeros(()), 1e-4)
+        np.testing.assert_allclose((after - x)[7:] / 1e-4, field(x, u)[7:], rtol=2e-3, atol=2e-3)
+
+
+def test_a_load_moves_the_centre_of_mass_and_adds_to_the_inertia():
+    place, mass = np.array([0.04, 0.03, -0.05]), 0.3
+    centre = mass / (hj.IRIS.mass + mass) * place
+    assert LOADED.mass == hj.IRIS.mass + mass
+    np.testing.assert_allclose(LOADED.rotor_positions, np.asarray(hj.IRIS.rotor_positions) - centre[:2])
+    # Two point masses about their centre of mass: the reduced mass times the square of the distance from each axis.
+    added = hj.IRIS.mass * mass / LOADED.mass * (place @ place - place**2)
+    np.testing.assert_allclose(np.asarray(LOADED.inertia) - hj.IRIS.inertia, added, rtol=1e-9)
+    np.testing.assert_allclose(loaded(hj.IRIS, 0.5, (0.0, 0.0, 0.0)).inertia, hj.IRIS.inertia)
