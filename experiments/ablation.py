@@ -122,7 +122,7 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
         found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.fields, config, stages, target)}
-        rows += rows_of([tested(HYBRID, mode, fit, config, stages, target) for mode, fit in found.items()])
+        rows += rows_of([tested(HYBRID, mode, fit, config, stages, target, None) for mode, fit in found.items()])
     return rows
 
 

@@ -7,8 +7,6 @@ from typing import Any, get_args
 import numpy as np
 from rich.console import Console
 
-from experiments.coverage import Config as CoverageConfig
-from experiments.coverage import coverage
 from experiments.external_force import sine_floor
 from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
@@ -17,13 +15,13 @@ from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
 from experiments.paper.outcome import paper_report
-from experiments.paper.study import flown, pretrained, source_splits
+from experiments.paper.study import drawn_splits, flown, pretrained, source_splits
 from experiments.reporting.names import EXPERT_AUGMENTATION, HYBRID, LAST_LAYER
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.options import Count, distinct, factors
+from experiments.runner.options import distinct, factors
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.expert_augmentation import Augmentation
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
@@ -53,8 +51,6 @@ class ComparisonConfig(Config):
     methods: tuple[Method, ...] = get_args(Method)
     """Which methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)
-    repeats: Count = 100
-    """Recordings of the simulation that checks the intervals of θ_p; see `python -m experiments.coverage`."""
 
     def __post_init__(self):
         Config.__post_init__(self)
@@ -69,7 +65,7 @@ class ComparisonConfig(Config):
 PRESETS = {
     "paper": ComparisonConfig(),
     "quick": preset_like(ComparisonConfig, QUICK, encoding=Encoding(stopping=Stopping(20, 10))),
-    "smoke": preset_like(ComparisonConfig, SMOKE, sizes=(20,), pool=20, encoding=Encoding(hidden=8), repeats=4),
+    "smoke": preset_like(ComparisonConfig, SMOKE, sizes=(20,), pool=20, encoding=Encoding(hidden=8)),
 }
 
 
@@ -78,8 +74,7 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
     learned, experts = source_models(config, stages)
     out, rows, flights = config.out / NAME, Results(), dict[str, Any]()
     for domain in DOMAINS:
-        pool = {"train": SplitSpec(config.pooled(), 10)}
-        target = flown(domain, source_splits(config) | pool | past_splits(test=config.test), config, stages)
+        target = flown(domain, drawn_splits(config) | past_splits(test=config.test), config, stages)
         case = Case(config, stages, learned, experts, target)
         lanes = [source_only(case, model) for model in learned]
         lanes += [adapted(case, method) for method in config.methods]
@@ -89,16 +84,11 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         rows, flights = rows + found, flights | {domain.name: target.metadata}
     if not hosts.is_main_process():
         return
-    simulated = CoverageConfig(repeats=config.repeats, n_train=config.sizes[0])
-    covered = stages.timed("coverage", lambda: coverage(simulated, console))
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
     drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
     figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
     notes = [*stages.notes(), GIVEN_NETWORK]
-    for (truth, noise_on), group in covered.group("case", "noise_on").items():
-        shares = ", ".join(f"{row['parameter']} {row['coverage']:.0%}" for row in group)
-        notes.append(f"95 % intervals of θ_p contained the truth, {truth}, noise on {noise_on}: {shares}.")
-    true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights, "coverage": covered.rows}
+    true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
     report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
     write_report(out, report, Console())
 
@@ -110,7 +100,7 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
     learned = {model: pretrained(model, IRIS, config, stages, source) for model in models}
     if EXPERT_AUGMENTATION not in config.methods:
         return learned, None
-    with_past = past_splits(train=config.source_train, validation=config.validation)
+    with_past = past_splits(train=config.source_train, validation=config.validating())
     longer = flown(SOURCE, with_past, config, stages)
     renamed = Dataset({name.removesuffix("_with_past"): longer.splits[name] for name in with_past}, longer.metadata)
     past, _ = split(renamed.splits["train"], PAST)

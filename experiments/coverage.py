@@ -1,212 +1,235 @@
-"""How often the intervals of θ_p contain the truth, over repeated flights: python -m experiments.coverage --help"""
+"""How often intervals of θ_p contain the truth: python -m experiments.coverage --help"""
 
-import itertools
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
-from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from rich.console import Console
 
-from experiments.paper.conditions import Noise, measure
-from experiments.reporting.results import Results
-from experiments.reporting.tables import print_tables, tabulate
+from experiments.changes import Change
+from experiments.paper.conditions import settings
+from experiments.paper.config import QUICK, SMOKE, Config, preset_like
+from experiments.paper.known_body import KnownBody, coverage, known_body_table
+from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
+from experiments.reporting.claims import Claim, Part, all_of, verdict_table
+from experiments.reporting.claims import evaluate as evaluate_claims
+from experiments.reporting.names import HYBRID
+from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results, Row
+from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
-from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
-from experiments.runner.progress import Line
-from hybrid_jax import checks, rotation
-from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
+from experiments.runner.options import Count, distinct
+from experiments.runner.run_record import environment
+from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.adaptation.auto import Auto
+from hybrid_jax.adaptation.pooling import SOURCES, combined
+from hybrid_jax.adaptation.selection import BLOCKS, blocks_of
+from hybrid_jax.adaptation.uncertainty import covariance_of
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
-from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.io.files import json_text, write_atomic
-from hybrid_jax.state import VELOCITY
+from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
+from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.sim.changes import CHANGES
+from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.sweep import hosts
+from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 NAME = "coverage"
-DT = 0.01  # s
-PART = 10  # repeats, at the least, between two looks at the clock
-TRUTH = {"Ix": 0.04, "Iy": 0.02, "k": IRIS.thrust_coefficient}  # SI: the paper's parameter shift
-NoiseOn = Literal["targets", "all"]
+ASKED = 0.9  # share of 95 % intervals that must contain the truth
+METHOD = Auto(networks=False)  # the network stays as it is: else there are no intervals
+RIGHT: tuple[Change, ...] = ("parameter_shift", "external_force", "doubled_drag", "weak_rotor", "gusty_wind")
+HEAD = f"""# {NAME}
+
+Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight, as
+`adapt(method="auto")` does without changing the network. The interval of each of θ_p is pooled over the sources by
+`hybrid_jax.pool`: the variance of a fit, with blocks of a second as clusters, and the variance between the sources.
+Coverage: the share of flights whose pooled 95 % interval contains the truth. A parameter that was not fitted has no
+interval and does not count; where rotors lost thrust, their efficiencies take the place of k. One source: the share of
+intervals that are not pooled.
+"""
 
 
 @dataclass(frozen=True)
-class Flight:
-    """How the windows are flown: a vehicle near hover that leans into its velocity; standard deviations."""
+class CoverageConfig(Config):
+    """Adapt to each of many flights after each change of the vehicle; count how often intervals contain the truth."""
 
-    speed: NotNegative = 2.0
-    """[m/s], along each axis, a third of it vertically."""
-    tilt: NotNegative = 0.1
-    """[rad], about each axis, in addition to the lean that balances the drag in steady flight."""
-    body_rates: NotNegative = 1.0
-    """[rad/s], along each axis."""
-    rotor_speed: NotNegative = 40.0
-    """[rad/s], of each rotor about hover, drawn anew in each interval."""
+    seeds: Count = SOURCES
+    """Sources, whose intervals are pooled."""
+    sizes: tuple[int, ...] = (100,)
+    """N, windows of 0.1 s: one number."""
+    draw: Literal["random", "contiguous"] = "contiguous"
+    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
+    random: of many flights, as in the paper."""
+    draws: Count = 100
+    """Flights: each source adapts to each of them alone."""
+    validation: Count | Literal["own"] = "own"
+    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
+    noise: float = 1.0
+    """White noise on the states of the flights to adapt to; 1 is typical of motion capture and a gyroscope."""
+    noise_on: Literal["all", "target"] = "target"
+    """Which flights are noisy: those before the change as well, or those after it alone."""
+    clean: bool = True
+    """Adapt to the same flights without noise, too."""
+    changes: tuple[Change, ...] = RIGHT
+    """Which changes; by default those that leave the vehicle's mass as the model has it."""
+    known: KnownBody = field(default_factory=KnownBody)
 
-
-@dataclass(frozen=True)
-class Config:
-    """Fly known rigid bodies, add noise, fit θ_p by least squares, count how often its interval contains the truth.
-
-    Twice: a truth that is the model itself, and one with linear drag that the model does not know. The first says
-    whether the intervals are honest, the second how far they mislead when the physics is wrong.
-    """
-
-    repeats: Count = 100
-    """Independent recordings, each with its own fit."""
-    n_train: int = 100
-    """Windows in a recording."""
-    steps: Count = 10
-    """Intervals of 0.01 s in a window."""
-    level: float = 0.95
-    """Of the intervals: what the coverage should be."""
-    kind: Kind = "sandwich"
-    """sandwich: windows are independent, nothing else is assumed. homoscedastic: all errors white and of one size,
-    which those of a vehicle's sensors are not."""
-    noise_on: tuple[NoiseOn, ...] = ("targets", "all")
-    """targets: the start of each window is known exactly, as the fit takes it to be. all: it is measured as well."""
-    noise: Noise = field(default_factory=Noise)
-    flight: Flight = Flight()
-    drag: NotNegative = 0.4
-    """[kg/s] of the truth that the model does not know: v̇ −= drag v / m."""
-    seed: CountFromZero = 0
-    """Everything random follows from it; the same flights and noise in every case."""
-    batch: Count = 1
-    """Repeats that are computed side by side: one on a CPU, many on a GPU."""
-    out: Path = Path("runs")
-    """Folder for the results; a folder `coverage` is made in it."""
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--changes", self.changes)
+        if len(self.sizes) != 1:
+            raise ValueError(f"--sizes must be one number, got {self.sizes}")
+        if self.seeds < SOURCES:
+            raise ValueError(f"--seeds must be at least {SOURCES}, got {self.seeds}")
 
 
-class Dragged(AbstractVectorField):
-    """A rigid body with linear drag: v̇ −= c v / m."""
-
-    body: RigidBody
-    drag: Float[Array, ""]  # kg/s
-
-    def __call__(self, x, u):
-        return self.body(x, u).at[VELOCITY].add(-self.drag / self.body.vehicle.mass * x[VELOCITY])
-
-
-def coverage(config: Config, console: Console) -> Results:
-    """A row for each parameter in every case: exact physics and unknown drag, with noise on what was asked for.
-
-    Shares; bias and half-width in % of the truth. A repeat that did not converge is a miss.
-    """
-    if config.n_train <= len(LEARNED):
-        raise ValueError(f"--n-train must be more than the {len(LEARNED)} parameters, got {config.n_train}")
-    if not 0 < config.level < 1:
-        raise ValueError(f"--level must be between 0 and 1, got {config.level}")
-    if not config.noise_on or len(set(config.noise_on)) < len(config.noise_on):
-        raise ValueError(f"--noise-on must be targets, all or both, got {' '.join(config.noise_on) or 'nothing'}")
-    check_numbers("--", config)
-    drags = {"exact physics": 0.0, "unknown drag": config.drag}
-    cases = list(itertools.product(drags, config.noise_on))
-    parts, done, rows = _parts(config), itertools.count(1), []
-    with Line(NAME, console) as line:
-        for case, noise_on in cases:
-            pieces = []
-            for keys in parts:
-                pieces.append(jax.device_get(_repeats(config, noise_on == "all", drags[case], keys)))
-                line.show_parts(next(done), len(cases) * len(parts))
-            repeats = jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *pieces)
-            share = repeats["inside"].mean(axis=0)
-            columns = {
-                "coverage": share,
-                "standard_error": np.sqrt(share * (1 - share) / config.repeats),
-                "bias": 100 * repeats["error"].mean(axis=0),
-                "half_width": 100 * repeats["half_width"].mean(axis=0),
-                "converged": np.full(len(LEARNED), repeats["converged"].mean()),
-            }
-            rows += [
-                {"case": case, "noise_on": noise_on, "parameter": parameter}
-                | {name: float(column[i]) for name, column in columns.items()}
-                for i, parameter in enumerate(LEARNED)
-            ]
-    return Results(rows, ("case", "noise_on", "parameter"))
+HARD: dict[str, Any] = {"seeds": SOURCES, "noise": 1.0, "noise_on": "target", "draw": "contiguous", "validation": "own"}
+PRESETS = {
+    "paper": CoverageConfig(),
+    "quick": preset_like(CoverageConfig, replace(QUICK, **HARD, draws=20), known=KnownBody(repeats=20)),
+    "smoke": preset_like(
+        CoverageConfig, replace(SMOKE, **HARD), sizes=(20,), changes=("parameter_shift",), clean=False,
+        known=KnownBody(repeats=4),
+    ),
+}  # fmt: skip
 
 
-def recording(
-    config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], key: PRNGKeyArray
-) -> Trajectories:
-    """Windows of the true vehicle as they would be measured."""
-    start_key, input_key, x0_key, x_key = jax.random.split(key, 4)
-    x0 = starts(config, start_key)
-    jitter = jax.random.normal(input_key, (config.n_train, config.steps, 4))
-    u = IRIS.hover_speed + config.flight.rotor_speed * jitter
-    truth = RigidBody({name: jnp.log(TRUTH[name] / value) for name, value in nominal(IRIS).items()}, IRIS)
-    x = rollout_batch(Dragged(truth, drag), x0, u, DT)
-    start = jnp.where(start_is_measured, measure(x0, config.noise, x0_key), x0)
-    return Trajectories(start, u, measure(x, config.noise, x_key), DT)
+def experiment(config: CoverageConfig, console: Console) -> None:
+    stages = stages_of(config, console)
+    source = flown(SOURCE, source_splits(config), config, stages)
+    fields = pretrained(HYBRID, IRIS, config, stages, source).fields
+    levels = {0.0: "none"} if config.clean and config.noise else {}
+    levels |= {config.noise: f"{config.noise:g}" if config.noise else "none"}
+    rows = Results(
+        [
+            {**row, "noise": label}
+            for domain in CHANGES
+            if domain.name in config.changes
+            for noise, label in levels.items()
+            for row in adapted(domain, fields, replace(config, noise=noise), stages)
+        ],
+        ("domain", "noise", "draw", "parameter"),
+    )
+    if not hosts.is_main_process():
+        return
+    known = stages.timed("known body", lambda: coverage(config.known, console))
+    verdicts = evaluate_claims(CLAIMS, rows)
+    tables = [verdict_table(verdicts, "Hypotheses"), pooled_table(rows), known_body_table(known, config.known.level)]
+    report = Report(
+        experiment=NAME,
+        config=config.described(),
+        environment=environment(stages.seconds),
+        rows=rows,
+        claims=verdicts,
+        notes=stages.notes(),
+        head=HEAD.strip(),
+        tables=tables,
+        extra={"known_body": known.rows},
+    )
+    write_report(config.out / NAME, report, Console())
 
 
-def starts(config: Config, key: PRNGKeyArray) -> Float[Array, "n 13"]:
-    """Random states near hover.
+def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:
+    """A row for each flight and parameter: whether the pooled interval, and those of single sources, hold the truth."""
+    splits = {"train": target_splits(config)["train"]}
+    pool = flown(domain, splits, config, stages).splits["train"]
+    drawn, truth = windows_of(METHOD, config.sizes[0], config)[0], nominal(domain.vehicle)
 
-    In steady flight a vehicle leans into its velocity until thrust balances drag, by c v / (m g) [rad] horizontally.
-    Without this link between attitude and velocity the drag that the model does not know would be as often up as down
-    the thrust, and would average out.
-    """
-    flight = config.flight
-    velocity_key, tilt_key, rates_key = jax.random.split(key, 3)
-    v = flight.speed * jax.random.normal(velocity_key, (config.n_train, 3)) * jnp.array([1.0, 1.0, 1 / 3])
-    lean = config.drag / (IRIS.mass * IRIS.gravity) * jnp.stack([-v[:, 1], v[:, 0]], axis=1)
-    half = (lean + flight.tilt * jax.random.normal(tilt_key, lean.shape)) / 2
-    q = rotation.normalise(jnp.pad(half, ((0, 0), (1, 1)), constant_values=((0, 0), (1.0, 0.0))))
-    omega = flight.body_rates * jax.random.normal(rates_key, v.shape)
-    return jnp.concatenate([jnp.zeros_like(v), q, v, omega], axis=1)
+    def of_draw(draw: int) -> list[Row]:
+        windows = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
+        logs, stds = jax.device_get(_fits(fields, windows, settings(config)))
+        tags = {"domain": domain.name, "draw": draw}
+        return [
+            {**tags, "parameter": name, **_compared(logs[:, i], stds[:, i], np.log(truth[name] / nominal(IRIS)[name]))}
+            for i, name in enumerate(LEARNED)
+        ]
 
-
-def _parts(config: Config) -> list[PRNGKeyArray]:
-    """The keys of all repeats, a few at a time: between two parts progress is drawn and interrupts are handled."""
-    size = min(config.batch * -(-PART // config.batch), config.repeats)
-    keys = jax.random.split(jax.random.key(config.seed), config.repeats)
-    # The last part is filled up, so that one program serves all.
-    return [keys[np.arange(begin, begin + size) % config.repeats] for begin in range(0, config.repeats, size)]
+    name = f"intervals {domain.name}, noise {config.noise:g}"
+    return [row for rows in stages.parts(name, [partial(of_draw, d) for d in range(config.draws)]) for row in rows]
 
 
-@partial(jax.jit, static_argnums=0)
-def _repeats(
-    config: Config, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray
-) -> dict[str, Array]:
-    """A part of the repeats, stacked, errors in shares of the truth: one program for all parts and cases."""
+# Equinox passes the options to jax.jit, but does not declare them.
+@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+def _fits(fields: Any, windows: Trajectories, shared: Settings):
+    """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
+    cluster = blocks_of(windows.x0.shape[1], BLOCKS)[0].shape[1]  # windows of one flight are correlated
 
-    def one(key: PRNGKeyArray) -> dict[str, Array]:
-        windows = recording(config, start_is_measured, drag, key)
-        found = fit_least_squares(rigid_body(IRIS), windows)
-        around = intervals(found.field, covariance_of(found.field, windows, config.kind), config.level)
-        value, low, high = (jnp.stack(side) for side in zip(*(around[name] for name in LEARNED), strict=True))
-        true = jnp.array([TRUTH[name] for name in LEARNED])
-        inside = (low <= true) & (true <= high) & found.converged
-        errors = {"error": value / true - 1, "half_width": (high - low) / (2 * true)}
-        return errors | {"inside": inside, "converged": found.converged}
+    def one(run):
+        field, windows = run
+        found = METHOD.solve(field, windows, windows, shared)
+        free, theta = (each[found.choice.taken] for each in (found.choice.free, found.choice.theta))
+        covariance = covariance_of(found.field, windows, solver=shared.solver, free=free, cluster=cluster)
+        stds = jnp.where(free, jnp.sqrt(jnp.diagonal(covariance)), jnp.nan)
+        return theta[: len(LEARNED)], stds[: len(LEARNED)]
 
-    return jax.lax.map(one, keys, batch_size=min(config.batch, len(keys)))
+    return jax.lax.map(one, (fields, windows))
 
 
-def experiment(config: Config) -> None:
-    """Compute the rows, write them with their configuration to coverage/coverage.json, print the table."""
-    folder = config.out / NAME
-    checks.writable_folder("--out", folder)
-    rows = coverage(config, Console(stderr=True))
-    write_atomic(folder / "coverage.json", json_text({"config": asdict(config), "rows": rows.rows}))
+def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
+    """Whether pooled and single intervals contain the truth; error and half-width in %. None where not fitted."""
+    columns = ("inside", "error", "half_width", "alone")
+    if not np.isfinite(stds).all():
+        return dict.fromkeys(columns)
+    centre, away = combined(logs, stds**2, degrees=BLOCKS - 1)
+    reach = [
+        combined(np.full(2, log), np.full(2, std**2), degrees=BLOCKS - 1)[1]
+        for log, std in zip(logs, stds, strict=True)
+    ]
+    alone = float(np.mean(np.abs(logs - true) <= reach))
+    numbers = bool(abs(centre - true) <= away), 100 * np.expm1(centre - true), 100 * away, alone
+    return dict(zip(columns, numbers, strict=True))
+
+
+def pooled_table(rows: Results) -> Table:
+    """A line for each change, noise and parameter."""
+
+    def text(column: str, scale: float, form: str, statistic=np.mean):
+        def of(own: Results) -> str:
+            known = [row[column] for row in own if row["inside"] is not None]
+            return f"{scale * statistic(known):{form}}" if known else EMPTY
+
+        return of
+
     columns = {
-        "coverage [%]": lambda r: f"{100 * r[0]['coverage']:.1f} ± {100 * r[0]['standard_error']:.1f}",
-        "bias [%]": lambda r: f"{r[0]['bias']:+.2f}",
-        "half-width [%]": lambda r: f"{r[0]['half_width']:.2f}",
-        "converged [%]": lambda r: f"{100 * r[0]['converged']:.0f}",
+        "flights": lambda own: str(sum(row["inside"] is not None for row in own)),
+        "coverage [%]": text("inside", 100, ".0f"),
+        "one source [%]": text("alone", 100, ".0f"),
+        "bias [%]": text("error", 1, "+.2f"),
+        "half-width [%], median": text("half_width", 1, ".2f", np.median),
     }
-    title = f"Does the {100 * config.level:g} % interval contain the truth?"
-    groups = rows.group("case", "noise_on", "parameter")
-    print_tables(Console(), [tabulate(title, groups, columns, ("truth", "noise on", "θ_p"))])
+    title = f"Do pooled 95 % intervals of {SOURCES} sources or more contain the truth?"
+    return tabulate(title, rows.group("domain", "noise", "parameter"), columns, ("change", "noise", "θ_p"))
 
 
-main = partial(command.call, NAME, Config, experiment)
+def _covers(rows: Results) -> Part:
+    def of(name: str, own: Results) -> Part:
+        inside = np.array([row["inside"] for row in own if row["inside"] is not None], bool)
+        margin = 1.96 * np.sqrt(ASKED * (1 - ASKED) / max(len(inside), 1))
+        share = inside.mean() if len(inside) else np.nan
+        holds = True if share >= ASKED else False if share < ASKED - margin else None
+        return holds, f"{name} {share:.2f} of {len(inside)}"
+
+    groups = rows.group("domain", "noise", "parameter").items()
+    fitted = {key: own for key, own in groups if any(row["inside"] is not None for row in own)}
+    return all_of(of(" ".join(key), own) for key, own in fitted.items())
+
+
+CLAIMS = (
+    Claim(
+        "K1",
+        f"At least {ASKED:.0%} of the pooled 95 % intervals contain the truth, for each change, noise and parameter "
+        "(fails: significantly fewer).",
+        _covers,
+    ),
+)
+
+ABOUT = "Intervals of the physical parameters after adaptation to one flight of ten seconds: do they contain the truth?"
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
 if __name__ == "__main__":
     main()

@@ -25,7 +25,7 @@ ERRORS = {
 
 def row(model, mode, n, seed, test_mse, domain="parameter_shift", theta=None, theta_interval=None, **fields):
     known = {"domain": domain, "model": model, "mode": mode, "n_train": n, "seed": seed, "test_mse": test_mse}
-    known |= {"rho": None, "val_mse": 1e-3, "epochs": 150, "status": "ok"}
+    known |= {"draw": 0, "rho": None, "val_mse": 1e-3, "epochs": 150, "status": "ok"}
     return known | {"theta": theta, "theta_interval": theta_interval} | fields
 
 

@@ -18,7 +18,7 @@ def test_the_library_example_recovers_the_pendulums_length(tmp_path):
     (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
     (tmp_path / "example.py").write_text(code)
     said = script("example.py", cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(ROOT)})
-    assert said.startswith("Adapted to 20 windows by least_squares: converged")
+    assert said.startswith("Adapted to 20 windows by auto: converged")
     (length,) = re.findall(r"\nlength (\S+)\n", said)
     # Damping pulls at the length until the network has taken it over; 3 % is far inside what a wrong sign would do.
     assert abs(float(length) / 0.8 - 1) < 0.03

@@ -69,6 +69,8 @@ class ClosedLoopConfig(Config):
             raise ValueError(f"--away-references must be among --references ({known}), got {', '.join(unknown)}")
         if not self.invariant_rates:
             raise ValueError("--invariant-rates must be at least one")
+        if self.draws > 1:
+            raise ValueError(f"--draws must be 1: each model of a seed is flown, got {self.draws}")
         if self.seconds < 1:
             raise ValueError(f"--seconds must be at least 1, got {self.seconds}")
         if self.residual_outputs != "all":
@@ -107,7 +109,7 @@ class ClosedLoopConfig(Config):
         """The options of all experiments in simulation, so that their stages are shared, with the own rate of bias."""
         rates = self.rates if self.invariant_offset is None else replace(self.rates, offset=self.invariant_offset)
         most = {"source_train": min(self.source_train, source), "max_epochs": min(self.max_epochs, epochs)}
-        return preset_like(Config, self, sizes=sizes, pool=self.pooled(), rates=rates, **most)
+        return preset_like(Config, self, sizes=sizes, pool=self.shared_pool(), rates=rates, **most)
 
 
 PRESETS = {

@@ -61,7 +61,7 @@ def train(model: str, config: Config, stages: Stages) -> Trained:
 
 def least_squares(source: AbstractVectorField, method: Method, config: Config, stages: Stages) -> Trained:
     """Fit θ_p and a constant disturbance of the source models to the smallest N of each domain by least squares."""
-    own = replace(config, sizes=(min(config.sizes),), pool=config.pooled())
+    own = replace(config, sizes=(min(config.sizes),), pool=config.shared_pool())
 
     def fit(target: Dataset) -> Fit:
         return study.solved(f"least squares {target.config['domain']}", method, source, own, stages, target)

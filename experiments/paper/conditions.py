@@ -1,6 +1,7 @@
 """Conditions of a sweep's runs: models by seed, hyper-parameters by size (paper, App. A), and measurement noise."""
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -10,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from experiments.paper.config import Config, Encoding, Stopping, column
+from experiments.paper.config import HELD_BACK, Config, Encoding, Stopping, column
 from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
@@ -79,20 +80,27 @@ def pretraining(
     """One run per seed, from the seeds' fields, on all source trajectories, with all rates times a factor."""
     patience = config.patience
     rule = patience.no_physics_pretraining if model == "no_physics" else patience.hybrid_pretraining
-    plan = _plan(model, config, config.rates.pretraining, rule, np.arange(config.source_train), config.source_train)
+    rates = config.rates.physics, config.rates.pretraining
+    plan = _plan(model, config, rates, rule, np.arange(config.source_train), config.source_train)
     plan = replace(plan, rates=jax.tree.map(lambda rate: factor * rate, plan.rates))
     return _starts(fields, np.arange(config.seeds), PRETRAINING), stack([plan] * config.seeds)
 
 
-def adaptation(model: str, mode: str, fields: AbstractVectorField, config: Config) -> tuple[FitState, RunConfig]:
-    """One run for each size and seed, in this order, from the seeds' fields; the subsets of a seed are nested."""
+def adaptation(
+    model: str, mode: str, fields: AbstractVectorField, config: Config, sizes: Sequence[int]
+) -> tuple[FitState, RunConfig]:
+    """One run for each size, draw and seed, in this order, from the seeds' fields; the subsets of a seed are nested."""
     one, drawn = lane(fields, 0), subsets(config)
-    plans = [
-        _with_offset(_plan(model, config, *_adaptation_rule(model, mode, size, config), subset, size), one, config)
-        for size in config.sizes
-        for subset in drawn
-    ]
-    seeds = np.tile(np.arange(config.seeds), len(config.sizes))
+
+    def plan(size: int, subset: np.ndarray) -> RunConfig:
+        rates, rule = _adaptation_rule(model, mode, size, config)
+        if config.validation != "own":
+            return _plan(model, config, rates, rule, subset, size)
+        train, own = held_back(subset[:size])
+        return replace(_plan(model, config, rates, rule, train, len(train)), validate_on=jnp.asarray(own, jnp.int32))
+
+    plans = [_with_offset(plan(size, subset), one, config) for size in sizes for subset in drawn]
+    seeds = np.tile(np.arange(config.seeds), config.draws * len(sizes))
     return _starts(lane(fields, seeds), seeds, ADAPTATION), stack(plans)
 
 
@@ -112,25 +120,40 @@ def augmentation(
     return _starts(learners, seeds, AUGMENTATION), stack([plan] * config.seeds)
 
 
-def subsets(config: Config) -> Int[np.ndarray, "seeds pool"]:
-    """The indices of target trajectories in the order in which each seed takes them from the pool."""
-    return stack([jax.random.permutation(_key(seed, SUBSET), config.pooled()) for seed in range(config.seeds)])
+def subsets(config: Config) -> Int[np.ndarray, "runs pool"]:
+    """For each draw and seed, in this order, the indices of target trajectories as they are taken from the pool."""
+    if config.draw == "random":
+        keys = [_key(seed, SUBSET) for seed in range(config.seeds)]
+        keys = [jax.random.fold_in(key, draw) if draw else key for draw in range(config.draws) for key in keys]
+        return stack([jax.random.permutation(key, config.pooled()) for key in keys])
+    index = np.arange(config.pooled()).reshape(config.draws, config.flown_each(), config.windows_each())
+    # With --flights, one of each flight in turn; else one flight after the other.
+    index = index.swapaxes(1, 2) if config.flights else index
+    return np.repeat(index.reshape(config.draws, -1), config.seeds, axis=0)
 
 
-def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[float, Stopping]:
-    """The rate of θ_d and the stopping rule of a size."""
+def held_back(subset: Int[np.ndarray, "*runs n"]) -> tuple[Int[np.ndarray, "*runs m"], Int[np.ndarray, "*runs v"]]:
+    """The first of the target trajectories, to train on, and the last fifth of them, to stop by."""
+    own = max(subset.shape[-1] // HELD_BACK, 1)
+    return subset[..., :-own], subset[..., -own:]
+
+
+def _adaptation_rule(model: str, mode: str, size: int, config: Config) -> tuple[tuple[float, float], Stopping]:
+    """The rates of θ_p and θ_d, and the stopping rule, of a size."""
     rates, patience, i = config.rates, config.patience, column(size)
     if model == "no_physics":
         rate = rates.no_physics_target_only if mode == "target_only" else rates.no_physics[i]
-        return rate, patience.no_physics
-    return rates.hybrid[i], Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
+        return (0.0, rate), patience.no_physics
+    physics = rates.physics_fine_tuning if mode == "fine_tuned" else rates.physics
+    return (physics, rates.hybrid[i]), Stopping(patience.hybrid_minimum[i], patience.hybrid_patience[i])
 
 
-def _plan(model: str, config: Config, rate: Any, rule: Stopping, subset: np.ndarray, size: int) -> RunConfig:
-    physics: Any = config.rates.physics
-    rates = {"hybrid": Hybrid(physics, rate), "no_physics": rate, "physics_only": physics}[model]
+def _plan(
+    model: str, config: Config, rates: tuple[Any, Any], rule: Stopping, subset: np.ndarray, size: int
+) -> RunConfig:
+    of_model = {"hybrid": Hybrid(*rates), "no_physics": rates[1], "physics_only": rates[0]}[model]
     weight, cap = config.regulariser_weight, config.max_epochs
-    return make_run_config(rates, subset, size, rule.minimum, rule.patience, cap, weight)
+    return make_run_config(of_model, subset, size, rule.minimum, rule.patience, cap, weight)
 
 
 def _with_offset(plan: RunConfig, field: AbstractVectorField, config: Config) -> RunConfig:
@@ -196,7 +219,11 @@ def measured(dataset: Dataset, level: float, seed: int) -> Dataset:
     for name, windows in dataset.splits.items():
         if not name.startswith("test"):
             start_key, key = jax.random.split(jax.random.fold_in(jax.random.key(seed), zlib.crc32(name.encode())))
-            x0 = np.asarray(measure(jnp.asarray(windows.x0), noise, start_key))
+            x0 = np.array(measure(jnp.asarray(windows.x0), noise, start_key))
             x = np.asarray(measure(jnp.asarray(windows.x), noise, key))
+            if dataset.config.get("splits", {}).get(name, {}).get("flights"):
+                # Windows that touch share the sample between them.
+                touching = 1 + np.flatnonzero((windows.x0[1:] == windows.x[:-1, -1]).all(axis=1))
+                x0[touching] = x[touching - 1, -1]
             splits[name] = Trajectories(x0, windows.u, x, windows.dt)
     return Dataset(splits, {**dataset.metadata, "noise": asdict(noise)})

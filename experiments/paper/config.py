@@ -10,6 +10,8 @@ from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
 TABLE_SIZES = (100, 300, 500, 700, 1000)  # the columns of the paper's table of fine-tuning rates
+FLIGHT = 110  # windows of a flight, 11 s
+HELD_BACK = 5  # with --validation own, one in so many of the N windows stops the training
 MOST = 10_000_000  # trajectories; these alone take 7 GB
 FITTED = len(LEARNED) + 6  # what constant_disturbance fits: θ_p, and steady accelerations, linear and angular
 Kind = TypeVar("Kind", bound="Config")
@@ -25,7 +27,9 @@ class Rates:
     """Adam's learning rates; a tuple has one for each of the sizes 100, 300, 500, 700, 1000."""
 
     physics: NotNegative = 1e-2
-    """θ_p, in pre-training and fine-tuning."""
+    """θ_p from a fresh start: pre-training, and target-only."""
+    physics_fine_tuning: NotNegative = 1e-2
+    """θ_p in fine-tuning; illegible in the scan of the paper. Claims C8 and C10 of param_shift depend on it."""
     pretraining: NotNegative = 1e-4
     """θ_d, both models."""
     decay: tuple[Positive, ...] = ()
@@ -86,10 +90,18 @@ class Config(Run):
     """N, target trajectories to train on; rates and patience are those of the nearest size in the paper's table."""
     pool: int | None = None
     """Target trajectories from which a seed draws its N; by default as many as the largest N."""
+    draw: Literal["random", "contiguous"] = "random"
+    """Which N target trajectories. random: of many flights, as in the paper. contiguous: from the start of one flight,
+    of ten seconds for 100 trajectories; of as few flights as hold them for more."""
+    draws: Count = 1
+    """Draws of target trajectories for each seed; contiguous draws are of different flights, the same for all seeds."""
+    flights: Count | None = None
+    """With contiguous: take N / flights trajectories from the start of each of so many flights."""
     source_train: Count = 10_000
     """Source trajectories for pre-training."""
-    validation: Count = 1000
-    """Validation trajectories, in the source and in the target."""
+    validation: Count | Literal["own"] = 1000
+    """Validation trajectories, in the source and in the target. own: nothing but the N target trajectories is used;
+    where a method needs some to stop by, these are the last fifth of them."""
     test: Count = 1000
     """Target test trajectories."""
     data_seed: CountFromZero = 0
@@ -114,6 +126,8 @@ class Config(Run):
     """Instead of --guess: each of θ_p starts at nominal times or over 1 + this, at random."""
     noise: NotNegative = 0.0
     """White noise on the states of training and validation flights; 1 is typical of motion capture and a gyroscope."""
+    noise_on: Literal["all", "target"] = "all"
+    """Which of these flights are noisy: those before the change as well, or those after it alone."""
     regulariser: RegulariserName = "trajectory_correlation"
     """Penalty that keeps f_d from replacing f_p."""
     regulariser_weight: NotNegative = 1e-3
@@ -136,8 +150,9 @@ class Config(Run):
             raise ValueError(f"--sizes must each be at least {batch}, got {self.sizes}")
         if self.source_train < self.batch_size:
             raise ValueError(f"--source-train must be at least {batch}, got {self.source_train}")
-        if self.pooled() + self.source_train + self.validation + self.test > MOST:
-            options = "--sizes, --pool, --source-train, --validation and --test"
+        self._check_draws()
+        if self.pooled() + self.source_train + self.validating() + self.test > MOST:
+            options = "--sizes, --draws, --pool, --source-train, --validation and --test"
             raise ValueError(f"{options} must ask for at most {MOST:,} trajectories together")
         chosen = {*getattr(self, "models", ()), *getattr(self, "methods", ())}  # empty where there is no choice
         if CONSTANT_DISTURBANCE in chosen and min(self.sizes) <= FITTED:
@@ -156,8 +171,42 @@ class Config(Run):
             if len(getattr(getattr(self, group), entry)) != len(TABLE_SIZES):
                 raise ValueError(f"--{name.replace('_', '-')} must have one entry for each of {TABLE_SIZES}")
 
+    def _check_draws(self) -> None:
+        if self.draw == "contiguous" and self.pool is not None:
+            raise ValueError("--pool is for --draw random: leave it out")
+        if self.draw == "random" and self.flights is not None:
+            raise ValueError("--flights is for --draw contiguous: leave it out")
+        if self.flights is not None and max(self.sizes) > FLIGHT * self.flights:
+            most = f"{FLIGHT} of each of {self.flights} flights"
+            raise ValueError(f"--sizes must be at most {most}, got {self.sizes}")
+        if self.validation == "own" and min(self.sizes) < HELD_BACK:
+            raise ValueError(f"--sizes must each be at least {HELD_BACK} with --validation own, got {self.sizes}")
+
     def pooled(self) -> int:
+        """Target trajectories to draw from; with contiguous those of all draws."""
+        if self.draw == "contiguous":
+            return self.draws * self.flown_each() * self.windows_each()
         return max(self.sizes) if self.pool is None else self.pool
+
+    def shared_pool(self) -> int | None:
+        """The option --pool with which another choice of sizes draws the same trajectories."""
+        return self.pooled() if self.draw == "random" else None
+
+    def flown_each(self) -> int:
+        """Flights of a contiguous draw."""
+        return self.flights or -(-max(self.sizes) // FLIGHT)
+
+    def windows_each(self) -> int:
+        """Trajectories of each flight of a contiguous draw."""
+        return -(-max(self.sizes) // self.flown_each())
+
+    def runs(self) -> int:
+        """Runs of each size."""
+        return self.draws * self.seeds
+
+    def validating(self) -> int:
+        """Validation trajectories of the source; of those of the paper, one to ten for training."""
+        return max(self.source_train // 10, 1) if self.validation == "own" else self.validation
 
 
 @dataclass(frozen=True)

@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.paper.claims import THETA_TOLERANCE
-from experiments.paper.lanes import THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
@@ -48,6 +48,7 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
     figure, ((left, right),) = subplots((9, 4.8), 1, 2)
     _draw_errors(left, _curves(rows, "test_mse"), floor)
+    _draw_home(left, rows.where(lambda row: "source_mse" in row))
     _draw_gains(right, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
     sizes = adapted_sizes(rows)
     for axes in (left, right):
@@ -145,6 +146,16 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if floor > 1 / DRAWABLE:
         axes.axhline(floor, color="0.4", linestyle="-.", label=plots.FLOOR_LABEL)
+
+
+def _draw_home(axes: Axes, rows: Results) -> None:
+    """The error of the first source model on flights of the source."""
+    for model in [model for model in MODELS if model in rows["model"]][:1]:
+        home = rows.where(model=model).spread("source_mse").mean
+        if 1 / DRAWABLE < home < DRAWABLE:
+            axes.axhline(home, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1,
+                         label=f"{label(model, SOURCE_ONLY)}, on source flights")  # fmt: skip
+            axes.set_ylim(bottom=min(axes.get_ylim()[0], home / 2))
 
 
 def _draw_gains(axes: Axes, curves: _Curves) -> None:

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 
 import hybrid_jax
 from experiments.reporting import names
@@ -16,6 +17,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED, FitState
+from hybrid_jax.trajectories import Trajectories
 
 THETA = ("Ix", "Iy", "k")
 DOMAINS = (names.PARAMETER_SHIFT, names.EXTERNAL_FORCE)
@@ -25,8 +27,11 @@ BASELINES = (
 )  # fmt: skip
 MODELS = (HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
 MODES = (names.FINE_TUNED, names.TARGET_ONLY, SOURCE_ONLY)
+# Test windows by their lowest altitude [m]: near the ground, above it, and where no ground effect is left.
+BANDS = {"low": "below 0.12 m", "middle": "0.12–0.5 m", "high": "above 0.5 m"}
+BAND_EDGES = (0.12, 0.5)
 CELL = ("model", "mode", "n_train")
-TAGS = ("domain", *CELL, "seed")
+TAGS = ("domain", *CELL, "draw", "seed")
 Cell = tuple[str, str, int]  # model, mode, n_train
 
 
@@ -58,19 +63,22 @@ def lanes_of(
     model: str,
     mode: str,
     sizes: Sequence[int],
+    seeds: int,
     fit: Fit,
     errors: np.ndarray,
     theta: Mapping[str, np.ndarray] | None = None,
     intervals: Mapping[str, np.ndarray] | None = None,
+    more: Mapping[str, np.ndarray] | None = None,
 ) -> Lanes:
-    """Models tested in a domain, one for each size and, in it, seed.
+    """Models tested in a domain, one for each size, draw and seed, in this order.
 
     Args:
         errors: L^T_MSE on the test flights.
         theta: name → the value of each, instead of that in the models.
         intervals: name → (lanes, 2), low and high end of the 95 % interval of θ_p.
+        more: further columns, the number of each.
     """
-    theta, seeds = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
+    theta, runs = theta_of(fit.fields) if theta is None else theta, len(errors) // len(sizes)
 
     def row(i: int) -> Row:
         ends = {name: pair[i] for name, pair in (intervals or {}).items()}
@@ -80,7 +88,8 @@ def lanes_of(
             "domain": domain,
             "model": model,
             "mode": mode,
-            "n_train": sizes[i // seeds],
+            "n_train": sizes[i // runs],
+            "draw": i % runs // seeds,
             "seed": i % seeds,
             "test_mse": float(errors[i]),
             "rho": None,  # see `with_rho`
@@ -89,9 +98,24 @@ def lanes_of(
             "status": STATUS_NAMES.get(int(fit.status[i]), STATUS_NAMES[STOPPED]),
             "theta": {name: float(value[i]) for name, value in theta.items()} or None,
             "theta_interval": bounds or None,
+            **{name: float(values[i]) for name, values in (more or {}).items()},
         }
 
     return Lanes(model, mode, fit.fields, [row(i) for i in range(len(errors))])
+
+
+def by_altitude(
+    column: str, windows: Trajectories, errors: Float[np.ndarray, "lanes windows"]
+) -> dict[str, Float[np.ndarray, " lanes"]]:
+    """The mean error of each model over the windows of each band, by column; NaN for a band without windows."""
+    band = np.digitize(lowest_altitude(windows), BAND_EDGES)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        sums = [errors[:, band == i].sum(axis=1) / np.float64(np.sum(band == i)) for i in range(len(BANDS))]
+    return {f"{column}_{name}": mean for name, mean in zip(BANDS, sums, strict=True)}
+
+
+def lowest_altitude(windows: Trajectories) -> Float[np.ndarray, " windows"]:
+    return np.minimum(windows.x0[:, 2], windows.x[..., 2].min(axis=1))
 
 
 def physics_in(field: Any) -> Any:
@@ -174,6 +198,7 @@ def save_models(folder: Path, groups: Sequence[Lanes], rows: Results) -> None:
     """Save every trained model, with what its row says about it; the rows as `rows_of` orders them."""
     models = [lane(lanes.fields, i) for lanes in groups for i in range(len(lanes.rows))]
     for model, row in zip(models, rows, strict=True):
-        about = {name: row[name] for name in ("model", "mode", "n_train", "seed", "test_mse", "val_mse")}
-        path = folder / "{model}-{mode}-{n_train}-seed{seed}.npz".format(**row)
+        about = {name: row[name] for name in ("model", "mode", "n_train", "draw", "seed", "test_mse", "val_mse")}
+        name = "{model}-{mode}-{n_train}-seed{seed}" + ("-draw{draw}" if row["draw"] else "")
+        path = folder / f"{name.format(**row)}.npz"
         hybrid_jax.save(path, model, about | {"dt": DT})

@@ -10,10 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.paper.conditions import adaptation, settings, subsets
+from experiments.paper.conditions import settings, subsets
 from experiments.paper.config import Config
-from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, physics_in, source_of, theta_of
+from experiments.paper.lanes import Fit, Lanes, lanes_of, physics_in, source_of, theta_of
 from experiments.paper.study import SOLVED, solved
+from experiments.paper.study import adapted as trained
 from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation import covariance_of, intervals
@@ -58,7 +59,7 @@ class Case:
 def source_only(case: Case, model: str) -> Lanes:
     fit, mode = case.pretrained[model], names.SOURCE_ONLY
     errors = case.tested(f"{mode} {model}", fit.fields)
-    return lanes_of(case.name, model, mode, (0,), fit, errors)
+    return lanes_of(case.name, model, mode, (0,), case.config.seeds, fit, errors)
 
 
 def adapted(case: Case, method: Method) -> Lanes:
@@ -74,11 +75,11 @@ def adapted(case: Case, method: Method) -> Lanes:
             start = Hybrid(start.physics, Frozen(start.residual))
         elif method == names.THETA_D_ONLY:
             start = Hybrid(Frozen(start.physics), start.residual)
-        fit = fit_of(case.stages.run(stage, *adaptation(model, mode, start, config), settings(config), case.target))
+        fit = trained(model, mode, start, config, case.stages, case.target, method)
         fit = fit._replace(fields=unfreeze(fit.fields))
     errors = case.tested(method, fit.fields)
     known = _intervals_of(case, method, fit.fields)
-    return lanes_of(case.name, method, mode, config.sizes, fit, errors, intervals=known)
+    return lanes_of(case.name, method, mode, config.sizes, config.seeds, fit, errors, intervals=known)
 
 
 def _augmented(case: Case) -> Lanes:
@@ -88,7 +89,8 @@ def _augmented(case: Case) -> Lanes:
 
     encoded = partial(_encoded, experts.fields, windows, settings(case.config).solver)
     errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: jax.device_get(encoded()))
-    return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), experts, errors, theta_of(physics))
+    seeds = case.config.seeds
+    return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), seeds, experts, errors, theta_of(physics))
 
 
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
@@ -113,7 +115,7 @@ def _intervals_of(case: Case, method: Method, fields: Any) -> Mapping[str, np.nd
     config, pool = case.config, case.target.splits["train"]
 
     def of_size(index: int, size: int):
-        own = lane(fields, np.arange(index * config.seeds, (index + 1) * config.seeds))
+        own = lane(fields, np.arange(index * config.runs(), (index + 1) * config.runs()))
         return jax.device_get(_intervals((own, subsets(config)[:, :size]), pool, settings(config).solver))
 
     parts = case.stages.timed(

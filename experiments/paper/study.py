@@ -15,9 +15,9 @@ import numpy as np
 from rich.console import Console
 
 from experiments.make_flights import chosen_flights, flights
-from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, settings, subsets
+from experiments.paper.conditions import adaptation, fresh_fields, held_back, measured, pretraining, settings, subsets
 from experiments.paper.config import AdaptationConfig, Config
-from experiments.paper.lanes import Fit, Lanes, fit_of, lanes_of, rows_of, source_of
+from experiments.paper.lanes import Fit, Lanes, by_altitude, fit_of, lanes_of, rows_of, source_of
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
@@ -32,7 +32,8 @@ from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
 from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.training import evaluate, sweep
+from hybrid_jax.sweep.lanes import lane
+from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training.fitting import STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -77,12 +78,13 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
                 programs[model] = pool.submit(_compile, model, vehicle, config)
         source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
         target = flown(domain, target_splits(config), config, stages, config.target_flights)
+        home = flown(SOURCE, {"test": SplitSpec(config.test, 100)}, config, stages)
         for model in config.models:
             start = source_of(model)
             if start not in learned:
                 wait([programs[start]] if start in programs else [])  # an error is met again below
                 learned[start] = pretrained(start, vehicle, config, stages, source)
-                lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target))
+                lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target, home))
             fields = learned[start].fields
             if model in SOLVED:
                 name = f"{FINE_TUNED} {model} {target.config['domain']}"
@@ -90,7 +92,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             else:
                 starts = {FINE_TUNED: fields, TARGET_ONLY: fresh_fields(model, vehicle, config)}
                 finals = {mode: adapted(model, mode, begin, config, stages, target) for mode, begin in starts.items()}
-            lanes += [tested(model, mode, final, config, stages, target) for mode, final in finals.items()]
+            lanes += [tested(model, mode, final, config, stages, target, None) for mode, final in finals.items()]
     return Study(source, target, lanes, rows_of(lanes), stages.seconds, stages.notes())
 
 
@@ -104,20 +106,34 @@ def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, sou
     return fit_of(found)
 
 
-def adapted(model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset) -> Fit:
-    """A model after training on target flight, one run for each size and, in it, seed."""
-    name, lanes = f"{mode} {model} {target.config['domain']}", adaptation(model, mode, fields, config)
-    return fit_of(stages.run(name, *lanes, settings(config), target, capacity(config)))
+def adapted(
+    model: str, mode: str, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset, name: str = ""
+) -> Fit:
+    """A model after training on target flight, one run for each size, draw and seed, in this order."""
+    name = f"{mode} {name or model} {target.config['domain']}"
+    if config.validation != "own":
+        lanes = adaptation(model, mode, fields, config, config.sizes)
+        return fit_of(stages.run(name, *lanes, settings(config), target, capacity(config)))
+    # The windows to stop by are of the pool. Runs of one sweep have equally many, so each size is a sweep.
+    data = Dataset(dict.fromkeys(("train", "validation"), target.splits["train"]), target.metadata)
+
+    def of_size(size: int) -> Fit:
+        lanes, shared = adaptation(model, mode, fields, config, [size]), settings(config)
+        shared = replace(shared, batch_size=min(shared.batch_size, int(lanes[1].n_train[0])))
+        return fit_of(stages.run(f"{name} {size}", *lanes, shared, data))
+
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *map(of_size, config.sizes))
 
 
 def solved(
     name: str, method: Method, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> Fit:
     """Each seed's field adapted to its target windows by a method, for each of the sizes, as the stage `name`."""
-    windows = target.splits["train"], target.splits["validation"]
+    starts = lane(fields, np.tile(np.arange(config.seeds), config.draws))
 
     def of_size(size: int) -> Fit:
-        return jax.device_get(_solved(method, settings(config), (fields, subsets(config)[:, :size]), *windows))
+        windows = windows_of(method, size, config)
+        return jax.device_get(_solved(method, settings(config), (starts, *windows), target.splits))
 
     parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
@@ -126,22 +142,39 @@ def solved(
 # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
 # Equinox passes the options to jax.jit, but does not declare them.
 @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
-def _solved(method: Method, shared: Settings, lanes: Any, pool: Trajectories, validation: Trajectories) -> Fit:
-    def one(lane) -> Fit:
-        field, subset = lane
-        field, steps, status = method.solve(field, pool[subset], validation, shared)
+def _solved(method: Method, shared: Settings, lanes: Any, splits: Mapping[str, Trajectories]) -> Fit:
+    def one(run) -> Fit:
+        field, subset, own = run
+        pool = splits["train"]
+        validation = splits["validation"] if own is None else pool[own]
+        field, steps, status, _ = method.solve(field, pool[subset], validation, shared)
         val_mse = rollout_mse(field, validation, solver=shared.solver)
         return Fit(field, val_mse, jnp.asarray(steps), jnp.asarray(status))
 
     return jax.lax.map(one, lanes)
 
 
-def tested(model: str, mode: str, fit: Fit, config: Config, stages: Stages, target: Dataset) -> Lanes:
-    """The models with their L^T_MSE on the test flights."""
-    windows, count = target.splits["test"], capacity(config)[0]
-    errors = stages.timed(f"test {mode} {model}", lambda: evaluate(fit.fields, windows, EVERY, settings(config), count))
+def windows_of(method: Method, size: int, config: Config) -> tuple[np.ndarray, np.ndarray | None]:
+    """Of each run the windows to fit, in the order of time, and those of them to choose by, or None for others."""
+    subset = subsets(config)[:, :size]
+    subset = np.sort(subset) if config.draw == "contiguous" else subset
+    if config.validation != "own":
+        return subset, None
+    return held_back(subset) if getattr(method, "uses_validation", True) else (subset, subset)
+
+
+def tested(
+    model: str, mode: str, fit: Fit, config: Config, stages: Stages, target: Dataset, home: Dataset | None
+) -> Lanes:
+    """The models with their L^T_MSE on the test flights, also by altitude; and on those of the source, their floor."""
+    errors, more = np.empty(0), {}
+    for column, flown_in in {"source_mse": home, "test_mse": target}.items():
+        if flown_in is not None:
+            given = fit.fields, flown_in.splits["test"], EVERY, settings(config), capacity(config)[0]
+            errors, each = stages.timed(f"test {mode} {model}", partial(evaluate_windows, *given))
+            more |= {column: errors, **by_altitude(column, given[1], each)}
     sizes = (0,) if mode == SOURCE_ONLY else config.sizes
-    return lanes_of(target.config["domain"], model, mode, sizes, fit, errors)
+    return lanes_of(target.config["domain"], model, mode, sizes, config.seeds, fit, errors, more=more)
 
 
 def flown(
@@ -163,21 +196,29 @@ def flown(
 
     (metadata, steps, origin), arrays = stages.timed(f"flights {domain.name}", lambda: hosts.from_first(read))
     received = {n: Trajectories(*(arrays[f"{n}/{part}"] for part in ARRAYS), dt=dt) for n, dt in steps.items()}
-    return measured(Dataset(received, metadata, origin), config.noise, config.data_seed)
+    noise = config.noise if config.noise_on == "all" or domain is not SOURCE else 0.0
+    return measured(Dataset(received, metadata, origin), noise, config.data_seed)
 
 
 def source_splits(config: Config) -> dict[str, SplitSpec]:
-    return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validation, 10)}
+    return {"train": SplitSpec(config.source_train, 10), "validation": SplitSpec(config.validating(), 10)}
 
 
 def target_splits(config: Config) -> dict[str, SplitSpec]:
     """The splits of the target; every seed draws from the train split."""
-    return source_splits(config) | {"train": SplitSpec(config.pooled(), 10), "test": SplitSpec(config.test, 100)}
+    return drawn_splits(config) | {"test": SplitSpec(config.test, 100)}
+
+
+def drawn_splits(config: Config) -> dict[str, SplitSpec]:
+    """The pool and, if other trajectories than those drawn from it stop the training, these."""
+    flights = config.draws * config.flown_each() if config.draw == "contiguous" else 0
+    others = {} if config.validation == "own" else {"validation": SplitSpec(config.validation, 10)}
+    return {"train": SplitSpec(config.pooled(), 10, flights), **others}
 
 
 def capacity(config: Config) -> tuple[int, int]:
     """Runs and windows to compile for, shared by pre-training (fewer runs) and adaptation (fewer windows)."""
-    return config.seeds * len(config.sizes), max(config.source_train, config.pooled())
+    return config.runs() * len(config.sizes), max(config.source_train, config.pooled())
 
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
@@ -187,8 +228,10 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
     )
     before = pretraining(model, fresh, config)
-    after = adaptation(model, TARGET_ONLY, fresh, config)
-    for (states, plans), windows in ((before, source), (after, target)):
+    jobs = [(before, source)]
+    if config.validation != "own":
+        jobs.append((adaptation(model, TARGET_ONLY, fresh, config, config.sizes), target))
+    for (states, plans), windows in jobs:
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])

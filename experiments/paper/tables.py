@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from experiments.paper.claims import FEW
-from experiments.paper.lanes import MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
+from experiments.paper.lanes import BANDS, MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row, spread
@@ -55,6 +55,30 @@ def by_size(rows: Results) -> list[Table]:
             lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": cell for n, cell in sizes.items()}
             tables.append(cross_table(title, lines, columns, text, "N, target trajectories"))
     return tables
+
+
+def altitudes(rows: Results) -> list[Table]:
+    """Test error by the windows' lowest altitude, at the smallest and the largest N; and that of the source models on
+    flights of the source, which adaptation can hardly get below. No table for rows without these columns."""
+    own, sizes = rows.where(lambda row: "test_mse_low" in row), adapted_sizes(rows)
+    if not len(own):
+        return []
+    groups = {
+        (label(model), label(mode), str(n or EMPTY)): ("test_mse", group)
+        for (model, mode, n), group in cells(own).items()
+        if n in (0, *sizes[:1], *sizes[-1:])
+    }
+    home = own.where(lambda row: "source_mse" in row).group("model")
+    groups |= {(label(model), "source-only, on source flights", EMPTY): ("source_mse", home[model]) for model in home}
+
+    def text(column: str, group: Results) -> str:
+        values = group.spread(column)
+        return EMPTY if values.non_finite == values.count else spread_text(values, ".2e", ".1e")
+
+    columns = {"": "all", **{f"_{name}": title for name, title in BANDS.items()}}
+    lines = [(*key, *(text(f"{column}{end}", group) for end in columns)) for key, (column, group) in groups.items()]
+    title = f"Test error by the lowest altitude of the window, and its floor ({mean_over_seeds(own)})"
+    return [Table(title, ("model", "mode", "N", *columns.values()), lines)]
 
 
 def ranking(rows: Results) -> list[Table]:

@@ -1,4 +1,4 @@
-"""Hypotheses about results as data: each is evaluated to holds, fails or inconclusive, with the numbers behind it."""
+"""Hypotheses about results as data: each is evaluated to holds, fails or undecided, with the numbers behind it."""
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -7,17 +7,17 @@ from typing import Any, Generic, TypeVar
 from experiments.reporting.tables import Table
 
 Evidence = TypeVar("Evidence")
-Part = tuple[bool, str]  # whether a hypothesis holds in one case, and the numbers behind that
-OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– inconclusive"}
+Part = tuple[bool | None, str]  # whether a hypothesis holds in one case, None if undecided, and the numbers behind that
+OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– undecided"}
 
 
-class Inconclusive(Exception):
-    """The results cannot decide a claim; the message says why."""
+class Undecided(Exception):
+    """The results lack what a claim needs; the message says what."""
 
 
 @dataclass(frozen=True)
 class Claim(Generic[Evidence]):
-    """A hypothesis, and a function that decides it or raises `Inconclusive`."""
+    """A hypothesis, and a function that decides it or raises `Undecided`."""
 
     id: str  # such as "C1"
     text: str
@@ -26,18 +26,25 @@ class Claim(Generic[Evidence]):
 
 @dataclass(frozen=True)
 class Verdict:
-    """The outcome of a claim: `holds` is None if the results are inconclusive, and `measured` then says why."""
+    """The outcome of a claim: `holds` is None if it is undecided; `measured` says why, or what data are lacking."""
 
     id: str
     text: str
     holds: bool | None
     measured: str
+    lacks_data: bool = False
+
+
+def every(outcomes: Iterable[bool | None]) -> bool | None:
+    """False if one is, else None if one is, else True."""
+    found = set(outcomes)
+    return False if False in found else None if None in found else True
 
 
 def all_of(parts: Iterable[Part]) -> Part:
-    """Whether all parts of a hypothesis hold, and their numbers."""
+    """Whether all parts of a hypothesis hold, see `every`, and their numbers."""
     holds, measured = zip(*parts, strict=True)
-    return all(holds), "; ".join(measured)
+    return every(holds), "; ".join(measured)
 
 
 def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verdict]:
@@ -45,9 +52,9 @@ def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verd
     def verdict(claim: Claim[Evidence]) -> Verdict:
         try:
             holds, measured = claim.predicate(evidence)
-            return Verdict(claim.id, claim.text, bool(holds), measured)
-        except Inconclusive as why:
-            return Verdict(claim.id, claim.text, None, str(why))
+            return Verdict(claim.id, claim.text, None if holds is None else bool(holds), measured)
+        except Undecided as why:
+            return Verdict(claim.id, claim.text, None, str(why), lacks_data=True)
 
     return [verdict(claim) for claim in claims]
 
@@ -58,8 +65,10 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
 
 
 def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:
-    """The keys of report.json: `claims` that were decided, and `not_judged` for those that are inconclusive."""
+    """The keys of report.json: `claims` with their outcome, and `not_judged` for those that lack data."""
     return {
-        "claims": [vars(each) for each in verdicts if each.holds is not None],
-        "not_judged": [{"id": v.id, "text": v.text, "why": v.measured} for v in verdicts if v.holds is None],
+        "claims": [
+            {"id": v.id, "text": v.text, "holds": v.holds, "measured": v.measured} for v in verdicts if not v.lacks_data
+        ],
+        "not_judged": [{"id": v.id, "text": v.text, "why": v.measured} for v in verdicts if v.lacks_data],
     }

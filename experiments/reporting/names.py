@@ -4,7 +4,7 @@ HYBRID, NO_PHYSICS, PHYSICS_ONLY = "hybrid", "no_physics", "physics_only"
 EXPERT_AUGMENTATION, LAST_LAYER, LINEAR_RESIDUAL = "expert_augmentation", "last_layer", "linear_residual"
 THETA_P_ONLY, THETA_D_ONLY = "theta_p_only", "theta_d_only"
 LEAST_SQUARES, CONSTANT_DISTURBANCE = "least_squares", "constant_disturbance"
-THRUST, HOLD = "thrust", "hold"
+THRUST, HOLD, CHOSEN = "thrust", "hold", "chosen"
 FINE_TUNED, TARGET_ONLY, SOURCE_ONLY = "fine_tuned", "target_only", "source_only"
 SCRATCH, ZERO_SHOT, NOMINAL = "scratch", "zero_shot", "nominal"
 UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE = "source", "parameter_shift", "external_force"
@@ -21,6 +21,7 @@ LABELS = {
     LINEAR_RESIDUAL: "source + linear residual",
     THRUST: "thrust, rates frozen",
     HOLD: "hold the state",
+    CHOSEN: "chosen",
     FINE_TUNED: "fine-tuned",
     ZERO_SHOT: "zero-shot",
     TARGET_ONLY: "target-only",

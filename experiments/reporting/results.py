@@ -16,6 +16,7 @@ from hybrid_jax.io.files import json_value
 Row = Mapping[str, Any]  # JSON values by column; a nested column, such as theta, is a mapping
 Column = str | Callable[[Row], float]
 Values = Sequence[float] | np.ndarray  # of each seed
+Labels = Sequence[Any] | np.ndarray  # the seeds of runs, or their draws
 LEVEL = 0.95
 
 
@@ -37,6 +38,18 @@ class Interval(NamedTuple):
     low: float = math.nan
     high: float = math.nan
 
+    def below(self, limit: float) -> bool | None:
+        """Whether the whole interval is below the limit; False if it is all above, None if it does not tell."""
+        return True if self.high < limit else False if self.low > limit else None
+
+    def above(self, limit: float) -> bool | None:
+        return Interval(-self.value, -self.high, -self.low).below(-limit)
+
+    def text(self, form: str = ".3g") -> str:
+        known = f"{self.low:{form}} … {self.high:{form}}" if self.low < self.high else "no interval"
+        certain = math.isinf(self.value) or self.low == self.high
+        return (f"{self.value:{form}}" + ("" if certain else f" ({known})")).replace("inf", "∞")
+
 
 def spread(values: Values) -> Spread:
     array = np.asarray(values, float)
@@ -47,19 +60,49 @@ def spread(values: Values) -> Spread:
     return Spread(mean, std, median, float(np.min(array)), len(array), non_finite)
 
 
-def mean_difference(first: Values, second: Values, level: float = LEVEL) -> Interval:
-    """The mean of first − second over the seeds where both are finite, with Student's t interval of the paired test.
+def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) -> Interval:
+    """The mean of the values of runs, with a confidence interval over seeds and draws of flights.
 
-    What the seeds of a pair share, such as the model from which both started, cancels.
+    Runs of the same seed are related, and so are runs of the same draw. The variance is clustered both ways, V_seed +
+    V_draw − V_both (Cameron, Gelbach, Miller, "Robust inference with multiway clustering", 2011), but not below V_seed
+    or V_draw. With one draw the interval is Student's. An infinite value makes the mean infinite, for certain; one
+    seed bounds nothing.
     """
-    one, other = _finite(first, second)
-    value = float(np.mean(one - other)) if len(one) else math.nan
-    if len(one) < 2:
-        return Interval(value)
-    if np.ptp(one - other) == 0:  # the test has no statistic
-        return Interval(value, value, value)
-    low, high = scipy.stats.ttest_rel(one, other).confidence_interval(level)
-    return Interval(value, float(low), float(high))
+    array = np.asarray(values, float)
+    with np.errstate(invalid="ignore"):
+        mean = float(np.mean(array)) if len(array) else math.nan
+    ways = [list(seeds), list(seeds if draws is None else draws)]
+    clusters = [count for way in ways if (count := len(set(way))) > 1]
+    if len(set(ways[0])) < 2 or math.isnan(mean):
+        return Interval(mean)
+    if math.isinf(mean):
+        return Interval(mean, mean, mean)
+
+    def variance(labels: Labels) -> float:
+        sums = np.bincount(np.unique(labels, return_inverse=True)[1].ravel(), array - mean)
+        return 0.0 if len(sums) < 2 else float(sums @ sums) * len(sums) / (len(sums) - 1) / len(array) ** 2
+
+    one, other, both = map(variance, (*ways, np.arange(len(array))))
+    t = float(scipy.special.stdtrit(min(clusters) - 1, (1 + LEVEL) / 2))
+    half = t * math.sqrt(max(one + other - both, one, other))
+    return Interval(mean, mean - half, mean + half)
+
+
+def ratio_of_stds(first: Values, second: Values) -> Interval:
+    """The standard deviation of first over that of second, of the same seeds, with the interval of the test of Pitman
+    and Morgan (1939). An infinite value makes a standard deviation infinite."""
+    above, below = spread(first).std, spread(second).std
+    if math.isnan(above + below) or (above == below and above in (0.0, math.inf)):
+        return Interval()
+    if 0 in (above, below) or math.inf in (above, below):
+        ratio = math.inf if below == 0 or above == math.inf else 0.0
+        return Interval(ratio, ratio, ratio)
+    if len(first) < 3:
+        return Interval(above / below)
+    t, freedom = float(scipy.special.stdtrit(len(first) - 2, (1 + LEVEL) / 2)), len(first) - 2
+    k = 1 + 2 * max(0.0, 1 - float(np.corrcoef(first, second)[0, 1]) ** 2) * t**2 / freedom
+    reach = math.sqrt(k + math.sqrt(k * k - 1))
+    return Interval(above / below, above / below / reach, above / below * reach)
 
 
 def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Interval:
@@ -187,17 +230,28 @@ class Results:
         return spread(self.numbers(column, missing))
 
     def paired(self, other: "Results", column: Column) -> tuple[np.ndarray, np.ndarray]:
-        """The numbers of a column here, and of the rows with the same seeds in another table.
+        """The numbers of a column here, and of the rows with the same seeds and draws in another table.
 
         A table of one row, such as that of a model that was not trained, is paired with every seed.
         """
-        theirs = dict(zip(other["seed"], other.numbers(column), strict=True))
+        theirs = dict(zip(other._runs(), other.numbers(column), strict=True))
         if len(other) == 1:
             return self.numbers(column), np.full(len(self), *theirs.values())
-        lacking = [seed for seed in self["seed"] if seed not in theirs]
+        lacking = [run for run in self._runs() if run not in theirs]
         if lacking:
-            raise ValueError(f"other must hold the same seeds, {lacking[0]} is missing")
-        return self.numbers(column), np.array([theirs[seed] for seed in self["seed"]])
+            seed, draw = lacking[0]
+            where = seed if draw is None else f"{seed} of draw {draw}"
+            raise ValueError(f"other must hold the same seeds, {where} is missing")
+        return self.numbers(column), np.array([theirs[run] for run in self._runs()])
+
+    def interval(self, column: Column, minus: "Results | None" = None, times: float = 1.0) -> Interval:
+        """The mean of a column, or of its difference from `times` that of another table's paired rows."""
+        first, second = (self.numbers(column), 0.0) if minus is None else self.paired(minus, column)
+        with np.errstate(invalid="ignore"):  # ∞ − ∞ says nothing
+            return mean_interval(first - np.multiply(times, second), self["seed"], [str(d) for d in self["draw"]])
+
+    def _runs(self) -> list[tuple[Any, Any]]:
+        return list(zip(self["seed"], self["draw"], strict=True))
 
     def to_csv(self) -> str:
         """CSV. A nested column becomes one per entry: theta.Ix is `Ix`, and its theta_interval `Ix_low` and `Ix_high`.

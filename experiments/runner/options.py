@@ -64,8 +64,10 @@ def check_numbers(prefix: str, options: Any) -> None:
         option, value = f"{prefix}{name.replace('_', '-')}", getattr(options, name)
         if is_dataclass(value):
             check_numbers(f"{option}.", value)
+        if value is None or isinstance(value, str):  # a word that stands for a number
+            continue
         for rule in _rules(hint):
-            for number in value if isinstance(value, tuple) else (value,) if value is not None else ():
+            for number in value if isinstance(value, tuple) else (value,):
                 rule(option, number)
 
 

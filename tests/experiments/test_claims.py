@@ -1,11 +1,12 @@
-"""Each claim of the paper holds for rows like the paper's, and fails or is inconclusive for others."""
+"""Each claim of the paper holds for rows like the paper's, and fails or is undecided for others."""
 
 import pytest
 from reports import TRUTH, changed, make_rows, verdicts
 
 from experiments.paper.claims import claims
-from experiments.paper.lanes import DOMAINS
-from experiments.reporting.claims import Claim, Inconclusive, Verdict, evaluate, to_json
+from experiments.paper.lanes import DOMAINS, TAGS, with_rho
+from experiments.reporting.claims import Claim, Undecided, Verdict, all_of, evaluate, to_json
+from experiments.reporting.results import Results
 
 
 def test_claims_hold_for_rows_like_the_papers():
@@ -35,6 +36,51 @@ def test_claim_fails(fails, change):
     assert verdicts(changed(make_rows(), *cell, **fields))[fails] is False
 
 
+@pytest.mark.parametrize(
+    ("claim", "cell", "errors"),
+    [
+        ("C1", ("no_physics", "fine_tuned", 500), [0.01, 0.03, 0.02]),
+        ("C2", ("no_physics", "fine_tuned", 1000), [0.01, 0.03, 0.01]),
+        ("C3", ("no_physics", "fine_tuned", 100), [1.5, 3.5, 2.0]),
+        ("C4", ("no_physics", "fine_tuned", 500), [0.0182, 0.0184, 0.0179]),
+        ("C5", ("hybrid", "fine_tuned", 500), [0.03, 0.01, 0.02]),
+        ("C6", ("hybrid", "fine_tuned", 1000), [1.0, 4.0, 2.0]),
+        ("C7", ("hybrid", "target_only", 100), [0.02, 0.05, 0.04]),
+        ("C7", ("hybrid", "target_only", 1000), [0.02, 0.03, 0.025]),
+        ("C8", ("hybrid", "fine_tuned", 100), [0.02, 0.03, 0.025]),
+    ],
+)
+def test_claim_is_undecided_within_the_noise_of_the_seeds(claim, cell, errors):
+    tags, rows = dict(zip(("model", "mode", "n_train"), cell, strict=True)), make_rows()
+    noisy = [{**r, "test_mse": errors[r["seed"]]} if tags.items() <= r.items() else r for r in rows]
+    (verdict,) = (v for v in claims(with_rho(Results(noisy, TAGS)), "param_shift", TRUTH) if v.id == claim)
+    assert (verdict.holds, verdict.lacks_data) == (None, False)
+    assert "…" in verdict.measured
+
+
+def test_c10_is_an_equivalence():
+    def judged(*factors):
+        noisy = [{**r, "theta": TRUTH | {"Ix": TRUTH["Ix"] * factors[r["seed"]]}} for r in make_rows()]
+        return verdicts(Results(noisy, TAGS))["C10"]
+
+    assert [judged(1.01, 1.02, 1.015), judged(1.0, 1.06, 1.03), judged(1.06, 1.07, 1.065)] == [True, None, False]
+
+
+def test_verdicts_count_seeds_and_draws():
+    """Ten draws of one seed decide nothing; a difference that only the draws share is no difference."""
+    rows = make_rows()
+    drawn = Results([{**r, "draw": d} for r in rows.where(seed=0) for d in range(10)], TAGS)
+    assert verdicts(drawn)["C6"] is None
+    moved = [
+        {**r, "draw": d, "rho": None, "test_mse": r["test_mse"] * (1 + 40 * d if r["n_train"] == 1000 else 1)}
+        for r in rows.where(model="hybrid") + rows.where(model="no_physics")
+        for d in range(2 if r["n_train"] else 1)
+    ]
+    found = verdicts(with_rho(Results(moved, TAGS)))
+    assert (found["C8"], found["C5"]) == (None, None)
+    assert verdicts(rows)["C5"] is True
+
+
 def test_divergence_counts_as_failure_under_external_force_only():
     both = make_rows() + make_rows(domain="external_force")
     rows = changed(both, "no_physics", "fine_tuned", 100, factor=0.7, status="diverged")
@@ -51,20 +97,28 @@ def test_claims_ignore_rows_of_other_domains(experiment, domain):
     assert "C9" not in verdicts(own, experiment)
 
 
-def test_claims_are_inconclusive_without_the_rows_they_need():
-    one_seed = verdicts(make_rows(seeds=1))
-    assert (one_seed["C1"], one_seed["C4"], one_seed["C7"]) == (True, None, None)
+def test_claims_are_undecided_without_the_rows_they_need():
+    assert set(verdicts(make_rows(seeds=1)).values()) == {None}
     one_size = verdicts(make_rows(sizes=(100,)))
     assert (one_size["C3"], one_size["C5"], one_size["C7"], one_size["C8"]) == (True, None, None, None)
     assert verdicts(make_rows(), truth=None)["C10"] is None
-    assert set(verdicts(make_rows().where(model=())).values()) == {None}
+    assert all(v.lacks_data for v in claims(make_rows().where(model=()), "param_shift", TRUTH))
 
 
-def test_json_separates_what_is_inconclusive():
-    def undecided(_):
-        raise Inconclusive("no rows")
+@pytest.mark.parametrize(("parts", "holds"), [([True, True], True), ([True, None], None), ([None, False, True], False)])
+def test_all_of_is_a_conjunction_of_three_values(parts, holds):
+    assert all_of((part, "") for part in parts)[0] is holds
 
-    found = evaluate([Claim("C2", "less", lambda x: (x < 1, f"{x}")), Claim("C10", "?", undecided)], 0.5)
-    assert found == [Verdict("C2", "less", True, "0.5"), Verdict("C10", "?", None, "no rows")]
-    assert to_json(found)["claims"] == [{"id": "C2", "text": "less", "holds": True, "measured": "0.5"}]
+
+def test_json_separates_what_lacks_data():
+    def lacks(_):
+        raise Undecided("no rows")
+
+    noise = Claim("C3", "noise", lambda x: (None, f"{x} (0 … 1)"))
+    found = evaluate([Claim("C2", "less", lambda x: (x < 1, f"{x}")), noise, Claim("C10", "?", lacks)], 0.5)
+    assert found[2] == Verdict("C10", "?", None, "no rows", lacks_data=True)
+    assert to_json(found)["claims"] == [
+        {"id": "C2", "text": "less", "holds": True, "measured": "0.5"},
+        {"id": "C3", "text": "noise", "holds": None, "measured": "0.5 (0 … 1)"},
+    ]
     assert to_json(found)["not_judged"] == [{"id": "C10", "text": "?", "why": "no rows"}]

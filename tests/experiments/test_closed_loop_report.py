@@ -97,23 +97,37 @@ def test_all_hypotheses_hold_on_these_rows():
         ("R4b", changed(ROWS, Agent("invariant", FEW), "parameter_shift", "step", excess=0.11)),
         ("R4a", changed(ROWS, Agent("hybrid", FEW), "parameter_shift", "step", excess=-0.11)),
         ("R5a", changed(ROWS, Agent("hybrid", FEW, observer=True), position_rmse=0.075)),
-        ("R5b", changed(ROWS, Agent("invariant", observer=True), position_rmse=0.0523)),
+        ("R5b", changed(ROWS, Agent("invariant", FEW, observer=True), position_rmse=0.058)),
         ("R9b", changed(ROWS, Agent("invariant", FEW, observer=True), "parameter_shift", "upset", position_rmse=0.017)),
         ("R6b", WORSE_AWAY),
     ],
     ids=lambda value: value if isinstance(value, str) else "",
 )
 def test_one_missed_goal_fails_only_its_hypothesis(goal, rows):
-    failed = {name for name, outcome in holds(rows).items() if not outcome}
+    failed = {name for name, outcome in holds(rows).items() if outcome is False}
     # A larger error in the wind also leaves more of the gap; a smaller one at home is a larger ratio away from it.
     also = {"R2a", "R2b", "R2c", "R1a", "R1b", "R1c"} if goal.startswith("R1") else {"R6a", "R6b", "R6c"}
     assert goal in failed
     assert failed <= {goal, *also}
 
 
+def test_hypotheses_are_undecided_within_the_noise_of_the_seeds():
+    """The adapted models differ twentyfold between seeds, with the observer in another order than without."""
+
+    def noisy(row):
+        if not row["n_train"] or row["distance"]:
+            return row
+        factor = (0.2, 1.0, 4.0)[(row["seed"] + row["observer"]) % SEEDS]
+        return {**row, "position_rmse": row["position_rmse"] * factor, "excess": 0.05 * (factor - 0.2)}
+
+    found = verdicts(Results([noisy(row) for row in ROWS], TAGS))
+    assert {name for name, verdict in found.items() if verdict.holds is not None} == {"R7", "R8"}
+    assert not any(verdict.lacks_data for verdict in found.values())
+
+
 def test_measured_errors_have_enough_decimals_to_differ():
     found = verdicts(changed(ROWS, Agent("invariant", FEW), "parameter_shift", "step", position_rmse=0.020203))["R3b"]
-    assert found.holds is False
+    assert found.holds is None  # the source's seeds are 1 % apart
     assert "step: 2.0200 cm → 2.0203 cm" in found.measured
     assert "hover: 2.02 cm → 1.11 cm" in found.measured
     same = Results([{**row, "position_rmse": 1e-9} for row in ROWS], TAGS)
@@ -143,7 +157,7 @@ def test_speed_hypotheses_compare_measured_times():
     assert (slow["R7"], slow["R8"]) == (False, False)
 
 
-def test_missing_flights_are_inconclusive():
+def test_missing_flights_are_undecided():
     found = holds(ROWS.where(lambda row: row["reference"] != "low_pass", distance=0.0))
     assert [found[name] for name in ("R1a", "R2a", "R5a", "R6a")] == [None] * 4
     assert found["R3a"] is True

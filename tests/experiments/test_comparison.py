@@ -24,7 +24,7 @@ DOMAINS = ("parameter_shift", "external_force")
 def folder(tmp_path_factory):
     """Left by one run of the methods that share the pre-trained hybrid, or of all."""
     folder = tmp_path_factory.mktemp("comparison")
-    options = ("--methods", *METHODS, "--repeats", "2")
+    options = ("--methods", *METHODS)
     (run,) = experiments("comparison", "comparison", folder=folder, options=options)
     assert run.returncode == 0, run.stderr
     assert "Table" not in run.stderr
@@ -52,7 +52,6 @@ def test_the_report_keeps_its_contract(folder):
         for name, (low, high) in (row["theta_interval"] or {}).items():
             assert low < row["theta"][name] < high
     assert [claim["id"] for claim in report["claims"] + report["not_judged"]] == ["C9"]
-    assert len(report["coverage"]) == 12  # two truths, noise on two sets of states, three parameters
     assert (folder / "standings.png").read_bytes().startswith(b"\x89PNG")
 
 

@@ -2,15 +2,16 @@
 
 import math
 from dataclasses import replace
+from functools import partial
 
 import equinox as eqx
 import jax
 import numpy as np
 import pytest
 
-from experiments.paper.conditions import adaptation, fresh_fields, pretraining, settings
+from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, settings, subsets
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
-from experiments.paper.study import placeholder, pretrained
+from experiments.paper.study import drawn_splits, placeholder, pretrained
 from experiments.runner.stages import _identity
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
@@ -27,7 +28,7 @@ SMALL = replace(PAPER, seeds=3, hidden=4)
 
 def plans_by_lane(model, mode, config=SMALL):
     """[(N, seed, plan)] in the order of the lanes."""
-    states, plans = adaptation(model, mode, fresh_fields(model, IRIS, config), config)
+    states, plans = adaptation(model, mode, fresh_fields(model, IRIS, config), config, config.sizes)
     lanes = [(n, seed) for n in config.sizes for seed in range(config.seeds)]
     assert len(states.epoch) == len(lanes)
     return [(n, seed, lane(plans, i)) for i, (n, seed) in enumerate(lanes)]
@@ -65,6 +66,20 @@ def test_runs_have_the_table_s_rates_and_patience(model, mode, table):
         expected = {"hybrid": [1e-2, rate], "no_physics": [rate], "physics_only": [1e-2]}[model]
         np.testing.assert_allclose(jax.tree.leaves(plan.rates), expected, rtol=1e-6)  # float32
         np.testing.assert_allclose(plan.regulariser_weight, 1e-3, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", ["hybrid", "physics_only"])
+def test_the_rate_of_theta_in_fine_tuning_reaches_fine_tuning_only(model):
+    config = replace(SMALL, rates=replace(SMALL.rates, physics_fine_tuning=0.5))
+    _, before = pretraining(model, fresh_fields(model, IRIS, config), config)
+    plans = {
+        "pretraining": [lane(before, 0)],
+        **{mode: [plan for *_, plan in plans_by_lane(model, mode, config)] for mode in ("fine_tuned", "target_only")},
+    }
+    for mode, of_mode in plans.items():
+        for plan in of_mode:
+            physics = jax.tree.leaves(plan.rates.physics if model == "hybrid" else plan.rates)
+            np.testing.assert_allclose(physics, 0.5 if mode == "fine_tuned" else 1e-2, rtol=1e-6)
 
 
 def test_other_input_scaling_is_another_pretraining():
@@ -119,6 +134,58 @@ def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():
         np.testing.assert_array_equal(plan.subset, subsets[n, seed])
 
 
+CONTIGUOUS = replace(SMALL, draw="contiguous", draws=2, sizes=(100, 300))
+
+
+def flight_of(config):
+    """Of each window of the pool, its flight."""
+    spec = drawn_splits(config)["train"]
+    return np.arange(spec.windows) // (spec.windows // spec.flights)
+
+
+def test_contiguous_draws_are_starts_of_flights_of_their_own_shared_by_all_seeds():
+    drawn, flight = subsets(CONTIGUOUS).reshape(2, SMALL.seeds, -1), flight_of(CONTIGUOUS)
+    assert (drawn == drawn[:, :1]).all()
+    np.testing.assert_array_equal(drawn[0, 0, :100], np.arange(100))  # ten seconds of one flight
+    assert len({*flight[drawn[0, 0, :300]]}) == 3
+    assert not {*flight[drawn[0, 0]]} & {*flight[drawn[1, 0]]}
+
+
+def test_the_n_windows_come_from_as_many_flights_as_asked():
+    config = replace(CONTIGUOUS, flights=5, sizes=(100,), draws=1)
+    drawn, each = subsets(config)[0, :100], config.windows_each()
+    assert each == 20
+    np.testing.assert_array_equal(np.sort(drawn), np.arange(100))
+    np.testing.assert_array_equal(flight_of(config)[drawn[:5]], np.arange(5))
+
+
+def test_other_random_draws_leave_the_first_as_it_was():
+    one, two = subsets(SMALL), subsets(replace(SMALL, draws=2))
+    np.testing.assert_array_equal(two[: SMALL.seeds], one)
+    assert len(np.unique(two, axis=0)) == 2 * SMALL.seeds
+
+
+def test_own_validation_windows_are_of_the_n_and_not_trained_on():
+    config = replace(SMALL, validation="own")
+    assert "validation" not in drawn_splits(config)
+    fields = fresh_fields("hybrid", IRIS, config)
+    _, plans = adaptation("hybrid", "fine_tuned", fields, config, [100])
+    for plan, subset in zip(map(partial(lane, plans), range(config.seeds)), subsets(config), strict=True):
+        trained = plan.subset[: plan.n_train]
+        assert (len(trained), len(plan.validate_on)) == (80, 20)
+        np.testing.assert_array_equal(np.concatenate([trained, plan.validate_on]), subset[:100])
+
+
+def test_noise_of_a_sample_is_that_of_both_windows_that_share_it():
+    windows = placeholder(SplitSpec(6, 10, flights=2))
+    chained = replace(windows, x=windows.x + np.arange(6)[:, None, None], x0=windows.x0 - 1)
+    chained.x0[[1, 2, 4, 5]] = chained.x[[0, 1, 3, 4], -1]
+    data = Dataset({"train": chained}, {"config": {"splits": {"train": {"flights": 2}}}})
+    noisy = measured(data, 1.0, 0).splits["train"]
+    np.testing.assert_array_equal(noisy.x0[[1, 2, 4, 5]], noisy.x[[0, 1, 3, 4], -1])
+    assert (noisy.x0[[0, 3], :3] != chained.x0[[0, 3], :3]).all()
+
+
 def test_a_seed_gives_all_models_the_same_parts():
     fields = {model: fresh_fields(model, IRIS, SMALL) for model in ("hybrid", "no_physics", "physics_only")}
     assert isinstance(fields["hybrid"], Hybrid)
@@ -132,7 +199,7 @@ def test_a_seed_gives_all_models_the_same_parts():
 
 def test_lanes_start_from_their_own_seed_s_field():
     fields = fresh_fields("no_physics", IRIS, SMALL)
-    states, _ = adaptation("no_physics", "fine_tuned", fields, SMALL)
+    states, _ = adaptation("no_physics", "fine_tuned", fields, SMALL, SMALL.sizes)
     for i in range(len(SMALL.sizes) * SMALL.seeds):
         np.testing.assert_array_equal(states.field.weight_in[i], fields.weight_in[i % SMALL.seeds])
     # A seed fixes the order of minibatches; the seeds' orders differ.
@@ -157,6 +224,14 @@ def test_a_size_between_columns_takes_the_nearest_by_ratio():
         ({"perturbed_by": math.nan}, "--perturbed-by must be a positive finite number, got nan"),
         ({"noise": math.inf}, "--noise must be a finite number of at least 0, got inf"),
         ({"regulariser_weight": -1.0}, "--regulariser-weight must be a finite number of at least 0"),
+        ({"draw": "contiguous", "pool": 2000}, "--pool is for --draw random: leave it out"),
+        ({"flights": 2}, "--flights is for --draw contiguous: leave it out"),
+        ({"draw": "contiguous", "flights": 2}, "--sizes must be at most 110 of each of 2 flights"),
+        (
+            {"validation": "own", "sizes": (4,), "batch_size": 4, "models": ("hybrid",)},
+            "--sizes must each be at least 5",
+        ),
+        ({"draws": 0}, "--draws must be an integer of at least 1, got 0"),
         ({"data_seed": -1}, "--data-seed must be an integer of at least 0, got -1"),
         ({"rates": replace(PAPER.rates, hybrid=(1e-3,))}, "--rates.hybrid"),
         ({"rates": replace(PAPER.rates, physics=-1.0)}, "--rates.physics must be a finite number of at least 0"),

@@ -12,27 +12,32 @@ from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
 from rich.console import Console
 
 from experiments.paper.claims import DOMAINS_OF
-from experiments.paper.lanes import THETA
-from experiments.paper.tables import parameters, run_notes
+from experiments.paper.figures import scores
+from experiments.paper.lanes import THETA, by_altitude
+from experiments.paper.study import placeholder
+from experiments.paper.tables import altitudes, parameters, run_notes
+from experiments.reporting.claims import OUTCOMES
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import spread_text
 from experiments.runner.run_record import PACKAGES
+from hybrid_jax.sim.flight import SplitSpec
 
 
 def test_report_json_keeps_the_contract(tmp_path):
     rows = changed(make_rows(seeds=1), "no_physics", "fine_tuned", 500, test_mse=math.nan, status="diverged")
+    rows = rows.where(lambda row: (row["model"], row["mode"]) != ("hybrid", "target_only"))
     write_report(tmp_path, make_report(rows, floor=1e-3, extra={"odd": np.array([1.0, math.inf])}))
     record = json.loads((tmp_path / "report.json").read_text(), parse_constant=pytest.fail)
     assert {"experiment", "config", "environment", "rows", "claims", "not_judged"} <= set(record)
     assert set(record["environment"]) >= {"versions", "hardware", "seconds"}
     assert set(PACKAGES) < set(record["environment"]["versions"])
-    fields = "domain model mode n_train seed test_mse rho val_mse epochs status theta theta_interval"
+    fields = "domain model mode n_train seed test_mse draw rho val_mse epochs status theta theta_interval"
     assert all(list(row) == fields.split() for row in record["rows"])
     assert any(row["test_mse"] is None and row["rho"] is None for row in record["rows"])
     assert all(set(claim) == {"id", "text", "holds", "measured"} for claim in record["claims"])
-    assert all(type(claim["holds"]) is bool for claim in record["claims"])
-    assert {claim["id"] for claim in record["not_judged"]} == {"C4", "C7"}
+    assert {claim["holds"] for claim in record["claims"]} <= {True, False, None}
+    assert {claim["id"] for claim in record["not_judged"]} == {"C7"}
     assert all(claim["why"] for claim in record["not_judged"])
     assert (record["format"], record["odd"], record["wind_sine_mse"]) == (2, [1.0, None], 1e-3)
     assert record["truth_theta"] == TRUTH
@@ -54,6 +59,35 @@ def test_parameters_have_spread_and_interval_width():
         assert table.lines[-1] == ("truth", "", "", "0.04", "0.02", "8.5e-06")
         (unknown,) = parameters(Results(given_rows), None)
         assert unknown.lines[0][3] == shown.partition(" (")[0]
+
+
+def test_errors_by_altitude_are_means_over_the_windows_of_each_band():
+    windows = placeholder(SplitSpec(3, 10))
+    windows.x[..., 2] = [[1.0], [1.0], [0.3]]
+    windows.x0[:, 2] = 1.0
+    windows.x[1, 4, 2] = 0.6  # the lowest state counts
+    errors = np.array([[1.0, 3.0, 5.0], [1.0, 3.0, math.inf]])
+    found = by_altitude("test_mse", windows, errors)
+    np.testing.assert_array_equal(found["test_mse_high"], [2.0, 2.0])
+    np.testing.assert_array_equal(found["test_mse_middle"], [5.0, math.inf])
+    assert np.isnan(found["test_mse_low"]).all()
+
+
+def test_altitudes_and_the_sources_own_error_are_in_table_and_figure():
+    assert altitudes(make_rows()) == []
+    ends = {"test_mse_low": 0.5, "test_mse_middle": 0.25, "test_mse_high": math.nan}
+    home = {"source_mse": 0.015, "source_mse_low": 0.2, "source_mse_middle": 0.01, "source_mse_high": math.nan}
+    rows = Results([{**row, **ends, **(home if row["mode"] == "source_only" else {})} for row in make_rows()])
+    (table,) = altitudes(rows)
+    lines = {line[:3]: line[3:] for line in table.lines}
+    tuned = lines["hybrid", "fine-tuned", "100"]
+    assert tuned == ("2.20e-02 ± 4.4e-04", "5.00e-01 ± 0.0e+00", "2.50e-01 ± 0.0e+00", "–")
+    assert lines["hybrid", "source-only, on source flights", "–"][0].startswith("1.50e-02")
+    assert {key[2] for key in lines} == {"–", "100", "1000"}  # the smallest and the largest N
+    left, _ = scores(rows, "Scores").axes
+    drawn = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))
+    assert drawn["hybrid, source-only, on source flights"].get_ydata()[0] == 0.015
+    assert left.get_ylim()[0] <= 0.0075
 
 
 def test_parameters_of_two_domains_have_the_truth_of_each():
@@ -93,7 +127,7 @@ def test_terminal_shows_each_verdict_and_unit(tmp_path):
     rows = changed(make_rows(), "hybrid", "fine_tuned", 100, factor=1.2)
     write_report(tmp_path, make_report(rows), Console(file=text, width=200))
     printed = text.getvalue()
-    assert printed.count("✓ holds") + printed.count("✗ fails") == 9
+    assert sum(printed.count(outcome) for outcome in OUTCOMES.values()) == 9
     assert "✗ fails" in printed
     assert "[kg m²]" in printed
 

@@ -112,7 +112,7 @@ def test_anything_else_is_another_sweep(folder, whole, other):
 def test_a_diverged_run_stops_no_other_and_is_reported_with_its_epoch(tmp_path, whole):
     final, _ = run(tmp_path, plans=stack([lane(PLANS, 0), replace(lane(PLANS, 1), rates=np.float32(1e3))]))
     assert same(lane(final, 0), lane(whole, 0))
-    rows = Results(lanes_of("parameter_shift", "physics_only", "fine_tuned", (20,), fit_of(final), np.ones(2)).rows)
+    rows = Results(lanes_of("parameter_shift", "physics_only", "fine_tuned", (20,), 2, fit_of(final), np.ones(2)).rows)
 
     assert [row["status"] == "diverged" for row in rows] == [False, True]
     assert rows[1]["epochs"] == final.epoch[1] < 30

@@ -1,0 +1,243 @@
+"""What one flight of ten seconds is adapted by, after seven changes of the vehicle: python -m experiments.changes"""
+
+from dataclasses import dataclass, replace
+from functools import partial
+from typing import Any, Literal, get_args
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from experiments.paper import study
+from experiments.paper.conditions import settings
+from experiments.paper.config import QUICK, SMOKE, Config, preset_like
+from experiments.paper.regret import CLAIMS, error_table, regret_figure, regret_table
+from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
+from experiments.reporting.claims import evaluate as evaluate_claims
+from experiments.reporting.claims import verdict_table
+from experiments.reporting.names import FINE_TUNED, HYBRID
+from experiments.reporting.plots import save_figures
+from experiments.reporting.report import Report, write_report
+from experiments.reporting.results import Results, Row
+from experiments.runner import command
+from experiments.runner.options import Count, distinct
+from experiments.runner.run_record import environment
+from experiments.runner.stages import Stages, stages_of
+from hybrid_jax.adaptation import FineTune
+from hybrid_jax.adaptation.auto import Auto, candidate, extended
+from hybrid_jax.adaptation.expectation import expected_errors
+from hybrid_jax.adaptation.selection import BLOCKS, blocks_of, geometric_mean, predict_block
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.io.datasets import Dataset
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.sim.changes import CHANGES
+from hybrid_jax.sim.domain import SOURCE, Domain
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.sweep import hosts
+from hybrid_jax.sweep.training import evaluate
+from hybrid_jax.training.objective import Settings
+from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.vehicle import IRIS
+
+NAME = "changes"
+INSIDE = "expected_inside"  # column: see `_share_inside`
+# For every preset.
+HARD: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "contiguous", "draws": 4, "validation": "own"}
+Change = Literal[
+    "parameter_shift", "external_force", "doubled_drag", "weak_rotor", "off_centre_load", "gusty_wind", "load_and_wind",
+]  # fmt: skip
+Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
+OFFSET = 0.3
+L2_SP = FineTune(l2_sp=1e-2)
+HEAD = f"""# {NAME}
+
+A hybrid that was trained on source flight adapts to a changed vehicle with the first N windows of 0.1 s of **one**
+flight and nothing else. `adapt(method="auto")` fits all candidates, predicts blocks of a second that it left out of the
+fit, and takes the simplest candidate whose error is within one standard error, or a tenth, of the smallest. Regret: the
+test error of the candidate that was taken over that of the best one in hindsight. ρ: the share of the source's test
+error that is gone. Test error: L^T_MSE over 1 s of other flights.
+
+- **source**: not adapted. **theta**: Ix, Iy and k by least squares
+- **force**, **torque**, **drag**, **efficiency**, and several of these: fitted with Ix, Iy, k; efficiency is that of
+  each rotor, and k stays as it is
+- **last_layer**, **network**: from the candidate that was taken, also the network's output layer or all of its weights,
+  by a ridge Gauss–Newton step of low rank that holds them at the source's
+- For comparison, no candidates: **fine_tune**, as in the paper; **fine_tune_offset**, its output bias at a rate of 0.3;
+  **l2_sp**, fine-tuning with a penalty on the distance from the source's parameters (L2-SP)
+"""
+
+
+@dataclass(frozen=True)
+class ChangesConfig(Config):
+    """Adapt with one flight after each change of the vehicle; every candidate is tested, to know what was missed."""
+
+    sizes: tuple[int, ...] = (100,)
+    """N, windows of 0.1 s: one number."""
+    draw: Literal["random", "contiguous"] = "contiguous"
+    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
+    random: of many flights, as in the paper."""
+    draws: Count = 4
+    """Draws of target trajectories; each seed's source adapts to each of them alone."""
+    validation: Count | Literal["own"] = "own"
+    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
+    noise: float = 1.0
+    """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
+    noise_on: Literal["all", "target"] = "target"
+    """Which of these flights are noisy: those before the change as well, or those after it alone."""
+    changes: tuple[Change, ...] = get_args(Change)
+    """Which changes."""
+    compared: tuple[Compared, ...] = get_args(Compared)
+    """Methods to compare with. fine_tune: Adam, as in the paper. fine_tune_offset: with --rates.offset 0.3. l2_sp: with
+    a penalty on the distance from the source's parameters."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--changes", self.changes)
+        if self.compared:
+            distinct("--compared", self.compared)
+        if len(self.sizes) != 1:
+            raise ValueError(f"--sizes must be one number, got {self.sizes}")
+
+
+PRESETS = {
+    "paper": ChangesConfig(),
+    "quick": preset_like(ChangesConfig, replace(QUICK, **HARD)),
+    "smoke": preset_like(
+        ChangesConfig,
+        replace(SMOKE, **HARD | {"draws": 1}),
+        sizes=(20,),
+        changes=("external_force",),
+        compared=("fine_tune",),
+    ),
+}
+
+
+def experiment(config: ChangesConfig, console: Console) -> None:
+    stages = stages_of(config, console)
+    source = flown(SOURCE, source_splits(config), config, stages)
+    fields = pretrained(HYBRID, IRIS, config, stages, source).fields
+    chosen = [domain for domain in CHANGES if domain.name in config.changes]
+    rows = Results(
+        [row for domain in chosen for row in adapted(domain, fields, config, stages)],
+        ("domain", "candidate", "draw", "seed"),
+    )
+    if hosts.is_main_process():
+        out, verdicts = config.out / NAME, evaluate_claims(CLAIMS, rows)
+        report = Report(
+            experiment=NAME,
+            config=config.described(),
+            environment=environment(stages.seconds),
+            rows=rows,
+            claims=verdicts,
+            figures=save_figures(out, {"regret": (regret_figure(rows), "Test error over that of the best candidate")}),
+            notes=stages.notes(),
+            head=HEAD.strip(),
+            tables=[
+                verdict_table(verdicts, "Hypotheses"),
+                regret_table(rows),
+                error_table(rows),
+            ],
+        )
+        write_report(out, report, Console())
+
+
+def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, stages: Stages) -> list[Row]:
+    """The rows of a domain: every candidate, and the methods to compare with, for every draw and seed."""
+    target = flown(domain, target_splits(config), config, stages)
+    pool, test, drawn = target.splits["train"], target.splits["test"], windows_of(Auto(), config.sizes[0], config)[0]
+
+    flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
+
+    def of_draw(draw: int) -> list[Row]:
+        own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
+        names, found = jax.device_get(_candidates(fields, own, flights, test, settings(config)))
+        inside = [_share_inside(found["ends"][seed], np.delete(found["flown"][seed], draw, 0)) for seed in seeds]
+
+        def row(seed: int, i: int) -> Row:
+            taken = bool(found["taken"][seed] == i)
+            tags = {"domain": domain.name, "candidate": names[i], "draw": draw, "seed": seed, "taken": taken}
+            numbers = {name: found[name][seed, i] for name in ("test_mse", "left_out")}
+            return tags | numbers | {INSIDE: inside[seed] if taken else None}
+
+        return [row(seed, i) for seed in seeds for i in range(len(names))]
+
+    found = stages.parts(f"adapt {domain.name}", [partial(of_draw, draw) for draw in range(config.draws)])
+    return [row for rows in found for row in rows] + compared(fields, config, stages, target)
+
+
+def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:
+    """The rows of the methods that are no candidates."""
+    tuned = partial(study.adapted, HYBRID, FINE_TUNED, fields)
+    offset = replace(config, rates=replace(config.rates, offset=OFFSET))
+    fits = {
+        "fine_tune": lambda: tuned(config, stages, target),
+        "fine_tune_offset": lambda: tuned(offset, stages, target, "hybrid, offset"),
+        "l2_sp": lambda: study.solved(f"l2_sp {target.config['domain']}", L2_SP, fields, config, stages, target),
+    }
+    rows = []
+    for name in config.compared:
+        errors = evaluate(fits[name]().fields, target.splits["test"], EVERY, settings(config), config.runs())
+        tags = {"domain": target.config["domain"], "candidate": name, "left_out": None, "taken": False}
+        cases = [divmod(i, config.seeds) for i in range(len(errors))]
+        rows += [
+            {**tags, INSIDE: None, "draw": d, "seed": s, "test_mse": float(errors[i])} for i, (d, s) in enumerate(cases)
+        ]
+    return rows
+
+
+# Equinox passes the options to jax.jit, but does not declare them.
+@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings):
+    """The candidates' names and, by seed, their left-out and test errors, and which was taken.
+
+    Also the mean squared errors of that one at the ends of windows, and of those that touch, as in `BlockErrors`: of
+    the blocks that were left out, and of each of the flights.
+    """
+    names, places = [], blocks_of(windows.x0.shape[1], BLOCKS)
+
+    def one(run):
+        field, windows = run
+        choice = Auto().solve(field, windows, windows, shared).choice
+        names[:] = choice.names
+        larger = extended(field, STATE_SIZE, INPUT_SIZE)
+
+        def error(index):
+            return rollout_mse(candidate(larger, choice, index), test, EVERY, shared.solver)
+
+        errors = jax.lax.map(error, jnp.arange(len(choice.names)))
+        adapted = candidate(larger, choice, choice.taken)
+        found = {"left_out": geometric_mean(choice.errors.mse), "taken": choice.taken, "test_mse": errors}
+        flown = jax.lax.map(partial(of_flight, adapted), flights)
+        return found | {"ends": choice.errors.ends[choice.taken], "flown": flown}
+
+    def of_flight(field, flight):
+        blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
+        return jnp.mean(
+            jax.lax.map(lambda block: predict_block(field, block[0], block[1], shared.solver).ends, blocks), axis=0
+        )
+
+    found = jax.lax.map(one, (fields, windows))
+    return tuple(names), found
+
+
+def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
+    """Of other flights, quantities and horizons the share whose error is in its 80 % interval; None without flights."""
+    expected = expected_errors(ends, (1.0, 2.0), rigid=True).values()  # names of the horizons, which do not matter
+    inside = []
+    for of_flight in flown:
+        truth = expected_errors(of_flight[None], (1.0, 2.0), rigid=True).values()
+        for known, own in zip(expected, truth, strict=True):
+            inside += [low <= own[name][0] <= high for name, (_, low, high) in known.items()]
+    return float(np.mean(inside)) if inside else None
+
+
+ABOUT = (
+    "One flight of ten seconds after a change of the vehicle: which method does it ask for, and is it the right one?"
+)
+main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,147 @@
+"""What the method that the windows choose costs, against the best candidate in hindsight."""
+
+from collections.abc import Sequence
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.reporting.claims import Claim, Part, Undecided
+from experiments.reporting.names import EXTERNAL_FORCE, PARAMETER_SHIFT
+from experiments.reporting.plots import STYLE, legend_below, subplots
+from experiments.reporting.results import Results
+from experiments.reporting.tables import Table
+
+NEAR = 1.1  # times the error of the best candidate
+SHARE = 0.9  # of the cases that must be near it
+WORSE = 1.02  # times the source's error
+MEAN_RHO, WORST_RHO = 0.93, 0.85
+HELD = 0.7, 0.9  # share of errors in their 80 % interval
+AUTO = "auto"  # the candidate that was taken
+SHOWN = {AUTO: "#0072B2", "theta": "#D55E00", "fine_tune": "0.5"}
+
+
+def of_each_case(rows: Results, name: str) -> np.ndarray:
+    """The test error of a candidate, a method or `AUTO`, for each domain, draw and seed."""
+    own = rows.where(taken=True) if name == AUTO else rows.where(candidate=name)
+    return np.array([case.numbers("test_mse")[0] for case in own.group("domain", "draw", "seed").values()])
+
+
+def best_of_each_case(rows: Results) -> np.ndarray:
+    """The smallest test error of all candidates, for each domain, draw and seed."""
+    candidates = rows.where(lambda row: row["left_out"] is not None or row["taken"])
+    return np.array([case.spread("test_mse").smallest for case in candidates.group("domain", "draw", "seed").values()])
+
+
+def regret(rows: Results) -> np.ndarray:
+    return of_each_case(rows, AUTO) / best_of_each_case(rows)
+
+
+def over(rows: Results, name: str) -> np.ndarray:
+    """The error of the candidate that was taken over that of another one, or of a method, in each case."""
+    return of_each_case(rows, AUTO) / of_each_case(rows, name)
+
+
+def _near_the_best(rows: Results) -> Part:
+    found = regret(rows)
+    share = float(np.mean(found <= NEAR))
+    return share >= SHARE, f"{share:.1%} of {len(found)} cases, the largest regret is {found.max():.3g}"
+
+
+def _never_worse(rows: Results) -> Part:
+    worst = float(over(rows, "source").max())
+    return worst <= WORSE, f"at worst {worst:.3g} times the source's error"
+
+
+def _gains(rows: Results) -> Part:
+    sound, words = [], []
+    for domain, own in rows.where(domain=(PARAMETER_SHIFT, EXTERNAL_FORCE)).group("domain").items():
+        rho = 1 - over(own, "source")
+        sound.append(rho.mean() >= MEAN_RHO and rho.min() >= WORST_RHO)
+        words.append(f"{domain}: mean {rho.mean():.3f}, worst {rho.min():.3f}")
+    if not sound:
+        raise Undecided("neither was flown")
+    return all(sound), "; ".join(words)
+
+
+def _beats_fine_tuning(rows: Results) -> Part:
+    if "fine_tune" not in rows.unique("candidate"):
+        raise Undecided("there was no fine-tuning to compare with")
+    ratio = over(rows, "fine_tune")
+    return bool((ratio < 1).all()), f"at worst {ratio.max():.3g} times its error, {np.mean(ratio < 1):.0%} below it"
+
+
+def _expects_its_error(rows: Results) -> Part:
+    own = rows.where(lambda row: row["expected_inside"] is not None)
+    if not len(own):
+        raise Undecided("there is no other flight to compare with")
+    shares = {domain: float(np.mean(group["expected_inside"])) for domain, group in own.group("domain").items()}
+    share = float(np.mean([*shares.values()]))
+    words = ", ".join(f"{domain} {value:.0%}" for domain, value in shares.items())
+    return HELD[0] <= share <= HELD[1], f"{share:.1%} in the mean over changes ({words})"
+
+
+CLAIMS: Sequence[Claim[Results]] = (
+    Claim(
+        "A1",
+        f"The candidate that is taken errs at most {NEAR - 1:.0%} more than the best one in {SHARE:.0%} of all cases.",
+        _near_the_best,
+    ),
+    Claim("A2", f"It never errs more than {WORSE - 1:.0%} more than the source.", _never_worse),
+    Claim(
+        "A3",
+        f"In both experiments of the paper its mean ρ is at least {MEAN_RHO} and its worst at least {WORST_RHO}.",
+        _gains,
+    ),
+    Claim("A4", "It errs less than fine-tuning by Adam in every case.", _beats_fine_tuning),
+    Claim(
+        "A5",
+        f"The 80 % intervals of its RMSE hold that of another flight in {HELD[0]:.0%} to {HELD[1]:.0%} of cases.",
+        _expects_its_error,
+    ),
+)
+
+
+def regret_table(rows: Results) -> Table:
+    """A line per domain: regret, ρ, and how often each candidate was taken."""
+    lines = []
+    for domain, own in rows.group("domain").items():
+        found, rho = regret(own), 1 - over(own, "source")
+        counts = {name: len(each) for name, each in own.where(taken=True).group("candidate").items()}
+        taken = ", ".join(f"{name} {n}" for name, n in sorted(counts.items(), key=lambda item: -item[1]))
+        numbers = np.mean(found <= NEAR), np.median(found), found.max(), rho.mean(), rho.min()
+        texts = (f"{number:{form}}" for number, form in zip(numbers, (".0%", ".3f", ".3f", ".3f", ".3f"), strict=True))
+        lines.append((domain, *texts, taken))
+    header = ("change", f"regret ≤ {NEAR}", "median", "largest", "mean ρ", "worst ρ", "taken, number of cases")
+    return Table("The candidate that is taken", header, lines)
+
+
+def error_table(rows: Results) -> Table:
+    """Mean test errors: a line per candidate and method, a column per domain."""
+    groups = rows.group("domain")
+
+    def text(own: Results, name: str) -> str:
+        return f"{of_each_case(own, name).mean():.3g}"
+
+    lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
+    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines)
+
+
+@mpl.rc_context(STYLE)
+def regret_figure(rows: Results) -> Figure:
+    """A dot per case: the error of auto and of two methods over that of the best candidate."""
+    groups = rows.group("domain")
+    figure, ((axes,),) = subplots((7, 1.5 + 0.55 * len(groups)), 1, 1)
+    shown = [name for name in SHOWN if name in (AUTO, *rows.unique("candidate"))]
+    for y, own in enumerate(groups.values()):
+        best = best_of_each_case(own)
+        for i, name in enumerate(shown):
+            ratio = of_each_case(own, name) / best
+            place = np.full(len(ratio), y + 0.22 * (i - (len(shown) - 1) / 2))
+            label = name.replace("_", "-") if y == 0 else ""
+            axes.plot(ratio, place, "o", ms=4, alpha=0.5, color=SHOWN[name], label=label)
+    axes.set(xscale="log", xlabel="test error over that of the best candidate in hindsight (log scale)")
+    axes.set_yticks(range(len(groups)), [name.replace("_", " ") for name in groups])
+    axes.invert_yaxis()
+    axes.axvline(NEAR, color="0.4", linestyle=":", label=f"{NEAR - 1:.0%} more")
+    return legend_below(figure, "Adaptation to one flight of ten seconds", columns=4)

@@ -1,0 +1,57 @@
+"""Coverage of intervals pooled over sources, and the command that measures it."""
+
+import json
+
+import numpy as np
+import pytest
+from smoke import experiments
+
+from experiments.coverage import CLAIMS, CoverageConfig, _compared, pooled_table
+from experiments.reporting.claims import evaluate
+from experiments.reporting.results import Results
+
+
+def rows(inside, flights=100):
+    """Of each flight whether the interval of Ix contains the truth; k was not fitted."""
+    found = []
+    for draw in range(flights):
+        tags = {"domain": "weak_rotor", "noise": "1", "draw": draw}
+        numbers = {"inside": draw < inside, "error": 0.5, "half_width": 2.0, "alone": 0.5}
+        found += [tags | {"parameter": "Ix"} | numbers, tags | {"parameter": "k"} | dict.fromkeys(numbers)]
+    return Results(found, ("domain", "noise", "draw", "parameter"))
+
+
+@pytest.mark.parametrize(("inside", "holds"), [(97, True), (90, True), (88, None), (80, False)])
+def test_the_claim_fails_where_significantly_fewer_intervals_hold(inside, holds):
+    (verdict,) = evaluate(CLAIMS, rows(inside))
+    assert verdict.holds is holds
+    assert verdict.measured == f"weak_rotor 1 Ix {inside / 100:.2f} of 100"
+
+
+def test_a_parameter_that_was_not_fitted_does_not_count():
+    of_ix, of_k = pooled_table(rows(97)).lines
+    assert of_ix[3:] == ("100", "97", "50", "+0.50", "2.00")
+    assert of_k[3:] == ("0", "–", "–", "–", "–")
+
+
+def test_pooled_intervals_have_their_coverage_where_sources_differ_and_single_ones_have_not():
+    """Each source absorbed something else: its estimate is off by as much as the flights' noise, and more."""
+    rng = np.random.default_rng(0)
+    shifts = rng.normal(0, 0.03, (2000, 3))
+    found = [_compared(row + rng.normal(0, 0.01), np.full(3, 0.01), 0.0) for row in shifts]
+    assert np.mean([row["inside"] for row in found]) > 0.93
+    assert np.mean([row["alone"] for row in found]) < 0.75
+
+
+def test_three_sources_are_needed():
+    with pytest.raises(ValueError, match="--seeds must be at least 3, got 2"):
+        CoverageConfig(seeds=2)
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_row_for_every_flight_and_parameter(tmp_path):
+    (run,) = experiments("coverage", "coverage", folder=tmp_path)
+    assert run.returncode == 0, run.stderr
+    report = json.loads((tmp_path / "out" / "coverage" / "report.json").read_text())
+    assert [row["parameter"] for row in report["rows"]] == ["Ix", "Iy", "k"]
+    assert len(report["known_body"]) == 12  # two truths, noise on two sets of states, three parameters
