@@ -87,13 +87,13 @@ class RealFlightConfig(Run):
     """Test and training share no flight, or no manoeuvre (file name without number).
     With manoeuvre and without --target, flights in --test are held out by manoeuvre as well."""
     validate_by: Literal["flight", "manoeuvre"] | None = None
-    """How validation flights, which stop the training, are held out. By default by flight; to predict other manoeuvres
-    (--folds-by manoeuvre or --protocol nanodrone, without --target) by manoeuvre."""
+    """How flights are held out that stop the training or, in turn, choose a model. By default by flight; to predict
+    other manoeuvres (--folds-by manoeuvre or --protocol nanodrone, without --target) by manoeuvre."""
     refit: bool = True
     """Without --target: train again with the validation flights, for the numbers of epochs that were best on them."""
     recipes: tuple[RecipeName, ...] | None = None
-    """Training recipes; of several, each fold uses the one whose hybrid does best on its validation flights. By default
-    turning; to predict other manoeuvres frozen_rates, torque_off and staged."""
+    """Training recipes. Each fold chooses by its own flights, left out of training in turn, among baselines and models
+    of each recipe. By default turning; to predict other manoeuvres frozen_rates, torque_off and staged."""
     models: tuple[Model, ...] = ("hybrid", "no_physics", "physics_only")
     """hybrid: physics and network. no_physics: network with p' = v and the attitude's kinematics. physics_only."""
     learn: tuple[str, ...] | None = None

@@ -1,6 +1,6 @@
 """Figures of models on recorded flights: errors against horizon and N, a predicted flight, output of the network."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -12,18 +12,20 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
+from experiments.real_flight.logs import Fold, motion_of_logs
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, STYLE, legend_below, subplots, tick_errors
+from experiments.reporting.plots import COLOURS, STYLE, legend_below, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
+from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.flights.log import segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, require_length
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 
-MODEL_COLOURS = COLOURS | {"linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
+MODEL_COLOURS = COLOURS | {"chosen": "#E69F00", "linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
 BINS, MIN_SAMPLES = 12, 10  # bins of speed, and samples of one that is drawn
 OFFSET = 1.02  # factor in N between the points of two models
@@ -37,6 +39,8 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
     caption = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
     steps = f"Error against horizon, {caption}, test flights of all folds"
     figures = {"errors_by_step": (errors_by_step(experiment, outputs), steps)}
+    ranges = "Motion of test flights (median, 1 to 99 %) against that of the flights trained on (band)"
+    figures["ranges"] = (ranges_of_motion(outputs.folds), ranges)
     if any(rows["n_train"]):
         by_size = errors_by_size(rows, experiment.dt, "Error against the amount of target flight")
         figures["errors_by_size"] = (by_size, "Error against N, the number of target windows trained on")
@@ -76,6 +80,23 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
     return legend_below(figure, "Error against horizon", "mean over seeds; band: ± one standard deviation")
+
+
+@mpl.rc_context(STYLE)
+def ranges_of_motion(folds: Sequence[Fold]) -> Figure:
+    """A panel for each kind of motion, a line for each test flight, before the range of its fold's training flights."""
+    tested = [(motion_of_logs([*fold.train, *fold.validation]), log) for fold in folds for log in fold.test]
+    figure, panels = subplots((12, 1.6 + 0.2 * len(tested)), 1, 4, sharey=True)
+    for line, (known, log) in enumerate(tested):
+        for axes, (name, values) in zip(panels.flat, motion_of_logs([log]).items(), strict=True):
+            low, middle, high = np.quantile(values, (RANGE[0], 0.5, RANGE[1]))
+            axes.barh(line, np.ptp(ends := np.quantile(known[name], RANGE)), left=ends[0], height=0.9, color="0.87")
+            axes.plot([low, high], [line, line], color=COLOURS["hybrid"])
+            axes.plot(middle, line, "o", color=COLOURS["hybrid"], markersize=3.5)
+            axes.set_xlabel(name)
+    name_lines(panels[0, 0], [flight_of(log) for _, log in tested])
+    figure.suptitle("What is asked of the models, and what they were trained on", fontsize=12)
+    return figure
 
 
 @mpl.rc_context(STYLE)

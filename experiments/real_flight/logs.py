@@ -14,6 +14,7 @@ from jaxtyping import Int
 
 from experiments.real_flight.config import Cleaning, RealFlightConfig
 from experiments.real_flight.models import RECIPES
+from hybrid_jax.extrapolation import Motion, motion
 from hybrid_jax.flights import windows
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.consistency import FAILS, check_log
@@ -29,6 +30,7 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}  # of --simulated: domains, numbers of flights
 SECONDS = 8.0
 FOLDS, VALIDATION_SHARE = 3, 0.2
+LEFT_OUT = 5  # most parts of a fold's flights that are left out of training in turn, which bounds the cost
 GROUP_BY = {"flight": flight_of, "manoeuvre": manoeuvre_of}
 
 
@@ -176,16 +178,36 @@ def make_folds(train: Sequence[FlightLog], tested: Sequence[FlightLog] | None, c
     return [fold(held_out) for _, held_out in splits]
 
 
-def hold_out_validation(logs: Sequence[FlightLog], config: RealFlightConfig) -> tuple[list[FlightLog], list[FlightLog]]:
+def hold_out_validation(
+    logs: Sequence[FlightLog], config: RealFlightConfig, by: str | None = None
+) -> tuple[list[FlightLog], list[FlightLog]]:
     """Split flights into training and validation: a fifth of the names, but at least one, is for validation."""
-    of = GROUP_BY[config.validated_by]
+    by = by or config.validated_by
+    of = GROUP_BY[by]
     names = sorted({of(log) for log in logs})
     if len(names) < 2:
-        few = f"{len(logs)} flights of one name ({names[0]}) are too few for training and validation"
-        raise ValueError(f"--validate-by {config.validated_by}: {few}")
+        few = f"{len(logs)} flights of one name ({names[0]}) are too few to leave one out, for validation and to choose"
+        other = "; use --validate-by flight" if by == "manoeuvre" and len(logs) > 1 else "; add a flight"
+        raise ValueError(f"--validate-by {by}: {few}{other}")
     count = max(1, round(VALIDATION_SHARE * len(names)))
     dealt = np.random.default_rng(config.data_seed).permutation(np.array(names, object))
     return hold_out(logs, list(dealt[:count]), of)
+
+
+def leave_out(fold: Fold, config: RealFlightConfig) -> list[Fold]:
+    """Folds of a fold's own flights but those tested: each is left out of training once, as `validated_by` says.
+
+    Of the flights left, some stop the training, by flight if they are of one manoeuvre. A single one stops its own.
+    """
+    of = GROUP_BY[config.validated_by]
+
+    def split(rest: list[FlightLog]) -> tuple[list[FlightLog], list[FlightLog]]:
+        by = config.validated_by if len({of(log) for log in rest}) > 1 else "flight"
+        return hold_out_validation(rest, config, by) if len(rest) > 1 else (rest, rest)
+
+    logs = [*fold.train, *fold.validation]
+    parts = folds(logs, min(LEFT_OUT, len({of(log) for log in logs})), of, config.data_seed)
+    return [Fold(", ".join(sorted({of(log) for log in held})), *split(rest), held) for rest, held in parts]
 
 
 def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlightConfig) -> None:
@@ -196,8 +218,14 @@ def require_windows(folds: Sequence[Fold], source: Fold | None, config: RealFlig
         require_length(fold.validation, longest)
     for fold in folds:
         require_length(fold.test, config.longest)
-        if len(config.tried) > 1:
-            require_length(fold.validation, config.longest)
+        require_length([*fold.train, *fold.validation], config.longest)
+        for inner in leave_out(fold, config):
+            require_length(inner.train, longest)
+            require_length(inner.validation, longest)
+            count = count_windows(inner.train, longest) // (1 if source else config.stride)
+            if count < config.batch_size:
+                few = f"without {inner.name}, the flights have only {count} windows to train on"
+                raise ValueError(f"--batch-size {config.batch_size}: {few}; add flights or give a smaller one")
         size, count = max(config.n), count_windows(fold.train, longest)
         if source and size > count:
             raise ValueError(f"--n {size}: the training flights have only {count} windows; give a smaller --n")
@@ -241,3 +269,9 @@ def non_overlapping(indices: np.ndarray, sizes: Sequence[int], spacing: int) -> 
         if flight != kept[-1][0] or index - kept[-1][1] >= spacing:
             kept.append((flight, index))
     return np.array([index for _, index in kept[1:]], int)
+
+
+def motion_of_logs(logs: Sequence[FlightLog]) -> Motion:
+    """`motion` of every sample of some logs."""
+    x, u = (np.concatenate([getattr(log, name) for log in logs]) for name in "xu")
+    return motion(x, u)

@@ -1,7 +1,7 @@
 """Write the report, rows, figures and models of an experiment on recorded flights."""
 
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
@@ -13,17 +13,20 @@ from rich.console import Console
 import hybrid_jax
 from experiments.real_flight import scoring
 from experiments.real_flight.figures import make_figures
+from experiments.real_flight.logs import Fold, motion_of_logs
 from experiments.real_flight.models import RECIPES
-from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, least, pooled, score_labels
+from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, pooled, score_labels
+from experiments.real_flight.selection import LEVEL, Selection
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment
-from experiments.reporting import report
+from experiments.reporting import names, report
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.plots import save_figures
 from experiments.reporting.results import Results, spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
 from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
+from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.consistency import FAILS
 from hybrid_jax.flights.windows import flight_of
 
@@ -50,9 +53,12 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
     out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
     save_models(out / "models", experiment, outputs)
     claims, nominal = scoring.verdicts(rows), named_parameters(experiment.before.physics())
-    main = [*score_tables(rows, experiment.dt), *([verdict_table(claims, "Hypotheses")] if claims else [])]
+    shares = {log: (fold.name, each) for fold in outputs.folds for log, each in outside_of_training(fold).items()}
+    main = [expected_table(outputs.selections), *score_tables(rows, experiment.dt)]
+    main += [verdict_table(claims, "Hypotheses")] if claims else []
     records = [record for logs in experiment.logs.values() for record in logs.records]
-    more = [*fold_tables(rows), *choice_tables(outputs.choices), *parameter_tables(rows, nominal), *log_tables(records)]
+    more = [*fold_tables(rows), choice_table(outputs.selections), *parameter_tables(rows, nominal)]
+    more += log_tables(records)
     parts = ("train", "validation", "test")
     extra = {
         "vehicle": {"before": asdict(experiment.before), "after": asdict(experiment.after)},
@@ -60,14 +66,18 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
             {"tested_on": fold.name} | {part: [flight_of(log) for log in getattr(fold, part)] for part in parts}
             for fold in outputs.folds
         ],
-        "choices": outputs.choices,
+        "selections": [selected.described() for selected in outputs.selections],
+        "outside": {flight: each for flight, (_, each) in shares.items()},
         "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
     figures = save_figures(out, make_figures(experiment, outputs))
     given = (experiment.config.described(), environment(stages.seconds), rows, claims, figures)
     head = introduction(name, experiment, outputs)
-    report.write_report(out, report.Report(name, *given, [*stages.notes(), *NOTES], extra, head, [*main, *more]))
+    tables, notes = [main[0], outside_table(shares), *main[1:], *more], [*stages.notes(), *NOTES]
+    report.write_report(out, report.Report(name, *given, notes, extra, head, tables))
     print_tables(console, main)
+    for line in warnings_of(shares):
+        console.print(line, highlight=False, soft_wrap=True, style="yellow", markup=False)
     console.print(f"Folds, parameters and log checks: {out / 'report.md'}", highlight=False, soft_wrap=True)
 
 
@@ -89,6 +99,7 @@ network of body-frame inputs
 - **no-physics**: the same network with ṗ = v and the attitude's kinematics
 - **physics-only**: the multirotor alone
 - **rigid body + linear residual**: the nominal rigid body, and a linear map of state and input fitted to its residuals
+- **chosen**: what flights left out of training in turn chose among baselines, physics-only and hybrids of each recipe
 - **fine-tuned**: from the source's model; **scratch**: from nominal values; **zero-shot**: the source's model as it is
 {recipes}
 
@@ -96,15 +107,72 @@ Errors are lengths of vectors, of rotation the angle. An RMSE is over all test w
 
 
 def save_models(folder: Path, experiment: Experiment, outputs: Outputs) -> None:
-    """Save every trained model, with what is known about it."""
-    scores = {tuple(row[tag] for tag in TAGS): row["scores"] for row in outputs.table}
-    for (number, model, mode), trained in outputs.trained.items():
-        for run, seed in enumerate(trained.seeds):
-            tags = (outputs.folds[number].name, model, mode, trained.size(run), seed)
-            about = dict(zip(("tested_on", *TAGS[1:]), tags, strict=True))
-            about |= {"dt": experiment.dt, "scores": scores[tags]}
-            name = f"fold{number}-{model}-{mode}-{trained.size(run)}-seed{seed}.npz"
-            hybrid_jax.save(folder / name, trained.run(run), about)
+    """Save every trained model, and what was chosen, with what is known about it."""
+    rows = {tuple(row[tag] for tag in TAGS): row for row in outputs.table}
+    fields: dict[tuple[Any, ...], Any] = {
+        (number, model, mode, trained.size(run), seed): trained.run(run)
+        for (number, model, mode), trained in outputs.trained.items()
+        for run, seed in enumerate(trained.seeds)
+    }
+    for (number, size, seed), each in outputs.chosen.items():
+        fields[number, names.CHOSEN, names.FINE_TUNED if size else names.SOURCE_ONLY, size, seed] = each
+    for (number, model, mode, size, seed), each in fields.items():
+        tags = (outputs.folds[number].name, model, mode, size, seed)
+        about = dict(zip(("tested_on", *TAGS[1:]), tags, strict=True)) | {"dt": experiment.dt}
+        about |= {name: rows[tags][name] for name in ("recipe", "scores")}
+        hybrid_jax.save(folder / f"fold{number}-{model}-{mode}-{size}-seed{seed}.npz", each, about)
+
+
+def expected_table(selections: Sequence[Selection]) -> Table:
+    """Make a table of the error to expect of what was chosen on a flight not seen, and of what came out."""
+
+    def cells_of(selected: Selection, label: int) -> Iterator[str]:
+        came_out, inside = np.array(list(selected.observed.values())), selected.inside()
+        for quantity in range(len(QUANTITIES)):
+            value, low, high = (end[label, quantity] for end in selected.expected)
+            text = f"{value:.3g} [{low:.2g}, {high:.2g}]" if np.isfinite(high) else f"{value:.3g} [?]"
+            tested = f": {np.median(came_out[:, label, quantity]):.3g}, {inside[label, quantity]} of {len(came_out)}"
+            yield text + tested * bool(len(came_out))
+
+    lines = [
+        (each.fold, each.chosen, str(each.n_train or EMPTY), label, *cells_of(each, place))
+        for each in selections
+        for place, label in enumerate(each.labels)
+    ]
+    title = (
+        f"Error to expect on a flight not seen [{LEVEL:.0%} interval], from those left out of training; after the "
+        "colon what came out on test flights: median, and how many lie inside"
+    )
+    return Table(title, ("tested on", "chosen", "N", "step", *_errors("")), lines)
+
+
+def outside_of_training(fold: Fold) -> dict[str, dict[str, float]]:
+    """Of each test flight, the shares of its samples outside what its fold was trained on."""
+    known = motion_of_logs([*fold.train, *fold.validation])
+    return {flight_of(log): shares_outside(known, motion_of_logs([log])) for log in fold.test}
+
+
+def outside_table(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> Table:
+    """Make a table of `outside_of_training` of all folds, by flight."""
+    lines = [
+        (flight, fold, *(f"{share:.0%}{' !' * (share > WARN)}" for share in each.values()))
+        for flight, (fold, each) in shares.items()
+    ]
+    title = "Test flights against those trained on: share of samples outside the 1 to 99 % range; ! above 10 %"
+    return Table(title, ("flight", "tested on", *next(iter(shares.values()))[1]), lines)
+
+
+def warnings_of(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> list[str]:
+    """A line if test flights lie outside of what was trained on: for those no interval above may hold."""
+    parts = []
+    for name in next(iter(shares.values()))[1]:
+        far = {flight: each[name] for flight, (_, each) in shares.items() if each[name] > WARN}
+        if far:
+            most = max(far, key=far.__getitem__)
+            share = f"{far[most]:.0%} of its samples"
+            parts.append(f"{name} in {len(far)} of {len(shares)} flights, most in {most} ({share})")
+    beyond = "test flights are outside of what was trained on, so that the errors to expect may be too small"
+    return [f"{beyond}: {'; '.join(parts)}"] * bool(parts)
 
 
 def score_tables(rows: Results, dt: float) -> list[Table]:
@@ -122,7 +190,8 @@ def fold_tables(rows: Results) -> list[Table]:
     if len(folds) < 2:
         return []
     most = max(n for _, _, n in found)
-    kept = [cell for cell in found if cell[0] in ("hold", "thrust") or (cell[0] == "hybrid" and cell[2] in (0, most))]
+    simple, learned = (names.HOLD, names.THRUST), (names.CHOSEN, names.HYBRID)
+    kept = [cell for cell in found if cell[0] in simple or (cell[0] in learned and cell[2] in (0, most))]
     lines = [
         (fold, cell_name(*cell), label, *(text(found[cell].where(fold=fold)) for text in _errors(label).values()))
         for fold in folds
@@ -146,13 +215,18 @@ def parameter_tables(rows: Results, nominal: Mapping[str, Any]) -> list[Table]:
     return [Table(title, ("", "nominal", *(cell_name(*cell) for cell in kept)), lines)] if lines else []
 
 
-def choice_tables(choices: Mapping[str, Mapping[str, float]]) -> list[Table]:
-    """Make a table of the recipes tried in each fold: validation error over that of the baseline."""
-    if not choices:
-        return []
-    lines = [(fold, *(f"{error:.3f}" for error in errors.values()), least(errors)) for fold, errors in choices.items()]
-    title = "Recipes: error on validation flights over that of thrust with frozen rates; the smallest is chosen"
-    return [Table(title, ("tested on", *next(iter(choices.values())), "chosen"), lines)]
+def choice_table(selections: Sequence[Selection]) -> Table:
+    """Make a table of the candidates of each fold and N."""
+    lines = []
+    for selected in selections:
+        for name, scores in selected.scores.items():
+            ratios = np.exp(scores.mean(axis=1))
+            worst = f"{ratios.max():.3f} ({selected.left_out[int(ratios.argmax())]})"
+            mark = "yes" * (name == selected.chosen)
+            mean = f"{np.exp(scores.mean()):.3f}"
+            lines.append((selected.fold, str(selected.n_train or EMPTY), name, mean, worst, mark))
+    title = "Candidates: error on flights left out of training over that of thrust with frozen rates (geometric mean)"
+    return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines)
 
 
 def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:

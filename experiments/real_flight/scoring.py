@@ -5,7 +5,6 @@ tested; scores: "10", "50", … (RMSE after so many intervals) and "sum" → qua
 units; theta_interval: their 95 % intervals [low, high]. Both are None where there are none.
 """
 
-import math
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby, product
 from typing import Any
@@ -21,8 +20,8 @@ from experiments.real_flight.logs import non_overlapping
 from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names
-from experiments.reporting.claims import Claim, Inconclusive, Part, Verdict, evaluate
-from experiments.reporting.results import Results
+from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every
+from experiments.reporting.results import Interval, Results, mean_interval
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
@@ -36,7 +35,7 @@ from hybrid_jax.trajectories import Trajectories
 
 QUANTITIES = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
 BASELINES = (names.LINEAR_RESIDUAL, names.THRUST, names.HOLD)
-MODELS = (names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
+MODELS = (names.CHOSEN, names.HYBRID, names.NO_PHYSICS, names.PHYSICS_ONLY, *BASELINES)
 MODES = (names.FINE_TUNED, names.SCRATCH, names.ZERO_SHOT, names.SOURCE_ONLY, names.NOMINAL)
 TAGS = ("fold", "model", "mode", "n_train", "seed")
 OWN_LABELS = {names.LINEAR_RESIDUAL: "rigid body + linear residual", names.SOURCE_ONLY: "trained", names.NOMINAL: ""}
@@ -53,13 +52,18 @@ def score(
     field: AbstractVectorField, *, windows: Trajectories, config: RealFlightConfig, fold: str, **columns: Any
 ) -> Test:
     """Test a field; `columns` are further columns of the row."""
-    errors = flight_errors(field, windows)
-    rms = np.array([np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors])
-    mean = np.array([np.mean(part, axis=0, dtype=float) for part in errors])
+    rms, mean = errors_by_step(field, windows)
     row = {"fold": fold, "model": "", "mode": "", "n_train": 0, "seed": 0, "recipe": "", "windows": len(windows)}
     row |= {"val_loss": None, "epochs": 0, "status": "ok", "scores": scores(rms, mean, config)}
     row |= {"theta": None, "theta_interval": None}
     return row | columns, np.stack([rms, mean])
+
+
+def errors_by_step(field: AbstractVectorField, windows: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+    """RMS and mean of the errors over the windows, (4, t) each."""
+    errors = flight_errors(field, windows)
+    rms = [np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors]
+    return np.array(rms), np.array([np.mean(part, axis=0, dtype=float) for part in errors])
 
 
 def scores(rms: np.ndarray, mean: np.ndarray, config: RealFlightConfig) -> Mapping[str, Mapping[str, float]]:
@@ -129,10 +133,15 @@ def _short(data: TrainingData) -> Trajectories:
 
 
 def relative_error(errors: FlightErrors, baseline: FlightErrors, horizons: Sequence[int]) -> float:
-    """Average RMSE over that of a baseline, over quantities and horizons; recipes are chosen by it."""
+    """Average RMSE over that of a baseline, over quantities and horizons; the rotors' lag is chosen by it."""
     ends = [[part[:, steps - 1] for part in found for steps in horizons] for found in (errors, baseline)]
     own, other = ([np.sqrt(np.mean(np.square(end, dtype=float))) for end in each] for each in ends)
     return float(np.mean(np.divide(own, other)))
+
+
+def labels(config: RealFlightConfig) -> list[str]:
+    """The labels of the scores of a run."""
+    return [*map(str, config.horizon), *[SUM] * (config.protocol == "nanodrone")]
 
 
 def cells(rows: Results) -> dict[Cell, Results]:
@@ -162,13 +171,8 @@ def pooled(rows: Results, label: str, quantity: str) -> np.ndarray:
     return np.array([one(own) for own in rows.sort(seed=None).group("seed").values()])
 
 
-def least(errors: Mapping[str, float]) -> str:
-    """The name with the smallest finite error, the first of equal ones."""
-    return min(errors, key=lambda name: (not math.isfinite(errors[name]), errors[name]))
-
-
 def verdicts(rows: Results) -> list[Verdict]:
-    """Evaluate each hypothesis that the rows can answer, on the mean over seeds with folds pooled."""
+    """Evaluate each hypothesis that the rows can answer."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
     mode, most = ("fine_tuned", sizes[-1]) if sizes else ("source_only", 0)
@@ -196,13 +200,23 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cel
     def predicate(found: Cells) -> Part:
         known = [found[other] for other in others if other in found]
         if not known:
-            raise Inconclusive("none of these was run")
-        ratios = {}
+            raise Undecided("none of these was run")
+        outcomes, words = [], []
         for label, quantity in product(score_labels(found[cell]), QUANTITIES):
-            own, *theirs = (float(np.mean(pooled(rows, label, quantity))) for rows in (found[cell], *known))
-            worst = max(own / other if math.isfinite(own) else math.inf for other in theirs)
-            ratios[f"{'summed' if label == SUM else f'step {label}'} {quantity}"] = worst
-        words = ", ".join(f"{where} {ratio:.3f}" for where, ratio in ratios.items())
-        return all(ratio < 1 for ratio in ratios.values()), f"error over that of the best of them: {words}"
+            ratios = [_log_ratio(found[cell], rows, f"scores.{label}.{quantity}") for rows in known]
+            outcomes += [ratio.below(0.0) for ratio in ratios]
+            worst = Interval(*np.exp(max(ratios, key=lambda ratio: ratio.value)))
+            words.append(f"{'summed' if label == SUM else f'step {label}'} {quantity} {worst.text('.3f')}")
+        return every(outcomes), f"error over that of the best of them: {', '.join(words)}"
 
-    return Claim(name, f"{cell_name(*cell)}, has smaller errors than {of} in every quantity", predicate)
+    text = f"{cell_name(*cell)}, has smaller errors than {of} in every quantity"
+    return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over folds and seeds).", predicate)
+
+
+def _log_ratio(rows: Results, others: Results, column: str) -> Interval:
+    """log(error / other error), of the same fold and seed; a baseline, which has no seeds, of the same fold."""
+    theirs = {(row["fold"], row["seed"]): error for row, error in zip(others, others.numbers(column), strict=True)}
+    pairs = [(row["fold"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]
+    with np.errstate(all="ignore"):
+        ratios = np.log(rows.numbers(column) / np.array([theirs[pair] for pair in pairs]))
+    return mean_interval(ratios, rows["seed"], rows["fold"])

@@ -1,26 +1,39 @@
-"""Train and test in every fold."""
+"""Train, choose and test in every fold."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
-from itertools import groupby
+from functools import cache, cached_property, partial
 from typing import Any
 
 import jax
 import numpy as np
 
-from experiments.real_flight import scoring, train
-from experiments.real_flight.logs import Fold, hold_out_validation, make_folds, require_windows
+from experiments.real_flight import scoring, selection, train
+from experiments.real_flight.config import RealFlightConfig
+from experiments.real_flight.logs import (
+    GROUP_BY,
+    Fold,
+    evenly_spaced,
+    hold_out_validation,
+    leave_out,
+    make_folds,
+    require_windows,
+    sampled_indices,
+)
 from experiments.real_flight.models import RECIPES, equivalent_recipe, thrust_baseline
-from experiments.real_flight.scoring import TAGS, Test, least, linear_residuals, parameters, relative_error
+from experiments.real_flight.scoring import BASELINES, QUANTITIES, SUM, TAGS, Test, linear_residuals, parameters
+from experiments.real_flight.selection import BLEND, Selection
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
+from experiments.reporting import names
 from experiments.reporting.results import Results
+from hybrid_jax.dynamics.base import AbstractVectorField, Blend
 from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows
+from hybrid_jax.trajectories import Trajectories
 
-CHOICE_SEEDS = 2  # seeds that are trained to choose a recipe
+CHOICE_SEEDS = 2  # seeds that are trained to choose a candidate
+CHOICE_WINDOWS = 500  # windows of a flight, or manoeuvre, that candidates are compared on
 
 Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 
@@ -29,9 +42,9 @@ Source = tuple[Callable[[str], TrainingData], Callable[..., TrainedModel]]
 class Outputs:
     folds: list[Fold]
     tests: list[Test] = field(default_factory=list)
-    # Of each fold, by recipe, the validation error over the baseline's; empty with a single recipe.
-    choices: dict[str, dict[str, float]] = field(default_factory=dict)
+    selections: list[Selection] = field(default_factory=list)  # of each fold and N
     trained: dict[tuple[int, str, str], TrainedModel] = field(default_factory=dict)  # by number of fold, model, mode
+    chosen: dict[tuple[int, int, int], AbstractVectorField] = field(default_factory=dict)  # number of fold, N, seed
 
     @property
     def table(self) -> Results:
@@ -53,87 +66,204 @@ def run_folds(experiment: Experiment) -> Outputs:
     return outputs
 
 
-def source_of(experiment: Experiment, name: str, fold: Fold) -> Source:
-    """Data of the flights before the change, by recipe, and models trained on them; each is made once."""
-    data = cache(partial(train.training_data, experiment, fold))
+def source_of(experiment: Experiment, name: str, fold: Fold, like: Source | None = None) -> Source:
+    """Data of the flights before the change, by recipe, and models trained on them; each is made once.
+
+    With `like`, loss and shapes are those of its data, so that both share their programs.
+    """
 
     @cache
-    def trained(model: str, recipe: str, seeds: int, prefix: str = "") -> TrainedModel:
+    def data(recipe: str) -> TrainingData:
+        if like is None:
+            return train.training_data(experiment, fold, recipe)
+        both = cut_windows(
+            [*fold.train, *fold.validation, *fold.test], RECIPES[recipe].window, experiment.config.stride
+        )
+        return train.training_data(experiment, fold, recipe, like[0](recipe).objective, capacity=len(both))
+
+    @cache
+    def trained(model: str, recipe: str, seeds: int) -> TrainedModel:
+        prefix = "choice " if seeds < experiment.config.seeds else ""
         return train.train_on_source(experiment, f"{prefix}{name}", model, recipe, data(recipe), seeds)
 
     return data, trained
 
 
-def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Source) -> None:
-    """Choose a recipe, train every model, adapt it if there is a target, and test."""
-    config, fold, name = experiment.config, outputs.folds[number], f"fold {number}"
-    adapts, (source_data, source_model) = "target" in experiment.logs, source
-    windows = {RECIPES[recipe].window for recipe in config.tried}
-    capacity = max(count_windows(each.train, steps) for each in outputs.folds for steps in windows)
+def candidates(config: RealFlightConfig) -> list[str]:
+    """Baselines, and models with their recipes, the simplest first; of those trained in the same way, one."""
+    learned = [
+        f"{model} {recipe}"
+        for model in (names.PHYSICS_ONLY, names.HYBRID)
+        for recipe in config.tried
+        if model in config.models and equivalent_recipe(model, recipe, config.tried) == recipe
+    ]
+    return [*reversed(BASELINES), *learned]
+
+
+class Trainer:
+    """Trains the candidates of one fold, each once."""
+
+    def __init__(self, experiment: Experiment, name: str, fold: Fold, source: Source, capacity: int):
+        self.experiment, self.name, self.fold, self.capacity = experiment, name, fold, capacity
+        self.adapts = "target" in experiment.logs
+        self.mode = names.FINE_TUNED if self.adapts else names.SOURCE_ONLY  # of what is delivered
+        self.source_data, self.source_model = source
+        self.target_data, self.trained = cache(self._target_data), cache(self._trained)
+
+    def _target_data(self, recipe: str) -> TrainingData:
+        loss = self.source_data(recipe).objective
+        return train.training_data(self.experiment, self.fold, recipe, loss, 1, self.capacity)
+
+    def _trained(self, model: str, recipe: str, seeds: int, mode: str) -> TrainedModel:
+        """A model adapted to each N, or without a target trained on all flights of the fold."""
+        experiment, first = self.experiment, self.source_model(model, recipe, seeds)
+        if self.adapts:
+            start, data = train.transfer(experiment, first), self.target_data(recipe)
+            return train.adapt(experiment, self.name, mode, start, data, experiment.config.n)
+        again = experiment.config.refit
+        return train.refit(experiment, self.name, self.fold, self.source_data(recipe), first) if again else first
+
+    def fields(self, candidate: str, seeds: int, size: int) -> Sequence[AbstractVectorField]:
+        """A candidate for an N of the configuration, 0 without a target: a field per seed, or one if all are equal."""
+        if BLEND in candidate:
+            parts = [self.fields(part, seeds, size) for part in candidate.split(BLEND)]
+            return [Blend(each) for each in zip(*parts, strict=True)]
+        model, _, recipe = candidate.partition(" ")
+        if recipe:
+            trained = self.trained(model, recipe, seeds, self.mode)
+            first = self.experiment.config.n.index(size) * seeds if self.adapts else 0
+            return [trained.run(first + seed) for seed in range(seeds)]
+        if model == names.LINEAR_RESIDUAL:
+            return self.linear_residuals(seeds, size)
+        vehicle = self.experiment.after if self.adapts else self.experiment.before
+        return [HoldState() if model == names.HOLD else thrust_baseline(vehicle)]
+
+    def linear_residuals(self, seeds: int, size: int) -> Sequence[AbstractVectorField]:
+        """Linear residuals of the rigid body, fitted to N target windows; with N = 0 to all windows of the source."""
+        config, recipe = self.experiment.config, self.experiment.config.tried[0]
+        before, after = (multirotor(e.vehicle, (), e.terms) for e in (self.experiment.before, self.experiment.after))
+        if size == 0:
+            data = self.source_data(recipe)
+            return linear_residuals(before, data, [np.arange(len(data.train))], after if self.adapts else before)
+        data = self.target_data(recipe)
+        size = min(size, len(data.train))
+        subsets = [sampled_indices(data.train.sizes, size, config.draw, seed) for seed in range(seeds)]
+        return linear_residuals(after, data, subsets, after)
+
+    @cached_property
+    def tested(self) -> dict[str, Trajectories]:
+        """Windows of each test flight, or manoeuvre, that is long enough."""
+        config, groups = self.experiment.config, {}
+        for log in self.fold.test:
+            groups.setdefault(GROUP_BY[config.validated_by](log), []).append(log)
+        long = {name: logs for name, logs in groups.items() if count_windows(logs, config.longest)}
+        cut = {name: cut_windows(logs, config.longest).windows for name, logs in long.items()}
+        return {name: evenly_spaced(windows, CHOICE_WINDOWS) for name, windows in cut.items()}
+
+    def log_errors(self, candidate: str, seeds: int, size: int) -> np.ndarray:
+        """Logs of a candidate's errors, (flights, seeds, labels, quantities)."""
+        fields, config = self.fields(candidate, seeds, size), self.experiment.config
+
+        def of(field: AbstractVectorField, windows: Trajectories) -> np.ndarray:
+            found = scoring.scores(*scoring.errors_by_step(field, windows), config)
+            return np.array([list(errors.values()) for errors in found.values()])
+
+        errors = [[of(field, windows) for field in fields] for windows in self.tested.values()]
+        shape = (-1, len(fields), len(scoring.labels(config)), len(QUANTITIES))
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.log(np.reshape(errors, shape)).repeat(seeds // len(fields), axis=1)
+
+
+def select(trainer: Trainer, inner: Sequence[Trainer], size: int) -> Selection:
+    """Choose a candidate by the flights that each of the inner folds leaves out of training."""
+    config = trainer.experiment.config
+    seeds, labels = min(CHOICE_SEEDS, config.seeds), scoring.labels(config)
+    judged = [labels.index(SUM)] if SUM in labels else range(len(labels))
 
     @cache
-    def target(recipe: str) -> TrainingData:
-        return train.training_data(experiment, fold, recipe, source_data(recipe), capacity)
+    def errors(candidate: str) -> np.ndarray:
+        return np.concatenate([each.log_errors(candidate, seeds, size) for each in inner])
 
-    def candidate(recipe: str) -> TrainedModel:
-        found = source_model("hybrid", recipe, min(CHOICE_SEEDS, config.seeds), "choice ")
-        if not adapts:
-            return found
-        start = train.transfer(experiment, found)
-        return train.adapt(experiment, f"choice {name}", "fine_tuned", start, target(recipe), [max(config.n)])
+    def scored(candidate: str) -> np.ndarray:
+        return (errors(candidate) - errors(names.THRUST))[:, :, judged].mean(axis=(2, 3))
 
-    chosen = _choose_recipe(experiment, outputs, fold, candidate)
-    data, test = source_data(chosen), cut_windows(fold.test, config.longest).windows
-    score = partial(scoring.score, windows=test, config=config, fold=fold.name)
+    scores = {candidate: scored(candidate) for candidate in candidates(config)}
+    if pair := selection.undecided(scores, BASELINES):
+        scores[BLEND.join(pair)] = scored(BLEND.join(pair))
+    chosen = selection.choose(scores, BASELINES)
+    left_out = [name for each in inner for name in each.tested]
+    observed = np.exp(trainer.log_errors(chosen, config.seeds, size).mean(axis=1))
+    expected = selection.expected(errors(chosen).mean(axis=1))
+    found = dict(zip(trainer.tested, observed, strict=True))
+    return Selection(trainer.fold.name, size, chosen, left_out, scores, expected, labels, found)
 
-    def add(trained: TrainedModel, theta: list[dict[str, Any]]) -> None:
-        outputs.tests.extend(scoring.score_model(score, trained, theta))
-        outputs.trained[number, trained.model, trained.mode] = trained
 
-    baselines = {"hold": HoldState(), "thrust": thrust_baseline(experiment.after if adapts else experiment.before)}
-    outputs.tests.extend(score(baseline, model=model, mode="nominal") for model, baseline in baselines.items())
-    adapted: TrainedModel | None = None
+def recipe_of(selected: Selection, config: RealFlightConfig) -> str:
+    """The recipe of the models in the report: the chosen one, or with a baseline that of the best learned candidate."""
+    learned = {name: each.mean() for name, each in selected.scores.items() if " " in name and np.isfinite(each).all()}
+    best = selected.chosen if selected.chosen in learned else min(learned, key=learned.__getitem__, default="")
+    return best.split(BLEND)[0].partition(" ")[2] or config.tried[0]
+
+
+def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Source) -> None:
+    """Choose a candidate, train every model, adapt it if there is a target, and test."""
+    config, fold, name = experiment.config, outputs.folds[number], f"fold {number}"
+    windows = {RECIPES[recipe].window for recipe in config.tried}
+    capacity = max(count_windows(each.train, steps) for each in outputs.folds for steps in windows)
+    trainer = Trainer(experiment, name, fold, source, capacity)
+    inner = []
+    for part, left_out in enumerate(leave_out(fold, config)):
+        own = f"{name} without {part}"
+        its_source = source if trainer.adapts else source_of(experiment, own, left_out, source)
+        inner.append(Trainer(experiment, own, left_out, its_source, capacity))
+    sizes = config.n if trainer.adapts else (0,)
+    selections = [select(trainer, inner, size) for size in sizes]
+    outputs.selections.extend(selections)
+    outputs.tests.extend(_test(trainer, outputs, number, selections))
+
+
+def _test(trainer: Trainer, outputs: Outputs, number: int, selections: Sequence[Selection]) -> Iterable[Test]:
+    """Test all models of a fold, with the recipe that was chosen for the largest N, and what was chosen."""
+    config = trainer.experiment.config
+    windows = cut_windows(trainer.fold.test, config.longest).windows
+    score = partial(scoring.score, windows=windows, config=config, fold=trainer.fold.name)
+    for model in (names.HOLD, names.THRUST):
+        yield score(*trainer.fields(model, 1, 0), model=model, mode=names.NOMINAL)
+    chosen = recipe_of(max(selections, key=lambda each: each.n_train), config)
     for model in config.models:
-        first = source_model(model, equivalent_recipe(model, chosen, config.tried), config.seeds)
-        if not adapts:
-            first = train.refit(experiment, name, fold, data, first) if config.refit else first
-            add(first, parameters(first, data))
-            continue
-        start = train.transfer(experiment, first)
-        add(start, parameters(first, data))
-        for mode in ("fine_tuned", "scratch") if model == "hybrid" else ("fine_tuned",):  # what the source is worth
-            adapted = train.adapt(experiment, name, mode, start, target(chosen), config.n)
-            add(adapted, parameters(adapted, target(chosen)))
-    outputs.tests.extend(_linear_baselines(experiment, score, data, (adapted, target(chosen)) if adapted else None))
+        for trained, theta in _models(trainer, model, equivalent_recipe(model, chosen, config.tried)):
+            outputs.trained[number, trained.model, trained.mode] = trained
+            yield from scoring.score_model(score, trained, theta)
+    yield from _linear_baselines(trainer, score)
+    for selected in selections:
+        size = selected.n_train
+        fields = trainer.fields(selected.chosen, config.seeds, size)
+        for seed in range(config.seeds):
+            outputs.chosen[number, size, seed] = each = fields[seed % len(fields)]
+            tags = {"model": names.CHOSEN, "mode": trainer.mode, "n_train": size, "seed": seed}
+            yield score(each, **tags, recipe=selected.chosen)
 
 
-def _linear_baselines(experiment: Experiment, score: Callable[..., Test], source: TrainingData, target: Any):
-    """Test linear residuals of the rigid body, fitted to all source windows and to those of each run on the target."""
-    before, after = (multirotor(each.vehicle, (), each.terms) for each in (experiment.before, experiment.after))
-    now, mode = (after, "zero_shot") if target else (before, "source_only")
-    (field,) = linear_residuals(before, source, [np.arange(len(source.train))], now)
-    yield score(field, model="linear_residual", mode=mode)
-    if target is None:
+def _models(trainer: Trainer, model: str, recipe: str) -> Iterable[tuple[TrainedModel, list[dict[str, Any]]]]:
+    """A model of a recipe with its θ_p; with a target, as it came from the source and then adapted."""
+    seeds = trainer.experiment.config.seeds
+    if not trainer.adapts:
+        trained = trainer.trained(model, recipe, seeds, trainer.mode)
+        yield trained, parameters(trained, trainer.source_data(recipe))
         return
-    adapted, data = target
-    for size, group in groupby(range(len(adapted)), adapted.size):
-        runs = list(group)
-        fields = linear_residuals(after, data, [adapted.subsets[run] for run in runs], after)
-        for run, each in zip(runs, fields, strict=True):
-            yield score(each, model="linear_residual", mode="scratch", n_train=size, seed=adapted.seeds[run])
+    first = trainer.source_model(model, recipe, seeds)
+    yield train.transfer(trainer.experiment, first), parameters(first, trainer.source_data(recipe))
+    # From scratch: what the source is worth.
+    for mode in (names.FINE_TUNED, names.SCRATCH) if model == names.HYBRID else (names.FINE_TUNED,):
+        trained = trainer.trained(model, recipe, seeds, mode)
+        yield trained, parameters(trained, trainer.target_data(recipe))
 
 
-def _choose_recipe(experiment: Experiment, outputs: Outputs, fold: Fold, candidate: Callable[[str], TrainedModel]):
-    """Choose the recipe whose hybrids do best on the fold's validation flights; of one recipe, take that."""
-    config = experiment.config
-    if len(config.tried) == 1:
-        return config.tried[0]
-    windows = cut_windows(fold.validation, config.longest).windows
-    baseline = flight_errors(thrust_baseline(experiment.after), windows)
-
-    def error(trained: TrainedModel) -> float:
-        found = [flight_errors(trained.run(index), windows) for index in range(len(trained))]
-        return float(np.mean([relative_error(errors, baseline, config.horizon) for errors in found]))
-
-    outputs.choices[fold.name] = {name: error(candidate(name)) for name in config.tried}
-    return least(outputs.choices[fold.name])
+def _linear_baselines(trainer: Trainer, score: Callable[..., Test]) -> Iterable[Test]:
+    """Test linear residuals of the rigid body, fitted to all source windows and to those of each run on the target."""
+    config, model = trainer.experiment.config, names.LINEAR_RESIDUAL
+    mode = names.ZERO_SHOT if trainer.adapts else names.SOURCE_ONLY
+    yield score(*trainer.linear_residuals(1, 0), model=model, mode=mode)
+    for size in config.n if trainer.adapts else ():
+        for seed, each in enumerate(trainer.linear_residuals(config.seeds, size)):
+            yield score(each, model=model, mode=names.SCRATCH, n_train=size, seed=seed)

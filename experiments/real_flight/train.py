@@ -74,17 +74,19 @@ class TrainedModel:
 
 
 def training_data(
-    experiment: Experiment, fold: Fold, recipe: str, source: TrainingData | None = None, capacity: int = 0
+    experiment: Experiment,
+    fold: Fold,
+    recipe: str,
+    loss: ChannelLoss | None = None,
+    stride: int | None = None,
+    capacity: int = 0,
 ) -> TrainingData:
-    """Cut the windows of a fold; after a change a window starts at every sample.
-
-    The loss is scaled by the training windows, or is that of `source`, the data before a change.
-    """
-    how, config = RECIPES[recipe], experiment.config
-    validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, config.validation)
-    train = cut_windows(fold.train, how.window, 1 if source else config.stride)
-    loss = source.objective if source else models.objective_of(experiment.before, train.windows, how)
-    return TrainingData(train, validation, loss, capacity or len(train))
+    """Cut the windows of a fold, by default at the source's stride and with a loss scaled by the training windows."""
+    how, stride = RECIPES[recipe], stride or experiment.config.stride
+    validation = evenly_spaced(cut_windows(fold.validation, how.window).windows, experiment.config.validation)
+    train = cut_windows(fold.train, how.window, stride)
+    loss = loss or models.objective_of(experiment.before, train.windows, how)
+    return TrainingData(train, validation, loss, max(capacity, len(train)))
 
 
 def train_on_source(
@@ -106,7 +108,7 @@ def refit(experiment: Experiment, name: str, fold: Fold, data: TrainingData, fir
     more = cut_windows(fold.validation, RECIPES[first.recipe].window, experiment.config.stride)
     both = concatenate([data.train.windows, more.windows])
     windows = LogWindows(both, [*data.train.sizes, *more.sizes], data.train.stride)
-    data = replace(data, train=windows, capacity=len(both))
+    data = replace(data, train=windows, capacity=max(data.capacity, len(both)))
     again = train_on_source(experiment, f"{name} again", first.model, first.recipe, data, len(first), first.best_epochs)
     return replace(first, fields=again.fields, epochs=first.epochs + again.epochs)
 
@@ -124,6 +126,7 @@ def adapt(
     if mode == "scratch":
         fields, steps = models.untrained(start.model, experiment.after, how, config.hidden, len(start)), how.scratch
     seeds = [seed for _ in sizes for seed in start.seeds]
+    sizes = [min(size, len(data.train)) for size in sizes]  # fewer where a flight is left out of few
     subsets = [sampled_indices(data.train.sizes, size, config.draw, s) for size in sizes for s in start.seeds]
     begin = TrainedModel(start.model, mode, start.recipe, lane(fields, np.array(seeds)), seeds, subsets)
     return in_stages(experiment, f"{name} {mode}", begin, steps, data, ())
@@ -139,8 +142,11 @@ def in_stages(
     fields, finals = start.fields, []
     settings = Settings(experiment.config.batch_size, objective=data.objective)
     train = data.train.windows[np.arange(data.capacity) % len(data.train)]
+    # With these two, trainings of fewer seeds, or without one of the flights, share the program.
+    lanes = experiment.config.seeds * len(start) // len(set(start.seeds))
+    listed = data.capacity if start.mode == "source_only" else max(experiment.config.n)
     for number, step in enumerate(steps):
-        runs = _run_configs(start, fields, step, experiment.config.epochs)
+        runs = _run_configs(start, fields, step, listed, experiment.config.epochs)
         splits = Dataset({"train": cut(train, step.steps), "validation": data.validation}, {})
         where = (fields, np.asarray(start.seeds), np.asarray(number + 1))
         states = jax.device_get(_start_states(*where, data.validation, settings))
@@ -148,7 +154,7 @@ def in_stages(
             exact = np.maximum(best_epochs[number], 1).astype(np.int32)
             runs = eqx.tree_at(lambda run: (run.max_epochs, run.min_epochs), runs, (exact, exact))
         stage = f"{name} {start.model} {start.recipe} {number + 1}"
-        finals.append(experiment.stages.run(stage, states, runs, settings, splits))
+        finals.append(experiment.stages.run(stage, states, runs, settings, splits, (lanes, 0)))
         if best_epochs:
             last = (finals[-1].field if epochs else fields for epochs in best_epochs[number])
             fields = stack([lane(each, run) for run, each in enumerate(last)])
@@ -159,15 +165,15 @@ def in_stages(
     return replace(start, fields=fields, val_loss=val_loss, epochs=epochs, best_epochs=best, status=status)
 
 
-def _run_configs(start: TrainedModel, fields: Any, step: Step, factor: float) -> RunConfig:
-    longest, one = max(map(len, start.subsets)), lane(fields, 0)
+def _run_configs(start: TrainedModel, fields: Any, step: Step, listed: int, factor: float) -> RunConfig:
+    one = lane(fields, 0)
     rates = rates_by_group(one, models.rates_of(step, start.model, one))
 
     def configure(run: int) -> RunConfig:
         # An epoch of few windows has few gradient steps, so small N are trained for more epochs.
         scale = factor * ((REFERENCE / start.size(run)) ** 0.5 if start.size(run) else 1.0)
         epochs, patience = (max(1, round(scale * count)) for count in (step.epochs, step.patience))
-        indices = np.resize(start.subsets[run], longest)  # all of one length; only the first ones are used
+        indices = np.resize(start.subsets[run], listed)  # all of one length; only the first ones are used
         return make_run_config(rates, indices, len(start.subsets[run]), 0, patience, epochs, 0.0)
 
     return stack([configure(run) for run in range(len(start))])

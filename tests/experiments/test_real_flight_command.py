@@ -217,8 +217,9 @@ def test_simulated_run_writes_a_complete_report(simulated):
     report = json.loads((out / "report.json").read_text())
     assert {"versions", "hardware", "seconds"} <= set(report["environment"])
     assert report["config"]["preset"] == "smoke"
-    # Two folds: hold, thrust, two linear residuals; three models zero-shot and fine-tuned, the hybrid from scratch.
-    assert len(report["rows"]) == 2 * (4 + 3 * 2 + 1)
+    # Two folds: hold, thrust, two linear residuals; three models zero-shot and fine-tuned, the hybrid from scratch; the
+    # chosen one.
+    assert len(report["rows"]) == 2 * (4 + 3 * 2 + 1 + 1)
     for found in report["rows"]:
         assert set(found["scores"]) == {"5", "10"}
         assert all(set(errors) == set(QUANTITIES) for errors in found["scores"].values())
@@ -226,7 +227,13 @@ def test_simulated_run_writes_a_complete_report(simulated):
     for fold in report["folds"]:
         assert not set(fold["test"]) & {*fold["train"], *fold["validation"]}
     assert sum(map(len, report["logs"].values())) == 16
+    for fold, selected in zip(report["folds"], report["selections"], strict=True):
+        assert sorted(selected["left_out"]) == sorted([*fold["train"], *fold["validation"]])
+        assert set(selected["observed"]) == set(fold["test"]) <= set(report["outside"])
+        (chosen,) = (r for r in report["rows"] if (r["model"], r["fold"]) == ("chosen", fold["tested_on"]))
+        assert chosen["recipe"] == selected["chosen"] in selected["scores"]
     page = (out / "report.md").read_text()
+    assert page.index("Error to expect") < page.index("Test flights against") < page.index("RMSE at step")
     for figure in report["figures"]:
         assert (out / figure).read_bytes().startswith(b"\x89PNG")
         assert f"({figure})" in page
@@ -246,7 +253,7 @@ def test_adaptation_changes_all_parameters(simulated):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["hybrid", "no_physics", "physics_only"])
+@pytest.mark.parametrize("name", ["hybrid", "no_physics", "physics_only", "chosen"])
 def test_saved_models_load_and_predict(simulated, name):
     path = simulated[0] / "models" / f"fold0-{name}-fine_tuned-20-seed0.npz"
     code = f"""
