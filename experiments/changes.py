@@ -12,7 +12,7 @@ from rich.console import Console
 
 from experiments.paper import study
 from experiments.paper.conditions import settings
-from experiments.paper.config import QUICK, SMOKE, Config, preset_like
+from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
 from experiments.paper.regret import CLAIMS, error_table, regret_figure, regret_table
 from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
@@ -22,7 +22,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
-from experiments.runner.options import Count, distinct
+from experiments.runner.options import distinct
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import FineTune
@@ -44,11 +44,6 @@ from hybrid_jax.vehicle import IRIS
 
 NAME = "changes"
 INSIDE = "expected_inside"  # column: see `_share_inside`
-# For every preset.
-HARD: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "contiguous", "draws": 4, "validation": "own"}
-Change = Literal[
-    "parameter_shift", "external_force", "doubled_drag", "weak_rotor", "off_centre_load", "gusty_wind", "load_and_wind",
-]  # fmt: skip
 Compared = Literal["fine_tune", "fine_tune_offset", "l2_sp"]
 OFFSET = 0.3
 L2_SP = FineTune(l2_sp=1e-2)
@@ -71,43 +66,25 @@ error that is gone. Test error: L^T_MSE over 1 s of other flights.
 
 
 @dataclass(frozen=True)
-class ChangesConfig(Config):
+class ChangesConfig(OneFlight):
     """Adapt with one flight after each change of the vehicle; every candidate is tested, to know what was missed."""
 
-    sizes: tuple[int, ...] = (100,)
-    """N, windows of 0.1 s: one number."""
-    draw: Literal["random", "contiguous"] = "contiguous"
-    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
-    random: of many flights, as in the paper."""
-    draws: Count = 4
-    """Draws of target trajectories; each seed's source adapts to each of them alone."""
-    validation: Count | Literal["own"] = "own"
-    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
-    noise: float = 1.0
-    """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
-    noise_on: Literal["all", "target"] = "target"
-    """Which of these flights are noisy: those before the change as well, or those after it alone."""
-    changes: tuple[Change, ...] = get_args(Change)
-    """Which changes."""
     compared: tuple[Compared, ...] = get_args(Compared)
     """Methods to compare with. fine_tune: Adam, as in the paper. fine_tune_offset: with --rates.offset 0.3. l2_sp: with
     a penalty on the distance from the source's parameters."""
 
     def __post_init__(self):
-        Config.__post_init__(self)
-        distinct("--changes", self.changes)
+        OneFlight.__post_init__(self)
         if self.compared:
             distinct("--compared", self.compared)
-        if len(self.sizes) != 1:
-            raise ValueError(f"--sizes must be one number, got {self.sizes}")
 
 
 PRESETS = {
     "paper": ChangesConfig(),
-    "quick": preset_like(ChangesConfig, replace(QUICK, **HARD)),
+    "quick": preset_like(ChangesConfig, replace(QUICK, **ONE_FLIGHT, draws=4)),
     "smoke": preset_like(
         ChangesConfig,
-        replace(SMOKE, **HARD | {"draws": 1}),
+        replace(SMOKE, **ONE_FLIGHT),
         sizes=(20,),
         changes=("external_force",),
         compared=("fine_tune",),

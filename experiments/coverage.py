@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, field, replace
 from functools import partial
-from typing import Any, Literal
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -10,9 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from rich.console import Console
 
-from experiments.changes import Change
 from experiments.paper.conditions import settings
-from experiments.paper.config import QUICK, SMOKE, Config, preset_like
+from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.known_body import KnownBody, coverage, known_body_table
 from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
@@ -22,7 +21,7 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
-from experiments.runner.options import Count, distinct
+from experiments.runner.options import Count
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.auto import Auto
@@ -55,24 +54,13 @@ intervals that are not pooled.
 
 
 @dataclass(frozen=True)
-class CoverageConfig(Config):
+class CoverageConfig(OneFlight):
     """Adapt to each of many flights after each change of the vehicle; count how often intervals contain the truth."""
 
     seeds: Count = SOURCES
     """Sources, whose intervals are pooled."""
-    sizes: tuple[int, ...] = (100,)
-    """N, windows of 0.1 s: one number."""
-    draw: Literal["random", "contiguous"] = "contiguous"
-    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
-    random: of many flights, as in the paper."""
     draws: Count = 100
     """Flights: each source adapts to each of them alone."""
-    validation: Count | Literal["own"] = "own"
-    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
-    noise: float = 1.0
-    """White noise on the states of the flights to adapt to; 1 is typical of motion capture and a gyroscope."""
-    noise_on: Literal["all", "target"] = "target"
-    """Which flights are noisy: those before the change as well, or those after it alone."""
     clean: bool = True
     """Adapt to the same flights without noise, too."""
     changes: tuple[Change, ...] = RIGHT
@@ -80,20 +68,17 @@ class CoverageConfig(Config):
     known: KnownBody = field(default_factory=KnownBody)
 
     def __post_init__(self):
-        Config.__post_init__(self)
-        distinct("--changes", self.changes)
-        if len(self.sizes) != 1:
-            raise ValueError(f"--sizes must be one number, got {self.sizes}")
+        OneFlight.__post_init__(self)
         if self.seeds < SOURCES:
             raise ValueError(f"--seeds must be at least {SOURCES}, got {self.seeds}")
 
 
-HARD: dict[str, Any] = {"seeds": SOURCES, "noise": 1.0, "noise_on": "target", "draw": "contiguous", "validation": "own"}
+SHORT: dict[str, Any] = ONE_FLIGHT | {"seeds": SOURCES}
 PRESETS = {
     "paper": CoverageConfig(),
-    "quick": preset_like(CoverageConfig, replace(QUICK, **HARD, draws=20), known=KnownBody(repeats=20)),
+    "quick": preset_like(CoverageConfig, replace(QUICK, **SHORT, draws=20), known=KnownBody(repeats=20)),
     "smoke": preset_like(
-        CoverageConfig, replace(SMOKE, **HARD), sizes=(20,), changes=("parameter_shift",), clean=False,
+        CoverageConfig, replace(SMOKE, **SHORT), sizes=(20,), changes=("parameter_shift",), clean=False,
         known=KnownBody(repeats=4),
     ),
 }  # fmt: skip

@@ -82,6 +82,11 @@ class Encoding:
     """Cap on the encoder's epochs."""
 
 
+Change = Literal[
+    "parameter_shift", "external_force", "doubled_drag", "weak_rotor", "off_centre_load", "gusty_wind", "load_and_wind",
+]  # fmt: skip
+
+
 @dataclass(frozen=True)
 class Config(Run):
     """What all experiments in simulation share. Without options this is the paper's full protocol."""
@@ -224,6 +229,37 @@ class AdaptationConfig(Config):
     def __post_init__(self):
         Config.__post_init__(self)
         distinct("--models", self.models)
+
+
+@dataclass(frozen=True)
+class OneFlight(Config):
+    """What a user has after a change: one short flight with sensor noise, and nothing else."""
+
+    sizes: tuple[int, ...] = (100,)
+    """N, windows of 0.1 s: one number."""
+    draw: Literal["random", "contiguous"] = "contiguous"
+    """Which N target trajectories. contiguous: from the start of one flight, of ten seconds for 100 trajectories.
+    random: of many flights, as in the paper."""
+    draws: Count = 4
+    """Draws of target trajectories; each seed's source adapts to each of them alone."""
+    validation: Count | Literal["own"] = "own"
+    """own: nothing but the N target trajectories is used. A number is that of the source's validation trajectories."""
+    noise: float = 1.0
+    """White noise on the states of all flights but the test flights; 1 is typical of motion capture and a gyroscope."""
+    noise_on: Literal["all", "target"] = "target"
+    """Which of these flights are noisy: those before the change as well, or those after it alone."""
+    changes: tuple[Change, ...] = get_args(Change)
+    """Which changes of the vehicle."""
+
+    def __post_init__(self):
+        Config.__post_init__(self)
+        distinct("--changes", self.changes)
+        if len(self.sizes) != 1:
+            raise ValueError(f"--sizes must be one number, got {self.sizes}")
+
+
+# The same for every preset of these experiments.
+ONE_FLIGHT: dict[str, Any] = {"noise": 1.0, "noise_on": "target", "draw": "contiguous", "validation": "own"}
 
 
 def preset_like(kind: type[Kind], like: Config, **changes: Any) -> Kind:
