@@ -3,7 +3,7 @@
 The step minimises Σ ‖r + J δ‖² + penalty ‖δ‖² over changes δ of the network's weights in the subspace that changes the
 predictions most (the leading right singular vectors of J, by randomised subspace iteration: Halko, Martinsson and
 Tropp, SIAM Review 2011). The penalty holds the weights at the source's, as L2-SP does (Li, Grandvalet and Davoine,
-2018); the strongest one, which changes nothing, is among those to choose from.
+2018). The network as it is stays among the candidates (`auto`).
 """
 
 from collections.abc import Callable
