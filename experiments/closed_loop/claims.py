@@ -12,7 +12,8 @@ import numpy as np
 from experiments.closed_loop.results import LEARNED, ORACLE, REFERENCES, SOURCES, Agent, away, gaps, uncrashed
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
-from experiments.reporting.results import Interval, Results
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval
 
 RMSE = uncrashed("position_rmse", 100.0)  # cm
 THREE = ("hover", "figure_eight", "low_pass")

@@ -18,7 +18,8 @@ from experiments.closed_loop.claims import COST_TOLERANCE
 from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
 from experiments.reporting import plots
 from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note, subplots
-from experiments.reporting.results import Interval, Results
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval
 
 COLOURS_OF = {
     "nominal": "0.45",

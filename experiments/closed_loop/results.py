@@ -6,7 +6,8 @@ from dataclasses import asdict, dataclass, fields
 from typing import Any
 
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
-from experiments.reporting.results import Interval, Results, Row, share_of_gap
+from experiments.reporting.results import Results, Row
+from experiments.reporting.statistics import Interval, share_of_gap
 from experiments.reporting.tables import EMPTY, Cell, Table, cross_table, mean_over_seeds, spread_text
 
 DOMAINS = {name: LABELS[name] for name in (UNCHANGED, PARAMETER_SHIFT, EXTERNAL_FORCE)}

@@ -15,7 +15,8 @@ from experiments.paper.lanes import DOMAINS, cells, gain
 from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, all_of, evaluate, every
 from experiments.reporting.names import EXTERNAL_FORCE, FINE_TUNED, HYBRID, NO_PHYSICS, TARGET_ONLY, label
-from experiments.reporting.results import Column, Interval, Results, Row, Spread, ratio_of_stds
+from experiments.reporting.results import Column, Results, Row
+from experiments.reporting.statistics import Interval, Spread, ratio_of_stds
 
 COMPARISON = "comparison"  # the experiment on both domains (Table 2)
 DOMAINS_OF = {"param_shift": DOMAINS[:1], "external_force": DOMAINS[1:], COMPARISON: DOMAINS}

@@ -8,7 +8,8 @@ from experiments.paper.claims import FEW
 from experiments.paper.lanes import BANDS, MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.results import Results, Row, spread
+from experiments.reporting.results import Results, Row
+from experiments.reporting.statistics import spread
 from experiments.reporting.tables import EMPTY, Table, cross_table, mean_over_seeds, over_seeds, spread_text, tabulate
 
 TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)

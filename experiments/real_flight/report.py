@@ -22,7 +22,8 @@ from experiments.real_flight.train import Experiment
 from experiments.reporting import names, report
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.plots import save_figures
-from experiments.reporting.results import Results, spread
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
 from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters

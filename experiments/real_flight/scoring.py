@@ -21,7 +21,8 @@ from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every
-from experiments.reporting.results import Interval, Results, mean_interval
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval, mean_interval
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals

@@ -9,7 +9,8 @@ from rich.console import Console
 from rich.table import Table as RichTable
 from rich.text import Text
 
-from experiments.reporting.results import Results, Spread
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Spread
 
 EMPTY = "–"
 STYLES = {"✓ holds": "green", "✗ fails": "bold red"}

@@ -11,7 +11,8 @@ from hypothesis import given, settings
 from reports import ERRORS, ODD_ROWS, changed, make_rows, row
 
 from experiments.paper.lanes import BASELINES, DOMAINS, TAGS, by_domain, cells, gain, with_rho
-from experiments.reporting.results import Results, spread
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import spread
 
 
 def test_rho_is_eq_9_of_the_seeds_own_source_only_error():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 
-from experiments.reporting.results import Interval, mean_interval, ratio_of_stds, share_of_gap
+from experiments.reporting.statistics import Interval, mean_interval, ratio_of_stds, share_of_gap
 
 REPEATS, SEEDS = 2000, 10
 

@@ -1,0 +1,131 @@
+"""Statistics of runs over seeds and draws: spreads, and confidence intervals of means, ratios and shares."""
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+import scipy  # which imports scipy.stats where it is first used
+
+Values = Sequence[float] | np.ndarray  # of each seed
+Labels = Sequence[Any] | np.ndarray  # the seeds of runs, or their draws
+LEVEL = 0.95
+
+
+class Spread(NamedTuple):
+    """Values over seeds: an infinite one makes mean and std infinite; std (ddof = 1) of a single value is NaN."""
+
+    mean: float
+    std: float
+    median: float
+    smallest: float
+    count: int
+    non_finite: int
+
+
+class Interval(NamedTuple):
+    """An estimate and the ends of its confidence interval, NaN where the seeds cannot bound it."""
+
+    value: float = math.nan
+    low: float = math.nan
+    high: float = math.nan
+
+    def below(self, limit: float) -> bool | None:
+        """Whether the whole interval is below the limit; False if it is all above, None if it does not tell."""
+        return True if self.high < limit else False if self.low > limit else None
+
+    def above(self, limit: float) -> bool | None:
+        return Interval(-self.value, -self.high, -self.low).below(-limit)
+
+    def text(self, form: str = ".3g") -> str:
+        known = f"{self.low:{form}} … {self.high:{form}}" if self.low < self.high else "no interval"
+        certain = math.isinf(self.value) or self.low == self.high
+        return (f"{self.value:{form}}" + ("" if certain else f" ({known})")).replace("inf", "∞")
+
+
+def spread(values: Values) -> Spread:
+    array = np.asarray(values, float)
+    non_finite = int(np.sum(~np.isfinite(array)))
+    with np.errstate(all="ignore"):
+        mean, median = float(np.mean(array)), float(np.median(array))
+        std = math.nan if len(array) < 2 else math.inf if non_finite else float(np.std(array, ddof=1))
+    return Spread(mean, std, median, float(np.min(array)), len(array), non_finite)
+
+
+def mean_interval(values: Values, seeds: Labels, draws: Labels | None = None) -> Interval:
+    """The mean of the values of runs, with a confidence interval over seeds and draws of flights.
+
+    Runs of the same seed are related, and so are runs of the same draw. The variance is clustered both ways, V_seed +
+    V_draw − V_both (Cameron, Gelbach, Miller, "Robust inference with multiway clustering", 2011), but not below V_seed
+    or V_draw. With one draw the interval is Student's. An infinite value makes the mean infinite, for certain; one
+    seed bounds nothing.
+    """
+    array = np.asarray(values, float)
+    with np.errstate(invalid="ignore"):
+        mean = float(np.mean(array)) if len(array) else math.nan
+    ways = [list(seeds), list(seeds if draws is None else draws)]
+    clusters = [count for way in ways if (count := len(set(way))) > 1]
+    if len(set(ways[0])) < 2 or math.isnan(mean):
+        return Interval(mean)
+    if math.isinf(mean):
+        return Interval(mean, mean, mean)
+
+    def variance(labels: Labels) -> float:
+        sums = np.bincount(np.unique(labels, return_inverse=True)[1].ravel(), array - mean)
+        return 0.0 if len(sums) < 2 else float(sums @ sums) * len(sums) / (len(sums) - 1) / len(array) ** 2
+
+    one, other, both = map(variance, (*ways, np.arange(len(array))))
+    t = float(scipy.special.stdtrit(min(clusters) - 1, (1 + LEVEL) / 2))
+    half = t * math.sqrt(max(one + other - both, one, other))
+    return Interval(mean, mean - half, mean + half)
+
+
+def ratio_of_stds(first: Values, second: Values) -> Interval:
+    """The standard deviation of first over that of second, of the same seeds, with the interval of the test of Pitman
+    and Morgan (1939). An infinite value makes a standard deviation infinite."""
+    above, below = spread(first).std, spread(second).std
+    if math.isnan(above + below) or (above == below and above in (0.0, math.inf)):
+        return Interval()
+    if 0 in (above, below) or math.inf in (above, below):
+        ratio = math.inf if below == 0 or above == math.inf else 0.0
+        return Interval(ratio, ratio, ratio)
+    if len(first) < 3:
+        return Interval(above / below)
+    t, freedom = float(scipy.special.stdtrit(len(first) - 2, (1 + LEVEL) / 2)), len(first) - 2
+    k = 1 + 2 * max(0.0, 1 - float(np.corrcoef(first, second)[0, 1]) ** 2) * t**2 / freedom
+    reach = math.sqrt(k + math.sqrt(k * k - 1))
+    return Interval(above / below, above / below / reach, above / below * reach)
+
+
+def share_of_gap(before: Values, after: Values, reachable: Values, level: float = LEVEL) -> Interval:
+    """(before − after) / (before − reachable), of the means over the seeds where all three are finite.
+
+    1 closes the gap between before and what is reachable, 0 none of it. The interval is Fieller's ("Some problems in
+    interval estimation", 1954): all shares s for which a paired t test does not reject (before − after) =
+    s (before − reachable). It has no ends if the gap is not significant, and no value if there is no gap.
+    """
+    start, end, best = _finite(before, after, reachable)
+    closed, gap = start - end, start - best
+    if len(gap) == 0 or gap.mean() <= 0:
+        return Interval()
+    value = float(closed.mean() / gap.mean())
+    if len(gap) < 2:
+        return Interval(value)
+    t = float(scipy.special.stdtrit(len(gap) - 1, (1 + level) / 2))
+    covariance = np.cov(closed, gap) * t**2 / len(gap)
+    a = gap.mean() ** 2 - covariance[1, 1]
+    b = closed.mean() * gap.mean() - covariance[0, 1]
+    c = closed.mean() ** 2 - covariance[0, 0]
+    if a <= 0:
+        return Interval(value)
+    half = math.sqrt(max(b * b - a * c, 0.0))
+    return Interval(value, float((b - half) / a), float((b + half) / a))
+
+
+def _finite(*samples: Values) -> list[np.ndarray]:
+    """The samples at the seeds where all are finite."""
+    arrays = [np.asarray(sample, float) for sample in samples]
+    if len({array.shape for array in arrays}) > 1:
+        raise ValueError(f"the samples must be of the same seeds, got {', '.join(str(a.shape) for a in arrays)}")
+    kept = np.all(np.isfinite(arrays), axis=0)
+    return [array[kept] for array in arrays]
