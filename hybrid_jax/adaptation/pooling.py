@@ -50,7 +50,9 @@ def combined(
 ) -> tuple[float, float]:
     """The mean of m estimates and the half-width of its interval, given the variance of each (Rubin, Eq. 3.1.2–8).
 
-    The variances have some degrees of freedom (Barnard and Rubin, Biometrika 1999).
+    The variances have some degrees of freedom (Barnard and Rubin, Biometrika 1999). Where the variance between the
+    estimates is nearly all of the total, their rule gives fewer degrees than the m - 1 of that variance alone, which is
+    then known better than it says: the larger of both is taken, and no more than there are within.
     """
     m = len(estimates)
     between = (1 + 1 / m) * np.var(estimates, ddof=1)
@@ -59,9 +61,8 @@ def combined(
     # Inverse degrees of freedom of the variance between the estimates, and of that within.
     ours = share**2 / (m - 1)
     own = (degrees + 3) / (degrees + 1) / degrees / (1 - share) if np.isfinite(degrees) and share < 1 else 0.0
-    quantile = (1 + level) / 2
-    reach = scipy.stats.t.ppf(quantile, 1 / (ours + own)) if ours + own > 0 else scipy.stats.norm.ppf(quantile)
-    return float(np.mean(estimates)), float(reach * np.sqrt(total))
+    freedom = max(1 / (ours + own), min(m - 1, degrees)) if ours + own > 0 else np.inf
+    return float(np.mean(estimates)), float(scipy.stats.t.ppf((1 + level) / 2, freedom) * np.sqrt(total))
 
 
 def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:

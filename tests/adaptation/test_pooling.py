@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy
 from pendulum import LENGTH, pendulum, swings
 from test_least_squares import Push, pushes
 
@@ -58,6 +59,13 @@ def test_few_degrees_of_freedom_widen_the_interval():
     """Of equal estimates it is Student's, but for the correction of Barnard and Rubin."""
     wide, narrow = (combined(np.full(3, 2.0), np.full(3, 0.25), degrees=degrees)[1] for degrees in (9, np.inf))
     assert 2.26 / 1.96 * narrow < wide < 1.4 * narrow
+
+
+def test_estimates_that_disagree_are_known_as_well_as_their_own_variance():
+    """Hardly any variance within: it is Student's interval of the estimates alone, also with few blocks of windows."""
+    estimates = np.array([1.0, 2.0, 3.0])
+    _, away = combined(estimates, np.full(3, 1e-9), degrees=9)
+    assert away == pytest.approx(scipy.stats.t.ppf(0.975, 2) * np.sqrt(4 / 3), rel=1e-6)
 
 
 def test_windows_that_touch_are_one_cluster():
