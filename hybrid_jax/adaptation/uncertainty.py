@@ -73,15 +73,16 @@ def covariance_of(
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
         kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
             sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
-            within one may be correlated and of any unit (Huber 1967; White 1980; for clusters Liang and Zeger 1986; the
-            factor is MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
+            within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
+            MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
         chunk: windows that are held in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
         scale: divides the error of each state, as in `fit_least_squares`.
         free: which parameters were fitted, all by default; the others are known and have no variance.
-        cluster: so many consecutive windows may be correlated, as those of one flight are; with the sandwich their
-            J_iᵀr_i are summed before they enter M (Liang and Zeger 1986), and intervals need Student's t.
+        cluster: so many consecutive windows may be correlated, as those of one flight are. The sandwich is then the
+            jackknife that leaves one cluster out at a time, as the sandwich of summed J_iᵀr_i is too narrow for few
+            clusters (CV3 of MacKinnon, Nielsen and Webb, J. Applied Econometrics 2023), and intervals need Student's t.
 
     Raises:
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
@@ -112,9 +113,14 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
     if kind == "homoscedastic":
         return jnp.sum(square) / (n * entries - p) * bread
     if cluster > 1:
-        clusters = -(-n // cluster)
-        score = jax.ops.segment_sum(score, np.arange(n) // cluster, clusters)
-        score = jnp.sqrt(clusters / (clusters - 1) * (n - 1) / n) * score
+        clusters, of = -(-n // cluster), np.arange(n) // cluster
+        gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
+        # What leaving a cluster out does to θ_p.
+        moves = jnp.einsum(
+            "gpq,gq->gp", jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram), score - jnp.mean(score, axis=0)
+        )
+        moves = moves - jnp.mean(moves, axis=0)
+        return (clusters - 1) / clusters * moves.T @ moves
     half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
     return n / (n - p) * half.T @ half
 

@@ -86,6 +86,17 @@ def test_windows_that_touch_are_one_cluster():
     assert np.mean(held[1]) < np.mean(held[10])
 
 
+def test_the_variance_of_clusters_is_that_of_leaving_each_out():
+    """Of a linear model, fitted anew without each of four clusters of different sizes."""
+    windows, design = pushes(35, noise=0.1)
+    of = np.arange(35) // 10
+    field = hj.fit_least_squares(Push(np.zeros(2, np.float32)), windows).field
+    data = np.asarray(windows.x).reshape(35, -1)
+    refits = [np.linalg.lstsq(design[of != g].reshape(-1, 2), data[of != g].ravel())[0] for g in range(4)]
+    expected = 3 * np.cov(np.array(refits).T, ddof=0)
+    np.testing.assert_allclose(hj.covariance_of(field, windows, cluster=10), expected, rtol=1e-3)
+
+
 def _drifted(u):
     reached = 0.1 * np.cumsum(u, axis=1)
     return np.stack([3.0 * reached[..., 0] - 2.0 * reached[..., 1], 3.0 * 0 + -2.0 * reached[..., 0]], -1)
