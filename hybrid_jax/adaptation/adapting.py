@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from dataclasses import field as attribute
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -24,7 +25,7 @@ from hybrid_jax.dynamics.corrected_body import simplified
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
 from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
-from hybrid_jax.integrate import checked
+from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.training.channels import scaled_loss
@@ -194,13 +195,13 @@ def adapt(
     choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
     exact = exact and int(solution.status) != DIVERGED and choice.get("chosen") not in NETWORKS
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
-    found, mse = disturbance_of(adapted), eqx.filter_jit(rollout_mse)
+    found, mse = disturbance_of(adapted), eqx.filter_jit(partial(rollout_mse, solver=compact(settings.solver)))
     return Adaptation(
         field=adapted,
         method=name,
         disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
-        mse_before=float(mse(field, windows, solver=settings.solver)),
-        mse_after=float(mse(adapted, windows, solver=settings.solver)),
+        mse_before=float(mse(field, windows)),
+        mse_after=float(mse(adapted, windows)),
         windows=len(windows),
         steps=int(solution.steps),
         status=STATUS[int(solution.status)],

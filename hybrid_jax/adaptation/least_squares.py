@@ -18,7 +18,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
-from hybrid_jax.integrate import rollout
+from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
@@ -114,24 +114,24 @@ def fit_free(
     def theta_at(z: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
 
-    def objective(z: Theta, _) -> Float[Array, "n t d"]:
-        return (residuals(theta_at(z)) / (size * DAMPING**0.5)).astype(z.dtype)
+    def objective(z: Theta, _) -> tuple[Float[Array, "n t d"], Float[Array, ""]]:
+        found = residuals(theta_at(z))
+        return (found / (size * DAMPING**0.5)).astype(z.dtype), mse(found)
 
     tolerance = float(jnp.finfo(start.dtype).eps) ** 0.75
     found = optimistix.least_squares(
         objective,
         _LevenbergMarquardt(tolerance, tolerance),  # pyright: ignore[reportCallIssue]
         jnp.zeros(start.shape),  # of JAX's default precision, as the solver's own numbers are
+        has_aux=True,
         options={"jac": "fwd"},
         max_steps=max_steps,
         throw=False,
     )
-    theta = theta_at(found.value)
-    reached = mse(residuals(theta))
-    finite = jnp.isfinite(reached)
+    finite = jnp.isfinite(found.aux)
     return LeastSquaresFit(
-        field=unravel(jnp.where(finite, theta, start)),
-        mse=jnp.where(finite, reached, mse(at_start)),
+        field=unravel(jnp.where(finite, theta_at(found.value), start)),
+        mse=jnp.where(finite, found.aux, mse(at_start)),
         steps=jnp.asarray(found.stats["num_steps"], jnp.int32),
         converged=(found.result == optimistix.RESULTS.successful) & finite,
     )
@@ -151,7 +151,7 @@ def prediction_errors(
     field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
     """(x_t − x̂_t) / scale of one window, x̂ in inference mode."""
-    errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, solver)
+    errors = jnp.asarray(window.x) - rollout(field, window.x0, window.u, window.dt, compact(solver))
     return errors if scale is None else (errors / scale).astype(errors.dtype)
 
 

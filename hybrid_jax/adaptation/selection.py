@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_free, ravel_parameters
 from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverse, masked, normal_equations
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.integrate import rollout
+from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.trajectories import Trajectories
 
 BLOCKS = 10
@@ -111,11 +111,11 @@ def predict_block(
         end, recorded = carry
         window, counted, i = item
         touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
-        predicted = rollout(field, jnp.where(touches, end, window.x0), window.u, block.dt, solver)
-        alone = rollout(field, window.x0, window.u, block.dt, solver)[-1]
+        starts = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
+        alone, predicted = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver)))(starts)
         difference = predicted - window.x if scale is None else (predicted - window.x) / scale
         error = jnp.mean(jnp.sum(jnp.square(difference), axis=-1))
-        ends = jnp.square(jnp.stack([alone, predicted[-1]]) - window.x[-1])
+        ends = jnp.square(jnp.stack([alone[-1], predicted[-1]]) - window.x[-1])
         return (predicted[-1], window.x[-1]), (jnp.where(counted, error, 0.0), ends, touches)
 
     start = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
