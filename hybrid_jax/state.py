@@ -1,7 +1,7 @@
-"""Where each quantity of a multirotor sits in its state x (13) and input u (4).
+"""Where each quantity of a multirotor sits in its state x (13) and input u (one for each rotor).
 
 x = [p, q, v, ω]: position p [m, world frame, z up]; unit quaternion q = (w, x, y, z), body → world; velocity
-v [m/s, world frame]; body rates ω [rad/s, body frame: x forward, y left, z up]. u: the four rotor speeds [rad/s].
+v [m/s, world frame]; body rates ω [rad/s, body frame: x forward, y left, z up]. u: the rotor speeds [rad/s].
 """
 
 from jaxtyping import Array, Float
@@ -12,9 +12,14 @@ VELOCITY = slice(7, 10)
 BODY_RATES = slice(10, 13)
 
 STATE_NAMES = ("px", "py", "pz", "qw", "qx", "qy", "qz", "vx", "vy", "vz", "wx", "wy", "wz")
-INPUT_NAMES = ("u0", "u1", "u2", "u3")
+INPUT_NAMES = ("u0", "u1", "u2", "u3")  # of a quadrotor; see `input_names`
 STATE_SIZE = len(STATE_NAMES)
 INPUT_SIZE = len(INPUT_NAMES)
 
 State = Float[Array, "13"]
-Input = Float[Array, "4"]  # rad/s
+Input = Float[Array, " rotors"]  # rad/s
+
+
+def input_names(rotors: int) -> tuple[str, ...]:
+    """u0, u1, …"""
+    return tuple(f"u{i}" for i in range(rotors))

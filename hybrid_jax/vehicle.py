@@ -1,4 +1,4 @@
-"""The constants of a quadrotor: mass, geometry and nominal coefficients, and their TOML file."""
+"""The constants of a multirotor: mass, geometry and nominal coefficients, and their TOML file."""
 
 import math
 import tomllib
@@ -10,11 +10,12 @@ from typing import Any, TypeVar
 from hybrid_jax import checks
 
 T = TypeVar("T")
+FEWEST_ROTORS, MOST_ROTORS = 3, 12
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The constants of a quadrotor, body frame x forward, y left, z up; ValueError unless positive and finite."""
+    """The constants of a multirotor, body frame x forward, y left, z up; ValueError unless positive and finite."""
 
     mass: float  # kg
     inertia: tuple[float, float, float]  # principal moments (Ix, Iy, Iz), kg m²
@@ -29,10 +30,14 @@ class Vehicle:
 
     def __post_init__(self):
         require_numbers("inertia", self.inertia, (3,), "a tuple of three moments (Ix, Iy, Iz)")
-        require_numbers("rotor_positions", self.rotor_positions, (4, 2), "a tuple of four pairs (x, y) [m]")
-        require_numbers("spin", self.spin, (4,), "a tuple of four signs +1 or -1")
+        n = len(self.rotor_positions) if isinstance(self.rotor_positions, tuple) else 0
+        pairs = f"a tuple of {FEWEST_ROTORS} to {MOST_ROTORS} pairs (x, y) [m], one for each rotor"
+        rotors = n if FEWEST_ROTORS <= n <= MOST_ROTORS else FEWEST_ROTORS
+        require_numbers("rotor_positions", self.rotor_positions, (rotors, 2), pairs)
+        signs = f"a tuple of {n} signs +1 or -1, one for each of rotor_positions"
+        require_numbers("spin", self.spin, (n,), signs)
         if any(abs(sign) != 1 for sign in self.spin):
-            raise ValueError(f"spin must be a tuple of four signs +1 or -1, got {checks.short_repr(self.spin)}")
+            raise ValueError(f"spin must be {signs}, got {checks.short_repr(self.spin)}")
         positive = ("mass", "thrust_coefficient", "torque_coefficient", "max_rotor_speed", "gravity")
         numbers = {name: getattr(self, name) for name in (*positive, "rotor_radius")}
         moments = zip(("Ix", "Iy", "Iz"), self.inertia, strict=True)
@@ -43,9 +48,14 @@ class Vehicle:
             raise ValueError(f"name must be text, got {checks.short_repr(self.name)}")
 
     @property
+    def rotors(self) -> int:
+        """How many there are."""
+        return len(self.rotor_positions)
+
+    @property
     def hover_speed(self) -> float:
-        """The rotor speed [rad/s] at which four equal rotors carry the weight."""
-        return math.sqrt(self.mass * self.gravity / (4 * self.thrust_coefficient))
+        """The rotor speed [rad/s] at which equal rotors carry the weight."""
+        return math.sqrt(self.mass * self.gravity / (self.rotors * self.thrust_coefficient))
 
 
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:

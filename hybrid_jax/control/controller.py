@@ -20,7 +20,7 @@ from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_pena
 from hybrid_jax.control.sensitivities import advance, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
-from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, Input, State
+from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vehicle import Vehicle
 
 VARIABLE_BOUND = 3.0  # there tanh is within 0.5 % of its limit, and its slope is still 1 %
@@ -36,7 +36,7 @@ ATTITUDE_GAIN, RATE_GAIN = 30.0, 10.0
 class Plan(eqx.Module):
     """State of the controller between calls."""
 
-    variables: Float[Array, "t 4"]  # tanh maps them to shares of the rotor speeds' range, held over each interval
+    variables: Float[Array, "t rotors"]  # tanh maps them to shares of the rotor speeds' range, held over each interval
     cost: Scalar  # predicted by the controller's model
     damping: Scalar  # of the best Gauss–Newton step
 
@@ -104,10 +104,10 @@ class Controller:
         middle, half = self._range()
         hover = math.atanh((self.vehicle.hover_speed - middle) / half)
         # With the dtype of later plans, or the second call would compile again.
-        variables = jnp.full((self.steps, INPUT_SIZE), hover, float)
+        variables = jnp.full((self.steps, self.vehicle.rotors), hover, float)
         return Plan(variables, jnp.asarray(jnp.inf, float), jnp.asarray(INITIAL_DAMPING, float))
 
-    def speeds(self, plan: Plan) -> Float[Array, "t 4"]:
+    def speeds(self, plan: Plan) -> Float[Array, "t rotors"]:
         """The rotor speeds [rad/s] of a plan, within the limits."""
         return self._speeds(jnp.tanh(plan.variables))
 
@@ -142,8 +142,8 @@ class Controller:
             raise ValueError(f"model must be a vector field, got {checks.short_repr(model)}")
         if not isinstance(plan, Plan):
             raise ValueError(f"plan must be begin() or that of the last call, got {checks.short_repr(plan)}")
-        if plan.variables.shape != (self.steps, INPUT_SIZE):
-            raise ValueError(f"plan must have variables of shape ({self.steps}, 4), got {plan.variables.shape}")
+        if plan.variables.shape != (shape := (self.steps, self.vehicle.rotors)):
+            raise ValueError(f"plan must have variables of shape {shape}, got {plan.variables.shape}")
         x, reference, plan = checked_states("x", x, reference, plan, self.steps)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
@@ -180,7 +180,7 @@ class Controller:
         best = jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, costs, states))
         return Plan(best[0], best[1], plan.damping), best[2]
 
-    def _recovery(self, wanted: State, x: State) -> Float[Array, "4"]:
+    def _recovery(self, wanted: State, x: State) -> Float[Array, " rotors"]:
         """Decision variables for hover thrust and −30 φ − 10 (ω − ω_ref) [rad/s²], φ the attitude error.
 
         After a large initial rate the shifted plan may contain a full roll, at a hundred times the least cost, and
@@ -193,15 +193,15 @@ class Controller:
         wrench = jnp.concatenate([weight, jnp.asarray(vehicle.inertia, x.dtype) * acceleration])
         px, py = np.array(vehicle.rotor_positions).T
         k, c_m = vehicle.thrust_coefficient, vehicle.torque_coefficient
-        mixer = np.stack([k * np.ones(4), k * py, -k * px, c_m * np.array(vehicle.spin)])
-        squares = jnp.asarray(np.linalg.pinv(mixer), x.dtype) @ wrench
+        mixer = np.stack([k * np.ones(len(px)), k * py, -k * px, c_m * np.array(vehicle.spin)])[: len(px)]
+        squares = jnp.asarray(np.linalg.pinv(mixer), x.dtype) @ wrench[: len(px)]  # three rotors leave yaw alone
         share = (jnp.sqrt(jnp.maximum(squares, 0.0)) - middle) / half
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 
-    def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, "4"]) -> State:
+    def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, " rotors"]) -> State:
         return advance(model, x, self._speeds(jnp.tanh(variables)), self.interval, self.unit_quaternion)
 
-    def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t 4"]) -> Scalar:
+    def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t rotors"]) -> Scalar:
         return plan_cost(self.weights, reference, states, jnp.tanh(variables))
 
     def _improve(self, model, reference, x: State, point: _Point) -> _Point:
@@ -232,7 +232,7 @@ class Controller:
         converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + plan.cost)
         return Plan(best.variables, best.cost, jnp.where(converged, INITIAL_DAMPING, best.damping)), states
 
-    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], variables: Float[Array, "t 4"]):
+    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], variables: Float[Array, "t rotors"]):
         """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the decision variables."""
         factor = stage_factors(self.weights, self.steps)
         weighted = partial(deviations, self.weights)
@@ -245,7 +245,7 @@ class Controller:
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         changes = input_rate_penalty(self.weights, self.steps)
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)
-        between = changes[:, None, :, None] * jnp.eye(INPUT_SIZE)[:, None, :] * slope[:, :, None, None] * slope
+        between = changes[:, None, :, None] * jnp.eye(self.vehicle.rotors)[:, None, :] * slope[:, :, None, None] * slope
         return slopes.T @ slopes + between.reshape(variables.size, variables.size), gradient
 
 

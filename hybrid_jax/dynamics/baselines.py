@@ -27,7 +27,7 @@ class Kinematics(AbstractVectorField):
 
     accepts_batch: ClassVar[bool] = True
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         accelerations = jnp.zeros((6, *x.shape[1:]), x.dtype)
         return jnp.concatenate([x[VELOCITY], rotation.derivative(x[QUATERNION], x[BODY_RATES]), accelerations])
 

@@ -123,7 +123,7 @@ def is_present(term, absent: float = 0.0) -> bool:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
-def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "4 b"]):
+def evaluate_columns(of_rows: Callable, theta: PyTree, x: Float[Array, "13 b"], u: Float[Array, "rotors b"]):
     """`of_rows(theta, x, u)` on a minibatch, for scalar parameters.
 
     Autodiff would keep some thirty rows of each evaluation for the way back and sum each parameter's derivative over

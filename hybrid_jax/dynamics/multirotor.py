@@ -9,7 +9,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics import equations
 from hybrid_jax.dynamics.rigid_body import LEARNED, AbstractRigidBody
-from hybrid_jax.dynamics.terms import POSITIVE, SHAPES, Terms, check_names, nominal_values, units_of
+from hybrid_jax.dynamics.terms import POSITIVE, Terms, check_names, nominal_values, shape_of, units_of
 from hybrid_jax.rotation import Rows
 from hybrid_jax.state import POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -21,8 +21,8 @@ class Multirotor(AbstractRigidBody):
         ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
         m f = C (τ_y, −τ_x, 0) − D Rᵀv,   E = diag(1, 1, 0)
 
-    T and τ are thrust and torque of the four rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k
-    or four, and G scales the torque where the speeds do not tell it. Rotor drag D, the moment A and the damping B:
+    T and τ are thrust and torque of the rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k or
+    one for each, and G scales the torque where the speeds do not tell it. Rotor drag D, the moment A and the damping B:
     Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for accurate
     tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C below the
     centre of mass: the state does not hold the load's position, but the torque that balances its moment reveals it.
@@ -37,7 +37,7 @@ class Multirotor(AbstractRigidBody):
     of each window.
 
     Attributes:
-        deviations: of each learned parameter, by name; shapes as in `SHAPES`.
+        deviations: of each learned parameter, by name; shapes as of `shape_of`.
         terms: nominal values; those that are zero and not learned cost nothing.
 
     Raises:
@@ -65,7 +65,7 @@ class Multirotor(AbstractRigidBody):
 
         return {name: value(name, deviation) for name, deviation in self.deviations.items()}
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         return equations.derivative(self.vehicle, self.terms, self.entries(), tuple(x), tuple(u))
 
     def train_batch(self, x, u):
@@ -90,7 +90,8 @@ class Multirotor(AbstractRigidBody):
 def multirotor(vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None) -> Multirotor:
     """The multirotor at its nominal values, which learns the parameters named in `learn`; see `check_names`."""
     check_names(tuple(learn))
-    return Multirotor({name: jnp.zeros(SHAPES[name]) for name in learn}, vehicle, Terms() if terms is None else terms)
+    deviations = {name: jnp.zeros(shape_of(vehicle, name)) for name in learn}
+    return Multirotor(deviations, vehicle, Terms() if terms is None else terms)
 
 
 def with_vehicle(field: Multirotor, vehicle: Vehicle) -> Multirotor:
@@ -108,4 +109,4 @@ def with_vehicle(field: Multirotor, vehicle: Vehicle) -> Multirotor:
 
 
 def _nominal(vehicle: Vehicle, terms: Terms, name: str, dtype) -> Array:
-    return jnp.reshape(jnp.asarray(nominal_values(vehicle, terms)[name], dtype), SHAPES[name])
+    return jnp.reshape(jnp.asarray(nominal_values(vehicle, terms)[name], dtype), shape_of(vehicle, name))

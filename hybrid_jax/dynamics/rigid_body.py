@@ -1,4 +1,4 @@
-"""f_p: the Newton–Euler equations of a quadrotor with unknown Ix, Iy and k (paper, Eq. 10)."""
+"""f_p: the Newton–Euler equations of a multirotor with unknown Ix, Iy and k (paper, Eq. 10)."""
 
 from abc import abstractmethod
 from typing import ClassVar
@@ -37,7 +37,7 @@ class AbstractRigidBody(AbstractVectorField):
 
 
 class RigidBody(AbstractRigidBody):
-    """A rigid body carried by four rotors, with no drag, ground effect or wind.
+    """A rigid body carried by its rotors, with no drag, ground effect or wind.
 
     θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
 
@@ -56,7 +56,7 @@ class RigidBody(AbstractRigidBody):
         """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
         return {name: value * jnp.exp(self.log_ratios[name]) for name, value in nominal(self.vehicle).items()}
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         return self.of_rows(tuple(x), tuple(u))
 
     def train_batch(self, x, u):

@@ -12,7 +12,7 @@ SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as m
 POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
-SHAPES = POSITIVE | SIGNED  # of all learnable parameters
+SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
 Three = tuple[float, float, float]
 NONE = (0.0, 0.0, 0.0)
 
@@ -53,10 +53,15 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
         raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
 
 
+def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:
+    """The shape of a learnable parameter of this vehicle."""
+    return (vehicle.rotors,) if name == "k_rotors" else SHAPES[name]
+
+
 def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
     """The nominal value of everything in `SHAPES`, number by number; SI units."""
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
-    own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * 4}
+    own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
@@ -64,7 +69,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
 def units_of(vehicle: Vehicle) -> dict[str, float]:
     """What a deviation of 1 is in SI units: forces and moments in the vehicle's weight and weight × arm."""
     weight = vehicle.mass * vehicle.gravity
-    arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / 4
+    arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
     places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
     return forces | places | dict.fromkeys(("torque_gain", "velocity_gain", "velocity_lag"), 1.0)

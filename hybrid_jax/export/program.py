@@ -11,7 +11,7 @@ import jax.numpy as jnp
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
-from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
 Size = int | None  # d or m; by default what the field knows
@@ -52,8 +52,8 @@ def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
 
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
     """Those of the outermost module in a tree that knows them."""
-    if isinstance(getattr(tree, "vehicle", None), Vehicle):
-        return STATE_SIZE, INPUT_SIZE
+    if isinstance(vehicle := getattr(tree, "vehicle", None), Vehicle):
+        return STATE_SIZE, vehicle.rotors
     if isinstance(tree, eqx.Module) and hasattr(tree, "state_size") and hasattr(tree, "input_size"):
         return tree.state_size, tree.input_size  # pyright: ignore[reportAttributeAccessIssue]
     children = jax.tree.leaves(tree, is_leaf=lambda node: node is not tree)

@@ -8,7 +8,7 @@ import scipy  # not scipy.signal, which takes a second: it is imported where it 
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.log import GAP, FlightLog, at_rest, even_segments, repeats, runs_of, segments
 from hybrid_jax.flights.readings import respond
-from hybrid_jax.state import QUATERNION
+from hybrid_jax.state import QUATERNION, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
 TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
@@ -80,7 +80,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
             both, _ = scipy.signal.sosfilt(sections, both, axis=0, zi=start)
         else:
             both = scipy.signal.sosfiltfilt(sections, both, axis=0, padlen=min(9, len(both) - 1))
-        x[part], u[part] = both[:, :-4], np.maximum(both[:, -4:], 0.0)
+        x[part], u[part] = both[:, :STATE_SIZE], np.maximum(both[:, STATE_SIZE:], 0.0)
     x[:, QUATERNION] /= np.linalg.norm(x[:, QUATERNION], axis=1, keepdims=True)
     phase = f"causal, {1000 * np.sqrt(2) / (2 * np.pi * cutoff):.1f} ms late" if causal else "zero phase"
     done = f"low-pass of second order at {cutoff:g} Hz, {phase}, states and motors"

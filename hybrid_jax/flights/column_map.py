@@ -22,7 +22,7 @@ from jaxtyping import Float
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
 from hybrid_jax.flights.flight_csv import flight_log, read_table
 from hybrid_jax.flights.log import FlightLog, wrong_norms
-from hybrid_jax.vehicle import from_table, read_tables, require_known
+from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
 
 SCALES = {
     "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
@@ -32,7 +32,7 @@ SCALES = {
     "body_rates": {"rad/s": 1.0, "deg/s": math.pi / 180},
     "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0},
 }
-COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "motors": 4}
+COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3}
 
 
 @dataclass(frozen=True)
@@ -143,6 +143,8 @@ def _check(name: str, stated: Columns) -> None:
     if stated.unit not in tuple(SCALES[name]):
         raise ValueError(f"[{name}]: unit must be one of {', '.join(SCALES[name])}, got {stated.unit!r}")
     columns, count = stated.columns, COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
+    if name == "motors" and isinstance(columns, tuple):
+        count = min(max(len(columns), FEWEST_ROTORS), MOST_ROTORS)
     named = isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)
     if not named or len(columns) != count:
         raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")

@@ -12,9 +12,9 @@ from jaxtyping import Float
 
 from hybrid_jax.flights import readings
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.log import COLUMNS, FlightLog, at_rest, gaps, repeats, sound_intervals
+from hybrid_jax.flights.log import FlightLog, at_rest, gaps, repeats, sound_intervals
 from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
-from hybrid_jax.state import QUATERNION, VELOCITY
+from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import Vehicle
 
 OK, FAILS, UNKNOWN = "ok", "fails", "cannot tell"
@@ -56,8 +56,10 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     """Run all checks of a log against itself and its vehicle.
 
     Raises:
-        ValueError: fewer than two samples.
+        ValueError: fewer than two samples, or another number of motors than the vehicle has.
     """
+    if log.u.shape[1] != vehicle.rotors:
+        raise ValueError(f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}")
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
@@ -113,7 +115,8 @@ def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
 def _columns(log: FlightLog) -> Check:
     """Check for equal motors and constant columns: a column was read twice or not recorded."""
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
-    columns: dict[str, np.ndarray] = dict(zip(COLUMNS[-len(values) :], values, strict=True))
+    names = (*STATE_NAMES[VELOCITY.start :], *input_names(log.u.shape[1]))
+    columns: dict[str, np.ndarray] = dict(zip(names, values, strict=True))
     moving = [name for name, values in columns.items() if (values != values[0]).any()]
     kinds = {name[0] for name in moving}  # v, w, u: a vehicle at rest does not change any of a kind
     alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
@@ -131,10 +134,11 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         correlated = (order, value, "correlation", ORDER_LIMIT), (spin, math.nan, "correlation", 0.0)
         return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (gyro, math.nan, "ms", limit))]
     columns = " ".join(f"u{motor}" for motor in found.order)
-    advice = f"reorder the motors: the vehicle's rotors 0 1 2 3 are {columns}"
+    rotors = " ".join(map(str, range(vehicle.rotors)))
+    advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}"
     yaw = found.yaw_sign * found.correlations[2]
-    if sum(vehicle.spin):
-        turning = FAILS, "the vehicle would turn in hover: two of its rotors must spin each way"
+    if abs(sum(vehicle.spin)) > 1:
+        turning = FAILS, "the vehicle would turn in hover: half of its rotors must spin each way"
     elif yaw < OPPOSED:
         turning = FAILS, "flip the sign of every spin of the vehicle"
     else:

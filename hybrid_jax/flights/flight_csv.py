@@ -16,10 +16,12 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import rates_between
 from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
-from hybrid_jax.state import BODY_RATES, QUATERNION
+from hybrid_jax.state import BODY_RATES, QUATERNION, input_names
+from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
 BLOCK = 1 << 22  # characters read at once
 MAX_ROW_LENGTH = 1 << 16
+FURTHER = input_names(MOST_ROTORS)[FEWEST_ROTORS:]
 MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
 
 
@@ -29,11 +31,11 @@ def read_csv(path: str | Path, *, max_rows: int = MAX_ROWS) -> FlightLog:
     Raises:
         ValueError: file, row (the first line is row 1), field and what to do, in one line.
     """
-    return flight_log(path, read_table(path, COLUMNS, max_rows=max_rows))
+    return flight_log(path, read_table(path, COLUMNS[:-1], max_rows=max_rows, further=FURTHER))
 
 
-def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
-    """Check the table of a file, in the order of `COLUMNS`; row i + 2 of the file holds table[i]."""
+def flight_log(path: str | Path, table: Float[np.ndarray, "n c"]) -> FlightLog:
+    """Check the table of a file, in the order of `COLUMNS`, of any rotors; row i + 2 of the file holds table[i]."""
     parts = table[:, 0], table[:, 1:14], table[:, 14:]
     require_possible(*parts, path, "row", 2)
     log = FlightLog(*parts, str(path))
@@ -42,9 +44,12 @@ def flight_log(path: str | Path, table: Float[np.ndarray, "n 18"]) -> FlightLog:
 
 
 def read_table(
-    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", max_rows: int = MAX_ROWS
+    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", max_rows=MAX_ROWS, further: Sequence[str] = ()
 ) -> Float[np.ndarray, "n c"]:
     """Read the named columns of a CSV file with a header, in the given order; all numbers must be finite.
+
+    Args:
+        further: columns that are read, too, up to the last of them that the file has.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
@@ -54,7 +59,7 @@ def read_table(
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             text = io.TextIOWrapper(gzip.GzipFile(fileobj=file) if packed else file, encoding="utf-8-sig")
-            parts = list(_parts(path, text, columns, delimiter, max_rows))
+            parts = list(_parts(path, text, columns, delimiter, max_rows, further))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
@@ -66,9 +71,10 @@ def read_table(
     return np.concatenate(parts)
 
 
-def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int) -> Iterator[Float[np.ndarray, "n c"]]:
+def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int, further) -> Iterator[Float[np.ndarray, "n c"]]:
     header = text.readline(MAX_ROW_LENGTH)
     names = [name.strip() for name in header.split(delimiter)]
+    columns = [*columns, *further[: max((i + 1 for i, name in enumerate(further) if name in names), default=0)]]
     for name in columns:
         if names.count(name) != 1:
             raise ValueError(_header_complaint(path, name, names, header))

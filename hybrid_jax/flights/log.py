@@ -6,10 +6,11 @@ from dataclasses import dataclass, field
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, QUATERNION, STATE_NAMES, STATE_SIZE
+from hybrid_jax.state import INPUT_NAMES, QUATERNION, STATE_NAMES, STATE_SIZE, input_names
+from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
-COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)
+COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
 GAP = 1.5  # intervals longer than this many times the median are gaps
 IDLE = 0.3  # share of the thrust in flight below which a vehicle is on the ground
 JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
@@ -32,13 +33,15 @@ class FlightLog:
 
     t: Float[np.ndarray, " n"] = field(repr=False)
     x: Float[np.ndarray, "n 13"] = field(repr=False)
-    u: Float[np.ndarray, "n 4"] = field(repr=False)
+    u: Float[np.ndarray, "n rotors"] = field(repr=False)
     name: str = "flight"
 
     def __post_init__(self):
         t, x, u = (np.array(array, float) for array in (self.t, self.x, self.u))
-        if t.ndim != 1 or x.shape != (len(t), STATE_SIZE) or u.shape != (len(t), INPUT_SIZE):
-            raise ValueError(f"{self.name}: t, x, u must be (n,), (n, 13), (n, 4), got {t.shape}, {x.shape}, {u.shape}")
+        rotors = u.shape[-1] if u.ndim == 2 and FEWEST_ROTORS <= u.shape[-1] <= MOST_ROTORS else len(INPUT_NAMES)
+        if t.ndim != 1 or x.shape != (len(t), STATE_SIZE) or u.shape != (len(t), rotors):
+            shapes = f"(n,), (n, 13), (n, {FEWEST_ROTORS} … {MOST_ROTORS})"
+            raise ValueError(f"{self.name}: t, x, u must be {shapes}, got {t.shape}, {x.shape}, {u.shape}")
         require_possible(t, x, u, self.name)
         x[:, QUATERNION] = _canonical(x[:, QUATERNION])
         for name, array in (("t", t), ("x", x), ("u", u)):
@@ -77,7 +80,8 @@ def require_possible(t, x, u, origin, unit: str = "sample", first: int = 0) -> N
 
 def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     """Impossible values: index of the sample, field and what to do."""
-    for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (INPUT_NAMES, u)):
+    rotors = input_names(u.shape[1])
+    for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (rotors, u)):
         for row, column in np.argwhere(~np.isfinite(block))[:1].tolist():
             yield row, names[column], f"is {block[row, column]}; cut the sample out (it becomes a gap) or repair it"
     # Compare, as a difference of finite times may overflow.
@@ -88,7 +92,7 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
         advice = "cut out samples without an attitude" if norm == 0 else "are these the four quaternion columns?"
         yield row, "qw qx qy qz", f"norm is {norm:.4g}, not 1; {advice}"
     for row, column in np.argwhere(u < 0)[:1].tolist():
-        yield row, INPUT_NAMES[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
+        yield row, rotors[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
 
 
 def wrong_norms(q: Float[np.ndarray, "n 4"]) -> list[tuple[int, float]]:

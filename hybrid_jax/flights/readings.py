@@ -3,11 +3,12 @@
 From angular acceleration and motors `respond` estimates the order of the motors, their direction of spin and their lag.
 """
 
-from itertools import permutations
+from functools import cache
+from itertools import combinations, permutations
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 from scipy.spatial.transform import Rotation
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
@@ -26,7 +27,7 @@ LONGEST_LAG = 0.1  # s, either way
 # and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s
 YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
-ORDERS = np.array(list(permutations(range(4))))
+PERMUTED = 6  # rotors at most of which all orders are tried: 720; of more, those with two exchanged
 
 Vectors = Float[np.ndarray, "n 3"]
 Readings = dict[str, tuple[Vectors, Vectors]]
@@ -146,26 +147,38 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     sign = -1 if yaw < 0 else 1
     found = [*table[at, best, :2].tolist(), float(abs(yaw))]
     lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
-    return Response(tuple(ORDERS[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+    return Response(tuple(orders(len(arms))[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+
+
+@cache
+def orders(rotors: int) -> Int[np.ndarray, "orders rotors"]:
+    """The orders of the motors that are tried, first the one that they have."""
+    if rotors <= PERMUTED:
+        return np.array(list(permutations(range(rotors))))
+    found = np.tile(np.arange(rotors), (1 + rotors * (rotors - 1) // 2, 1))
+    for row, (i, j) in zip(found[1:], combinations(range(rotors), 2), strict=True):
+        row[[i, j]] = j, i
+    return found
 
 
 def correlations(
-    torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n 4"], mix: Float[np.ndarray, "3 4"], lag: int
-) -> Float[np.ndarray, "24 3"]:
+    torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n rotors"], mix: Float[np.ndarray, "3 rotors"], lag
+) -> Float[np.ndarray, "orders 3"]:
     """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
     ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
     cross, spread = ahead.T @ behind, behind.T @ behind
-    shared = np.einsum("aj,aoj->oa", mix, cross[:, ORDERS])
-    variance = np.einsum("ai,oij,aj->oa", mix, spread[ORDERS[:, :, None], ORDERS[:, None, :]], mix)
+    order = orders(mix.shape[1])
+    shared = np.einsum("aj,aoj->oa", mix, cross[:, order])
+    variance = np.einsum("ai,oij,aj->oa", mix, spread[order[:, :, None], order[:, None, :]], mix)
     return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
 
 
-def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n 4"]]:
+def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n rotors"]]:
     """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
     fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
     sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
     if len(sound) < fast + slow:
-        return np.zeros((0, 3)), np.zeros((0, 4))
+        return np.zeros((0, 3)), np.zeros((0, log.u.shape[1]))
     mean = middle(omega)
     torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(mean, inertia * mean)
     bands = []

@@ -60,7 +60,7 @@ def make_residual(
         hidden: units of each network.
         norm: as in `residual_network`.
         linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
-        vehicle: needed by "near_ground" and "rotors" only.
+        vehicle: gives the number of rotors, by default four; needed by "near_ground" and "rotors".
 
     Raises:
         ValueError: an unknown name, outputs that do not go with the inputs (see `GO_WITH`), or no vehicle where one is
@@ -74,8 +74,9 @@ def make_residual(
     (reads, seen), (writes, written) = INPUTS[inputs], OUTPUTS[outputs]
     if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
         raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
-    network = residual_network(reads, INPUT_SIZE, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
-    field = zero_output(LinearSkip(jnp.zeros((writes, reads + INPUT_SIZE)), network)) if linear else network
+    rotors = INPUT_SIZE if vehicle is None else vehicle.rotors
+    network = residual_network(reads, rotors, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
+    field = zero_output(LinearSkip(jnp.zeros((writes, reads + rotors)), network)) if linear else network
     field = field if written is None else written(field)
     if seen is not None:
         field = seen(field, vehicle) if seen is views.GroundDistance else seen(field)

@@ -139,7 +139,7 @@ class RotorThrust(AbstractVectorField):
     def __check_init__(self):
         checks.positive("vehicle.rotor_radius", self.vehicle.rotor_radius)
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         return self.write(x, u, self.share(self.read(x), u))
 
     def fuse_for_inference(self):
@@ -153,15 +153,15 @@ class RotorThrust(AbstractVectorField):
         d_share = by_near[:, None] * d_near + by_u[:, None] * du
         return jvp_columns(self.write, (x, u, share), (dx, du, d_share))
 
-    def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " 4 *b"]:
+    def read(self, x: Float[Array, " 13 *b"]) -> Float[Array, " rotors *b"]:
         """R / h of each rotor."""
         return _nearness(x, _up(x), self.vehicle)
 
-    def share(self, near: Float[Array, " 4 *b"], u: Float[Array, " 4 *b"]) -> Float[Array, " 4 *b"]:
+    def share(self, near: Float[Array, " rotors *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " rotors *b"]:
         """f of each rotor."""
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
-    def write(self, x, u, share: Float[Array, " 4 *b"]) -> Float[Array, " 13 *b"]:
+    def write(self, x, u, share: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         """ẋ from the additional thrust of each rotor, as a share of k u²."""
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
@@ -178,7 +178,7 @@ def _up(x: Float[Array, " 13 *b"]) -> Float[Array, " 3 *b"]:
     return rotation.body_z(rotation.conjugate(x[QUATERNION]))
 
 
-def _nearness(x: Float[Array, " 13 *b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " 4 *b"]:
+def _nearness(x: Float[Array, " 13 *b"], up: Float[Array, " 3 *b"], vehicle: Vehicle) -> Float[Array, " rotors *b"]:
     """R / h of each rotor, its altitude h at least R / 2."""
     altitude = x[2]
     heights = jnp.stack([altitude + along * up[0] + across * up[1] for along, across in vehicle.rotor_positions])

@@ -24,7 +24,7 @@ from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import normalise
 from hybrid_jax.sim.forces import DRAG_COEFFICIENT, Force, Parameters, Scalar, drag, ground_effect, parameters_of, wind
 from hybrid_jax.sim.pilot import scale_of
-from hybrid_jax.state import BODY_RATES, INPUT_SIZE, QUATERNION, STATE_SIZE, VELOCITY, Input, State
+from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY, Input, State
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
@@ -36,6 +36,12 @@ def build_model(vehicle: Vehicle) -> mujoco.MjModel:
     spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("iris.xml")))
     spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
     body = spec.body("vehicle")
+    for i in range(vehicle.rotors, 4):
+        spec.delete(spec.actuator(f"rotor{i}"))
+        spec.delete(spec.site(f"rotor{i}"))
+    for i in range(4, vehicle.rotors):
+        body.add_site(name=f"rotor{i}")
+        spec.add_actuator(name=f"rotor{i}", target=f"rotor{i}", trntype=mujoco.mjtTrn.mjTRN_SITE)
     body.mass, body.inertia = vehicle.mass, vehicle.inertia
     reaction = vehicle.torque_coefficient / vehicle.thrust_coefficient
     for i, (x, y) in enumerate(vehicle.rotor_positions):
@@ -50,7 +56,7 @@ def traced_model(p: Parameters) -> mjx.Model:
     """The scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
     # Concrete even while tracing, so that MJX sees the model's structure as constants.
     with jax.ensure_compile_time_eval():
-        model = mjx.put_model(build_model(IRIS))
+        model = mjx.put_model(build_model(_placeholder(len(p.spin))))
     thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
     ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
     replaced: dict[str, Any] = {
@@ -63,6 +69,12 @@ def traced_model(p: Parameters) -> mjx.Model:
         "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
     }
     return cast(mjx.Model, model.tree_replace(replaced))
+
+
+def _placeholder(rotors: int) -> Vehicle:
+    """The Iris with another number of rotors, wherever they are."""
+    places, spin = ((each * rotors)[:rotors] for each in (IRIS.rotor_positions, IRIS.spin))
+    return replace(IRIS, rotor_positions=places, spin=spin)
 
 
 class Quadrotor(eqx.Module):
@@ -97,7 +109,7 @@ class Quadrotor(eqx.Module):
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
 
     def rollouts(
-        self, x0: Float[Array, "n 13"], u: Float[Array, "n t 4"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
+        self, x0: Float[Array, "n 13"], u: Float[Array, "n t rotors"], t0: Float[Array, " n"], dt: float, chunk=CHUNK
     ) -> Float[Array, "n t 13"]:
         """The states of n flights at the end of each interval, from x0 at t0 [s] with u[:, i] held over interval i.
 
@@ -109,8 +121,9 @@ class Quadrotor(eqx.Module):
                 or x0 has no unit quaternion.
         """
         x0, u, n = checks.floating("x0", x0), checks.floating("u", u), jnp.shape(t0)
-        if len(n) != 1 or x0.shape != (*n, STATE_SIZE) or u.ndim != 3 or u.shape != (*n, u.shape[1], INPUT_SIZE):
-            raise ValueError(f"x0 (n, 13), u (n, t, 4) and t0 (n,) expected, got {x0.shape}, {u.shape} and {n}")
+        m = len(self.parameters.spin)
+        if len(n) != 1 or x0.shape != (*n, STATE_SIZE) or u.ndim != 3 or u.shape != (*n, u.shape[1], m):
+            raise ValueError(f"x0 (n, 13), u (n, t, {m}) and t0 (n,) expected, got {x0.shape}, {u.shape} and {n}")
         checks.positive("dt", dt, "a positive number of seconds")
         checks.unit_quaternions("x0", x0)
         checks.count("chunk", chunk)

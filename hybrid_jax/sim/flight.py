@@ -41,7 +41,7 @@ class Flights(NamedTuple):
     """n flights of t decisions, float64."""
 
     states: Float[Array | np.ndarray, "*n t+1 13"]
-    inputs: Float[Array | np.ndarray, "*n t 4"]  # held from one state to the next [rad/s]
+    inputs: Float[Array | np.ndarray, "*n t rotors"]  # held from one state to the next [rad/s]
     lowest_rotor: Float[Array | np.ndarray, "*n t+1"]  # altitude [m]
     start: Float[Array | np.ndarray, "*n"]  # time of the first state [s]
 

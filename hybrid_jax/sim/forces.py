@@ -41,8 +41,8 @@ class Parameters(eqx.Module):
     inertia: Float[Array, "3"]
     thrust_coefficient: Scalar
     torque_coefficient: Scalar
-    rotor_positions: Float[Array, "4 3"]  # m, body frame, z = 0
-    spin: Float[Array, "4"]
+    rotor_positions: Float[Array, "rotors 3"]  # m, body frame, z = 0
+    spin: Float[Array, " rotors"]
     rotor_radius: Scalar
     gravity: Scalar
     drag_coefficient: Scalar  # C_D, kg/s
@@ -108,7 +108,7 @@ def thrust_gain(altitude: Float[Array, "*rotors"], rotor_radius: Scalar) -> Floa
     return 1 / (1 - (rotor_radius / (4 * height)) ** 2)
 
 
-def rotor_altitudes(x: State, rotor_positions: Float[Array, "4 3"]) -> Float[Array, "4"]:
+def rotor_altitudes(x: State, rotor_positions: Float[Array, "rotors 3"]) -> Float[Array, " rotors"]:
     """The altitude [m, world z] of each rotor."""
     q = normalise(x[QUATERNION])
     return x[POSITION][2] + jax.vmap(rotate, in_axes=(None, 0))(q, rotor_positions)[:, 2]

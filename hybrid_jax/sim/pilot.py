@@ -185,8 +185,14 @@ def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale)
 def _allocate(thrust: Scalar, torque: Vector, nominal: Parameters, max_speed: float) -> Input:
     """Rotor speeds [rad/s] that give a thrust [N] and a torque [N m, body], clipped to what a rotor can do."""
     k, x, y = nominal.thrust_coefficient, nominal.rotor_positions[:, 0], nominal.rotor_positions[:, 1]
-    mixer = jnp.stack([k * jnp.ones(4), k * y, -k * x, nominal.torque_coefficient * nominal.spin])
-    squared = jnp.linalg.solve(mixer, jnp.concatenate([thrust[None], torque]))
+    mixer = jnp.stack([k * jnp.ones(len(x)), k * y, -k * x, nominal.torque_coefficient * nominal.spin])
+    wrench = jnp.concatenate([thrust[None], torque])
+    if len(x) <= 4:  # three rotors leave yaw alone
+        squared = jnp.linalg.solve(mixer[: len(x)], wrench[: len(x)])
+    else:  # the smallest squares of many that give the wrench; rows scaled, as they differ by far
+        size = jnp.linalg.norm(mixer, axis=1)
+        mixer = mixer / size[:, None]
+        squared = mixer.T @ jnp.linalg.solve(mixer @ mixer.T, wrench / size)
     return jnp.sqrt(jnp.clip(squared, 0.0, max_speed**2))
 
 
