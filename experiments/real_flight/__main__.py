@@ -3,6 +3,7 @@
 import sys
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 from rich.console import Console
@@ -18,8 +19,9 @@ from experiments.real_flight.train import Experiment
 from experiments.runner import command
 from experiments.runner.stages import stages_of
 from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, learned_by_field, vehicle_model_of
+from hybrid_jax.dynamics.vehicle_file import LAG, NEED_PURPOSE, VehicleModel, learned_by_field, vehicle_model_of
 from hybrid_jax.flights.cleaning import choose_time_constant
+from hybrid_jax.flights.consistency import FAILS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
@@ -37,12 +39,14 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
   show the format of the logs.
 
   Your own logs: one file per flight, CSV with the columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 (SI
-  units, z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; or PX4's .ulg. Ten
-  flights of ten seconds before the change and five after it are a good start. docs/real_flight.md explains the formats.
+  units, z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; PX4's .ulg; a log of a
+  Crazyflie's SD card; a ROS bag. python -m experiments.inspect_logs FOLDER says what is in them and what to do. Ten
+  flights of ten seconds before the change and five after it are a good start. docs/howto/logs.md explains the formats.
 
   Public flights: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and
   idsia-robotics/nanodrone-sysid-benchmark on GitHub. Both need a column map and have licences of their own."""
-LISTS = ("--horizon", "--n", "--polynomial", "--learn", "--recipes", "--models")  # options that take several values
+# Options that take several values.
+LISTS = ("--horizon", "--n", "--polynomial", "--motor-order", "--topics", "--learn", "--recipes", "--models")
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -51,17 +55,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not any(word.startswith(("--simulated", "--source", "--vehicle", "--help", "-h")) for word in given):
         print(GUIDE, file=sys.stderr)
         sys.exit(command.BAD_INPUT)
-    command.run(NAME, ABOUT, run, split_lists(given), presets=PRESETS)
-
-
-def split_lists(arguments: Sequence[str]) -> list[str]:
-    """Split comma-separated values, such as 10,50, of the options that take several values."""
-    words, option = [], ""
-    for word in arguments:
-        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
-        several = option in LISTS and word != option
-        words += [option] * word.startswith("--") + value.split(",") if several else [word]
-    return words
+    command.run(NAME, ABOUT, run, command.split_lists(given, LISTS), presets=PRESETS)
 
 
 def run(config: RealFlightConfig, console: Console) -> None:
@@ -78,7 +72,7 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
         path, folders = logs.write_logs(config.out / NAME / "logs", config.data_seed)
     if path is None or "source" not in folders:
         raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
-    before, after, chooses_lag = load_vehicle_models(path, config)
+    before, after, chooses_lag, not_learned = load_vehicle_models(path, config)
     # The time constant may not be chosen on flights, or manoeuvres, that models are tested on.
     if chooses_lag and "target" not in folders and ("test" not in folders or config.folds_by == "manoeuvre"):
         raise ValueError(
@@ -96,19 +90,42 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
         chosen = choose_lag(sets["source"], before, config)
         console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
         sets = {name: each.with_lag(chosen) for name, each in sets.items()}
-    for flight, check in failed_checks([record for each in sets.values() for record in each.records]):
+    say = partial(console.print, highlight=False, soft_wrap=True, markup=False)
+    if not_learned:
+        say(not_learned)
+    for each in sets.values():
+        for file, why in each.left.items():
+            say(f"{each.label}/{file}: left: {why}")
+        for record in each.records:
+            for note in record["notes"]:
+                say(f"{each.label}/{record['flight']}: {note}")
+    found = failed_checks([record for each in sets.values() for record in each.records])
+    failed = []
+    for flight, check in found:
         line = f"{flight}: {check['name']}: {check['suggestion']}"  # the report holds the whole table
-        console.print(line, highlight=False, soft_wrap=True, style="yellow")
+        if check["verdict"] == FAILS and not config.anyway:
+            failed.append(line)
+        else:
+            say(line, style="yellow")
+    if failed:
+        raise command.ChecksFailed(*failed, logs.MEND)
     return Experiment(config, before, after, sets, dt, stages_of(config, console))
 
 
-def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool]:
-    """Read the vehicle of the source, that of target and test, and whether the rotors' time constant is chosen."""
+def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleModel, VehicleModel, bool, str]:
+    """Read the vehicle of the source, and that of target and test.
+
+    Returns also whether the rotors' time constant is chosen, and a line on what is not learned; empty if all is.
+    """
     tables = read_tables(path)
     before, after = (vehicle_model_of(tables, path, variant) for variant in (None, config.target_variant))
-    learn = config.learn or (before.learn if "learn" in tables else LEARN)
+    asked = config.learn or (before.learn if "learn" in tables else LEARN)
+    aimless = tuple(name for name in asked if name in NEED_PURPOSE and name not in before.purpose)
+    learn = tuple(name for name in asked if name not in aimless)
     before, after = (replace(each, learn=learned_by_field(learn)) for each in (before, after))
-    return before, after, LAG in learn
+    names = ", ".join(aimless)
+    why = f"{path}: {names} is not learned, as the file does not say what it is for; above its tables: purpose = "
+    return before, after, LAG in learn, f'{why}{{ {aimless[0]} = "why" }}' if aimless else ""
 
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:

@@ -1,5 +1,6 @@
 """The options of `python -m experiments.real_flight`, and its presets."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -41,12 +42,22 @@ class Cleaning:
         check_numbers("--cleaning.", self)
 
 
+def read_topics(words: Sequence[str]) -> dict[str, str]:
+    """The topics of --topics by what they hold; ValueError for a word without an equals sign."""
+    for word in words:
+        if "=" not in word:
+            raise ValueError(f"--topics must be words such as odometry=/odom, got {word!r}")
+    return dict(word.split("=", 1) for word in words)
+
+
 @dataclass(frozen=True)
 class RealFlightConfig(Run):
     """Train on the flights in --source, adapt to N windows of those in --target, test on held-out flights.
 
     A flight is a file: CSV (.csv, .csv.gz; columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 in SI units,
-    z up, forward-left-up, rotor speeds in rad/s), any other CSV with --columns MAP.toml, or PX4's .ulg.
+    z up, forward-left-up, rotor speeds in rad/s), any other CSV with --columns MAP.toml, PX4's .ulg, a log of a
+    Crazyflie's SD card, a ROS bag or Betaflight's blackbox; python -m experiments.inspect_logs FOLDER says what is in
+    them. A check that fails stops the run before anything is trained, with exit code 3; --anyway goes on.
 
     Without --test, the target's flights are held out in turn (--folds). Without --target, nothing is adapted and the
     source's models are tested. No data? Try --simulated.
@@ -67,7 +78,14 @@ class RealFlightConfig(Run):
     columns: Path | None = None
     """TOML file of the columns, units and frames of CSV logs."""
     polynomial: tuple[float, ...] = ()
-    """For ULog files without ESC telemetry: rotor speed [rad/s] = c0 + c1 command + c2 command² …"""
+    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
+    from 0 to 1. For example 100,1000 if a motor turns with 100 rad/s as it starts and with 1100 at the full command."""
+    motor_order: tuple[int, ...] = ()
+    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
+    topics: tuple[str, ...] = ()
+    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
+    anyway: bool = False
+    """Train in spite of checks that failed. The report says so in its first line."""
     cleaning: Cleaning = field(default_factory=Cleaning)
     simulated: bool = False
     """Simulate flights, write their logs to --out and use these."""
@@ -115,6 +133,7 @@ class RealFlightConfig(Run):
     def __post_init__(self):
         Run.__post_init__(self)
 
+        read_topics(self.topics)
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):
             distinct(f"--{name}", getattr(self, name))

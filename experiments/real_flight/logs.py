@@ -3,8 +3,8 @@
 import gzip
 import io
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -12,13 +12,15 @@ import jax
 import numpy as np
 from jaxtyping import Int
 
-from experiments.real_flight.config import Cleaning, RealFlightConfig
+from experiments.real_flight.config import Cleaning, RealFlightConfig, read_topics
 from experiments.real_flight.models import RECIPES
+from experiments.runner.command import ChecksFailed
 from hybrid_jax.extrapolation import Motion, motion
-from hybrid_jax.flights import windows
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
-from hybrid_jax.flights.consistency import FAILS, check_log
+from hybrid_jax.flights.consistency import FAILS, Check, check_log
+from hybrid_jax.flights.loading import asked_interval, read_folder
 from hybrid_jax.flights.log import COLUMNS, FlightLog, gaps, repeats, segments
+from hybrid_jax.flights.suitability import check_recording, failures
 from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.files import write_atomic
@@ -29,6 +31,7 @@ from hybrid_jax.vehicle import IRIS, Vehicle
 
 FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}  # of --simulated: domains, numbers of flights
 SECONDS = 8.0
+MEND = "nothing was trained; mend the logs as the lines above say, or go on with --anyway"
 FOLDS, VALIDATION_SHARE = 3, 0.2
 LEFT_OUT = 5  # most parts of a fold's flights that are left out of training in turn, which bounds the cost
 GROUP_BY = {"flight": flight_of, "manoeuvre": manoeuvre_of}
@@ -41,25 +44,47 @@ class LogSet:
     label: str  # source, target or test
     logs: list[FlightLog]  # after cleaning
     records: list[dict[str, Any]]  # of each flight, as JSON values: see `_record`
+    left: Mapping[str, str] = field(default_factory=dict)  # other files of the folder, and why they were not read
 
     def with_lag(self, time_constant: float) -> "LogSet":
         """The flights with rotors that follow the log's motor values with a first-order lag [s]."""
         logs, lines = zip(*(lag_motors(log, time_constant) for log in self.logs), strict=True)
         records = [each | {"done": [*each["done"], line]} for each, line in zip(self.records, lines, strict=True)]
-        return LogSet(self.label, list(logs), records)
+        return LogSet(self.label, list(logs), records, self.left)
 
 
 def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float, config: RealFlightConfig) -> LogSet:
-    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s]."""
+    """Read, check and clean all logs of a folder, which the given option named; rotors lag by the time constant [s].
+
+    Raises:
+        ChecksFailed: a check failed, without --anyway.
+    """
+    dt = config.cleaning.resample
     try:
-        found = windows.load_logs(folder, columns=config.columns, polynomial=config.polynomial)
+        given = {"columns": config.columns, "topics": read_topics(config.topics), "motor_order": config.motor_order}
+        readings, left = read_folder(folder, **given)
     except ValueError as error:
         about_folder = str(error).startswith(f"{folder}: ")
         raise ValueError(f"--{option} {error}" if about_folder else str(error)) from error
-    cleaned = [clean(raw, config.cleaning, vehicle) for raw in found]
-    records = [_record(option, raw, *each, vehicle) for raw, each in zip(found, cleaned, strict=True)]
-    logs = LogSet(option, [log for log, _ in cleaned], records)
+    # Before they become flights, which those that fail might not do.
+    found = [check_recording(each.recording, vehicle, asked_interval(each, dt)) for each in readings]
+    names = [f"{option}/{Path(each.recording.name).name}" for each in readings]
+    require_checks(list(zip(names, found, strict=True)), config)
+    raws = [each.flight(dt, config.polynomial) for each in readings]
+    cleaned = [clean(raw, config.cleaning, vehicle) for raw in raws]
+    records = [
+        _record(option, raw, *each, [*checks, *check_log(each[0], vehicle)], reading.recording.notes)
+        for reading, raw, each, checks in zip(readings, raws, cleaned, found, strict=True)
+    ]
+    logs = LogSet(option, [log for log, _ in cleaned], records, {path.name: why for path, why in left.items()})
     return logs.with_lag(time_constant) if time_constant else logs
+
+
+def require_checks(found: Sequence[tuple[str, Sequence[Check]]], config: RealFlightConfig) -> None:
+    """Raise ChecksFailed with a line for each check that failed, by the names of their flights; not with --anyway."""
+    lines = [line for name, checks in found for line in failures(checks, name)]
+    if lines and not config.anyway:
+        raise ChecksFailed(*lines, MEND)
 
 
 def require_distinct(sets: Sequence[LogSet], config: RealFlightConfig) -> None:
@@ -99,8 +124,9 @@ def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle) -> tuple[FlightL
     return log, done
 
 
-def _record(folder: str, raw: FlightLog, log: FlightLog, done: list[str], vehicle: Vehicle) -> dict[str, Any]:
-    checks = [asdict(check) for check in check_log(raw, vehicle)]
+def _record(
+    folder: str, raw: FlightLog, log: FlightLog, done: list[str], checks: Sequence[Check], notes: Sequence[str]
+) -> dict[str, Any]:
     return {
         "folder": folder,
         "flight": flight_of(raw),
@@ -112,8 +138,9 @@ def _record(folder: str, raw: FlightLog, log: FlightLog, done: list[str], vehicl
         "repeated_samples": int(repeats(raw).sum()),
         "used_samples": sum(part.stop - part.start for part in segments(log)),
         "done": done,
-        "fails": sum(check["verdict"] == FAILS for check in checks),
-        "checks": checks,
+        "notes": notes,
+        "fails": sum(check.verdict == FAILS for check in checks),
+        "checks": [asdict(check) for check in checks],
     }
 
 

@@ -28,7 +28,7 @@ from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_ta
 from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.extrapolation import WARN, shares_outside
-from hybrid_jax.flights.consistency import FAILS
+from hybrid_jax.flights.consistency import FAILS, WARNS
 from hybrid_jax.flights.windows import flight_of
 
 NOTES = (
@@ -36,7 +36,8 @@ NOTES = (
     "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
     "not account for errors of the model.",
 )
-VERDICTS = {"ok": "ok", "fails": "FAILS", "cannot tell": "?"}
+VERDICTS = {"ok": "ok", "warns": "warns", "fails": "FAILS", "cannot tell": "?"}
+CHECKED = "Checks: of each log as recorded, then of the cleaned flight (? cannot tell; the value is beside the verdict)"
 SHORT = {
     "repeated samples": "repeats",
     "dp/dt against v": "dp/dt, v",
@@ -59,7 +60,6 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
     main += [verdict_table(claims, "Hypotheses")] if claims else []
     records = [record for logs in experiment.logs.values() for record in logs.records]
     more = [*fold_tables(rows), choice_table(outputs.selections), *parameter_tables(rows, nominal)]
-    more += log_tables(records)
     parts = ("train", "validation", "test")
     extra = {
         "vehicle": {"before": asdict(experiment.before), "after": asdict(experiment.after)},
@@ -74,7 +74,8 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
     figures = save_figures(out, make_figures(experiment, outputs))
     given = (experiment.config.described(), environment(stages.seconds), rows, claims, figures)
     head = introduction(name, experiment, outputs)
-    tables, notes = [main[0], outside_table(shares), *main[1:], *more], [*stages.notes(), *NOTES]
+    tables = [*log_tables(records), main[0], outside_table(shares), *main[1:], *more]
+    notes = [*stages.notes(), *NOTES]
     report.write_report(out, report.Report(name, *given, notes, extra, head, tables))
     print_tables(console, main)
     for line in warnings_of(shares):
@@ -88,7 +89,11 @@ def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
     of = ", ".join(f"{label} {sum(record['seconds'] for record in each.records):.0f} s" for label, each in logs.items())
     recipes = "\n".join(f"- recipe **{recipe}**: {RECIPES[recipe].about}" for recipe in config.tried)
     adapted = f"the source's flights, then on N windows of the target's ({config.draw}),"
-    return f"""# {name}
+    failed = sum(record["fails"] for each in logs.values() for record in each.records)
+    anyway = (
+        f"**{failed} checks of the logs failed, and --anyway went on: no number below counts until they pass.**\n\n"
+    )
+    return f"""{anyway if failed else ""}# {name}
 
 Models are trained on {adapted if "target" in logs else "flights"} and predict \
 held-out flights, open loop from every sample with the recorded rotor speeds.
@@ -242,15 +247,15 @@ def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
     failed = [(flight, c["name"], _value(c), c["suggestion"]) for flight, c in failed_checks(records)]
     header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
     names = [str(SHORT.get(check["name"], check["name"])) for check in records[0]["checks"]]
-    tables = [Table("Logs", header, lines), Table("Consistency of the raw logs", ("flight", *names), verdicts)]
-    advice = Table("Failed checks, and how to repair them", ("flight", "check", "value", "suggestion"), failed)
-    return [*tables, advice] if failed else tables
+    tables = [Table("Logs", header, lines), Table(CHECKED, ("flight", *names), verdicts)]
+    advice = Table("Checks that failed or warn, and what to do", ("flight", "check", "value", "suggestion"), failed)
+    return [*([advice] if failed else []), *tables]
 
 
 def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mapping[str, Any]]]:
-    """The checks that failed, each with its flight."""
+    """The checks that failed or warn, each with its flight."""
     named = [(f"{record['folder']}/{record['flight']}", check) for record in records for check in record["checks"]]
-    return [(flight, check) for flight, check in named if check["verdict"] == FAILS]
+    return [(flight, check) for flight, check in named if check["verdict"] in (FAILS, WARNS)]
 
 
 def _errors(label: str) -> dict[str, Callable[[Results], str]]:

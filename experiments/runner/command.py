@@ -20,9 +20,13 @@ from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
 Options = TypeVar("Options")
-BAD_INPUT = 2  # exit code; that of a signal is 128 + its number
+BAD_INPUT, FAILED_CHECKS = 2, 3  # exit codes; that of a signal is 128 + its number
 # How options begin, old → new. Old names are accepted for one version; --help does not list them.
 RENAMED = {"--guess-off": "--perturbed-by", "--safe-": "--invariant-", "--no-safe-": "--no-invariant-"}
+
+
+class ChecksFailed(Exception):
+    """Checks of the input failed; its arguments are lines that say which, and what to type."""
 
 
 def run(
@@ -72,6 +76,16 @@ def call(
         command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
 
 
+def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
+    """Split comma-separated values, such as 10,50, of the options that take several values."""
+    words, option = [], ""
+    for word in arguments:
+        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
+        several = option in lists and word != option
+        words += [option] * word.startswith("--") + value.split(",") if several else [word]
+    return words
+
+
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
     """The configuration given by a command line: a preset, changed by the other options."""
     arguments = [_renamed(argument) for argument in arguments]
@@ -101,6 +115,10 @@ def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
         message = str(error) if isinstance(error, OtherRun) else " ".join(str(error).split())
         print(f"{name}: {message}", file=sys.stderr)
         sys.exit(BAD_INPUT)
+    except ChecksFailed as failed:
+        for line in failed.args:
+            print(f"{name}: {line}", file=sys.stderr)
+        sys.exit(FAILED_CHECKS)
     except KeyboardInterrupt as stop:
         print(f"{name}: {interrupted}", file=sys.stderr)
         sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))

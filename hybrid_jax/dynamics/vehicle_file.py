@@ -1,7 +1,8 @@
 """A whole vehicle file: constants of the vehicle, nominal values of further terms, and what is to be learned.
 
 Above all tables `learn = ["Ix", "drag", …]`, names of `terms.SHAPES`; then `[vehicle]` with the constants of `Vehicle`,
-`[vehicle.NAME]` with those that differ in a variant, and `[terms]` with nominal values of `Terms`.
+`[vehicle.NAME]` with those that differ in a variant, and `[terms]` with nominal values of `Terms`. Above the tables
+may also stand what a term is for, as in `purpose = { cable_pull = "the load hangs on a cable" }`.
 """
 
 from collections.abc import Mapping
@@ -16,7 +17,8 @@ from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import Vehicle, from_table, read_tables, require_known, vehicle_of
 
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.cleaning`
-TABLES = ("vehicle", "learn", "terms")
+NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, they would absorb other effects
+TABLES = ("vehicle", "learn", "terms", "purpose")
 
 
 @dataclass(frozen=True)
@@ -26,6 +28,7 @@ class VehicleModel:
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
     learn: tuple[str, ...] = LEARNED  # names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs
+    purpose: tuple[str, ...] = ()  # names of terms of which the file says what they are for
 
     def __post_init__(self):
         check_learned(self.learn)
@@ -61,5 +64,18 @@ def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str |
         raise ValueError(f"{path}: [vehicle]: learn must stand above all tables")
     if not isinstance(terms, dict):
         raise ValueError(f"{path}: terms must be a table [terms], got {checks.short_repr(terms)}")
-    parts = {"vehicle": vehicle_of(tables, path, variant), "terms": from_table(Terms, terms, f"{path}: [terms]")}
-    return from_table(VehicleModel, parts | {"learn": tables.get("learn", LEARNED)}, str(path))
+    parts: dict[str, Any] = {
+        "vehicle": vehicle_of(tables, path, variant),
+        "terms": from_table(Terms, terms, f"{path}: [terms]"),
+    }
+    parts |= {"purpose": purpose_of(tables, path), "learn": tables.get("learn", LEARNED)}
+    return from_table(VehicleModel, parts, str(path))
+
+
+def purpose_of(tables: Mapping[str, Any], path: str | Path) -> tuple[str, ...]:
+    """The names of terms of which a file says what they are for; ValueError if it says nothing, or of what is none."""
+    stated = tables.get("purpose", {})
+    if not isinstance(stated, dict) or not all(isinstance(words, str) and words.strip() for words in stated.values()):
+        raise ValueError(f'{path}: purpose must be {{ cable_pull = "why" }}, got {checks.short_repr(stated)}')
+    check_learned(tuple(stated))
+    return tuple(stated)

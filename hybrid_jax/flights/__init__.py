@@ -1,6 +1,6 @@
 """Recorded flights: read logs, check them, clean them and cut them into training windows.
 
-    windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one CSV or ULog file per flight
+    windows = hj.load_windows("flights/", hj.load_vehicle("vehicle.toml"), steps=10)  # one log of any format per flight
 
 Its steps can be taken one by one. Split by flight before cutting, since windows of one flight share samples and wind:
 
@@ -19,9 +19,14 @@ from hybrid_jax.flights.cleaning import (
 )
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map
 from hybrid_jax.flights.consistency import Check, check_log
+from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.loading import load_log, load_logs
 from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.reading import find_logs, read_recording
+from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_log, load_logs, load_windows
+from hybrid_jax.flights.suitability import check_recording
+from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_windows
 
 __all__ = [
     "Check",
@@ -29,11 +34,15 @@ __all__ = [
     "FlightErrors",
     "FlightLog",
     "LogWindows",
+    "Recording",
+    "Signal",
     "align_motors",
     "check_log",
+    "check_recording",
     "choose_time_constant",
     "cut_windows",
     "delay_motors",
+    "find_logs",
     "flight_errors",
     "folds",
     "hold_out",
@@ -44,5 +53,7 @@ __all__ = [
     "load_logs",
     "load_windows",
     "low_pass",
+    "read_recording",
     "resample",
+    "to_flight",
 ]

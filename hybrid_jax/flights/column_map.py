@@ -6,10 +6,14 @@ position = {columns = ["x", "y", "z"], unit = "mm"}             # m, cm, mm
 attitude = {columns = ["q0", "q1", "q2", "q3"], unit = "wxyz"}  # body → world; wxyz, xyzw; roll, pitch, yaw: rad, deg
 velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}         # m/s, cm/s, mm/s
 body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}        # rad/s, deg/s
-motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, command; in the vehicle's order
-format = {delimiter = ";"}                                      # optional, by default a comma
+specific_force = {columns = ["ax", "ay", "az"], unit = "g"}     # of the body, as an accelerometer measures it; m/s², g
+voltage = {columns = ["vbat"], unit = "V"}                      # V, mV
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, or commands; in the vehicle's order
+format = {delimiter = ";", decimal = ","}                       # optional, by default "," and "."
 
-Motors in unit "command" need polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
+All but frames and time may be left out; training on states needs position, attitude, velocity, body_rates and motors.
+Commands are in unit share (0 … 1), pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047); or in any unit of the
+log, called command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
 """
 
 import math
@@ -19,9 +23,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax.flights import samples
 from hybrid_jax.flights.attitude import Frames, from_euler, to_library
 from hybrid_jax.flights.flight_csv import flight_log, read_table
 from hybrid_jax.flights.log import FlightLog, wrong_norms
+from hybrid_jax.flights.recording import Recording
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
 
 SCALES = {
@@ -30,9 +36,15 @@ SCALES = {
     "attitude": {"wxyz": 1.0, "xyzw": 1.0, "rad": 1.0, "deg": math.pi / 180},
     "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
     "body_rates": {"rad/s": 1.0, "deg/s": math.pi / 180},
-    "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0},
+    "specific_force": {"m/s²": 1.0, "m/s^2": 1.0, "g": 9.81},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0}
+    | {"share": 1.0, "pwm": 1e-3, "16bit": 1 / 65535, "dshot": 1 / 1999},
 }
-COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3}
+REST = {"pwm": 1000.0, "dshot": 48.0}  # values of motors at rest
+SHARES = ("share", "pwm", "16bit", "dshot")  # units of commands
+COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "specific_force": 3, "voltage": 1}
+STATES = ("position", "attitude", "velocity", "body_rates", "motors")  # what training on states needs
 
 
 @dataclass(frozen=True)
@@ -49,8 +61,11 @@ class Format:
     """How the numbers stand in the file."""
 
     delimiter: str = ","
+    decimal: str = "."
 
     def __post_init__(self):
+        if self.decimal not in (".", ",") or self.decimal == self.delimiter:
+            raise ValueError(f'decimal must be "." or "," and not the delimiter, got {self.decimal!r}')
         if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
             raise ValueError(f"delimiter must be one character, got {self.delimiter!r}")
 
@@ -65,11 +80,13 @@ class ColumnMap:
 
     frames: Frames
     time: Columns
-    position: Columns
-    attitude: Columns
-    velocity: Columns
-    body_rates: Columns
-    motors: Columns
+    position: Columns | None = None
+    attitude: Columns | None = None
+    velocity: Columns | None = None
+    body_rates: Columns | None = None
+    specific_force: Columns | None = None
+    voltage: Columns | None = None
+    motors: Columns | None = None
     format: Format = Format()
 
     def __post_init__(self):
@@ -81,8 +98,8 @@ class ColumnMap:
 
     @property
     def quantities(self) -> dict[str, Columns]:
-        """The columns of each quantity, in the order of `SCALES`."""
-        return {name: getattr(self, name) for name in SCALES}
+        """The columns of each quantity that is given, in the order of `SCALES`."""
+        return {name: getattr(self, name) for name in SCALES if getattr(self, name) is not None}
 
     @property
     def names(self) -> list[str]:
@@ -107,21 +124,68 @@ def load_column_map(path: str | Path) -> ColumnMap:
 
 
 def read_mapped(path: str | Path, column_map: ColumnMap) -> FlightLog:
-    """Read one flight of a CSV file, plain or gzip, into the library's units and frames.
+    """Read one flight of a CSV file, plain or gzip, into the library's units and frames, at the times of its rows.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
-    table = read_table(path, column_map.names, delimiter=column_map.format.delimiter)
-    stated, parts, begin = column_map.quantities, {}, 0
-    for name, scales in SCALES.items():
-        end = begin + len(stated[name].columns)
-        parts[name], begin = table[:, begin:end] * scales[stated[name].unit], end
+    stated = column_map.quantities
+    for name in STATES:
+        if name not in stated:
+            raise ValueError(
+                f"{path}: the column map states no {name}; a model of states is trained on all of {STATES}"
+            )
+    if stated["motors"].unit in SHARES and not stated["motors"].polynomial:
+        raise ValueError(f"{path}: [motors] are commands; add polynomial = [c0, c1, …]: rad/s = c0 + c1 share …")
+    parts = _parts(path, column_map)
     q = _attitude(parts["attitude"], stated["attitude"], path)
-    motors, polynomial = parts["motors"], stated["motors"].polynomial
-    u = np.polynomial.polynomial.polyval(motors, polynomial) if polynomial else motors
+    u = _speeds(parts["motors"], stated["motors"])
     x = to_library(parts["position"], q, parts["velocity"], parts["body_rates"], column_map.frames)
     return flight_log(path, np.concatenate([parts["time"], x, u], axis=1))
+
+
+def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
+    """Read what a CSV file, plain or gzip, holds of the quantities of a recording.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
+    t, found = parts.pop("time")[:, 0], {}
+    for name, values in parts.items():
+        quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), samples.XYZ
+        if name == "attitude":
+            values = samples.attitude(_attitude(values, stated[name], path), frames.world, frames.body)
+            axes = samples.WXYZ
+        elif name == "motors":
+            commands = stated[name].unit in SHARES and not stated[name].polynomial
+            quantity, values = ("command", values) if commands else (quantity, _speeds(values, stated[name]))
+            axes = tuple(map(str, range(values.shape[1])))
+        elif name == "voltage":
+            axes = samples.BATTERY
+        elif name == "position" or (name == "velocity" and frames.velocity == "world"):
+            values = samples.world(values, frames.world)
+        else:
+            values = samples.body(values, frames.body)
+            quantity = "body_velocity" if name == "velocity" else quantity
+        found[quantity] = samples.Samples(t, values, axes, f"columns {' '.join(stated[name].columns)}")
+    return samples.record(path, found, facts={"format": "CSV"})
+
+
+def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
+    """The columns of each quantity, scaled to SI units and shares."""
+    form, stated = column_map.format, column_map.quantities
+    table = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
+    parts, begin = {}, 0
+    for name, each in stated.items():
+        end = begin + len(each.columns)
+        rest = REST.get(each.unit, 0.0) if name == "motors" else 0.0
+        parts[name], begin = (table[:, begin:end] - rest) * SCALES[name][each.unit], end
+    return parts
+
+
+def _speeds(motors: Float[np.ndarray, "n m"], stated: Columns) -> Float[np.ndarray, "n m"]:
+    return np.polynomial.polynomial.polyval(motors, stated.polynomial) if stated.polynomial else motors
 
 
 def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
@@ -150,6 +214,7 @@ def _check(name: str, stated: Columns) -> None:
         raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")
     given = stated.polynomial
     numbers = isinstance(given, tuple) and all(isinstance(c, int | float) and math.isfinite(c) for c in given)
-    if not numbers or bool(given) != (stated.unit == "command"):
-        what = "polynomial must be numbers c0, c1, … if and only if the unit is command"
+    needed = stated.unit == "command"
+    if not numbers or bool(given) < needed or (given and not (needed or stated.unit in SHARES)):
+        what = "polynomial must be numbers c0, c1, … of a unit of commands"
         raise ValueError(f"[{name}]: {what}, got {given!r} for {stated.unit}")

@@ -6,6 +6,8 @@ The header names the columns. Their order is free, and other columns are ignored
 import contextlib
 import gzip
 import io
+import json
+import re
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -44,7 +46,13 @@ def flight_log(path: str | Path, table: Float[np.ndarray, "n c"]) -> FlightLog:
 
 
 def read_table(
-    path: str | Path, columns: Sequence[str], *, delimiter: str = ",", max_rows=MAX_ROWS, further: Sequence[str] = ()
+    path: str | Path,
+    columns: Sequence[str],
+    *,
+    delimiter: str = ",",
+    decimal: str = ".",
+    max_rows: int = MAX_ROWS,
+    further: Sequence[str] = (),
 ) -> Float[np.ndarray, "n c"]:
     """Read the named columns of a CSV file with a header, in the given order; all numbers must be finite.
 
@@ -59,7 +67,7 @@ def read_table(
             packed = file.read(2) == b"\x1f\x8b"
             file.seek(0)
             text = io.TextIOWrapper(gzip.GzipFile(fileobj=file) if packed else file, encoding="utf-8-sig")
-            parts = list(_parts(path, text, columns, delimiter, max_rows, further))
+            parts = list(_parts(path, text, [columns, further], delimiter, decimal, max_rows))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
@@ -71,16 +79,20 @@ def read_table(
     return np.concatenate(parts)
 
 
-def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int, further) -> Iterator[Float[np.ndarray, "n c"]]:
+def _parts(
+    path, text: IO[str], asked, delimiter: str, decimal: str, max_rows: int
+) -> Iterator[Float[np.ndarray, "n c"]]:
     header = text.readline(MAX_ROW_LENGTH)
     names = [name.strip() for name in header.split(delimiter)]
+    columns, further = asked
     columns = [*columns, *further[: max((i + 1 for i, name in enumerate(further) if name in names), default=0)]]
     for name in columns:
         if names.count(name) != 1:
-            raise ValueError(_header_complaint(path, name, names, header))
+            raise ValueError(_header_complaint(path, name, names, header, delimiter))
     picked, row = [names.index(name) for name in columns], 2
     while block := text.read(BLOCK):
-        lines = (block + text.readline(MAX_ROW_LENGTH)).split("\n")
+        block += text.readline(MAX_ROW_LENGTH)
+        lines = (block.replace(decimal, ".") if decimal != "." else block).split("\n")
         if not lines[-1]:
             lines.pop()
         elif len(lines[-1]) >= MAX_ROW_LENGTH:
@@ -94,11 +106,15 @@ def _parts(path, text: IO[str], columns, delimiter: str, max_rows: int, further)
         raise ValueError(f"{path}: row 2: there are no samples below the header; record or export the flight again")
 
 
-def _header_complaint(path, name: str, names: list[str], header: str) -> str:
+def _header_complaint(path, name: str, names: list[str], header: str, delimiter: str) -> str:
     if not header.strip():
         return f"{path}: row 1: the file is empty or has no header; export the log again"
     if name in names:
         return f"{path}: row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
+    for other in (";", "\t", ","):
+        if len(names) == 1 and other != delimiter and header.count(other) > 2:
+            advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map (--columns)"
+            return f"{path}: row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
     found = ", ".join(names[:20])[:200].encode("unicode_escape").decode()
     return f"{path}: row 1, field {name}: no such column among {found}; rename a column or use a column map"
 
@@ -125,6 +141,9 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
             with contextlib.suppress(ValueError):
                 if np.isfinite(np.loadtxt([cell or "-"], delimiter=delimiter, comments=None)).all():
                     continue
+            if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
+                advice = 'set format = {delimiter = ";", decimal = ","} in a column map (--columns)'
+                return f"row {row + at}, field {names[column]}: {cell[:40]!r} has a decimal comma; {advice}"
             found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
             return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"
     return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"

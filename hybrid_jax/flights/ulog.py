@@ -1,132 +1,190 @@
-"""Read PX4 ULog files with pyulog (extra `logs`).
+"""Read PX4 ULog files, of PX4 1.5 to 1.16, with pyulog (extra `logs`).
 
 PX4 states attitude as body FRD → world NED and vectors in these frames (msg/versioned/VehicleAttitude.msg,
-msg/versioned/VehicleLocalPosition.msg). Each topic has its own time stamps; all are resampled to one grid.
+msg/versioned/VehicleLocalPosition.msg); the format is that of docs.px4.io, "ULog File Format".
 """
 
 import contextlib
 import io
-from collections.abc import Sequence
+import struct
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from jaxtyping import Float
 
-from hybrid_jax.flights.attitude import Frames, interpolate, interpolate_attitude, mean_of_held, to_library
-from hybrid_jax.flights.flight_csv import MAX_ROWS
-from hybrid_jax.flights.log import FlightLog, wrong_norms
+from hybrid_jax.flights import samples
+from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.samples import BATTERY, WXYZ, XYZ, Samples
 
-FRAMES = Frames(world="NED", body="FRD", velocity="world")
-STATES = {
-    "vehicle_local_position": ("x", "y", "z", "vx", "vy", "vz"),
-    "vehicle_attitude": ("q[0]", "q[1]", "q[2]", "q[3]"),
-    "vehicle_angular_velocity": ("xyz[0]", "xyz[1]", "xyz[2]"),
+LOCAL, ATTITUDE, STATUS, OUTPUTS = "vehicle_local_position", "vehicle_attitude", "vehicle_status", "actuator_outputs"
+# Quantity → where it may stand, the first that a log has counts: topic and fields.
+SOURCES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
+    "position": ((LOCAL, ("x", "y", "z")),),
+    "velocity": ((LOCAL, ("vx", "vy", "vz")),),
+    "attitude": ((ATTITUDE, tuple(f"q[{i}]" for i in range(4))),),
+    "rates": (
+        ("vehicle_angular_velocity", tuple(f"xyz[{i}]" for i in range(3))),  # from 1.10 on
+        ("sensor_combined", tuple(f"gyro_rad[{i}]" for i in range(3))),
+        (ATTITUDE, ("rollspeed", "pitchspeed", "yawspeed")),  # until 1.9
+    ),
+    "specific_force": (
+        ("sensor_combined", tuple(f"accelerometer_m_s2[{i}]" for i in range(3))),
+        ("vehicle_acceleration", tuple(f"xyz[{i}]" for i in range(3))),
+    ),
+    "voltage": (("battery_status", ("voltage_v",)),),
 }
-RPM = "esc_status"
-# Of motors; the first topic that the log has is used.
-FIELDS = {RPM: "esc[{}].esc_rpm", "actuator_motors": "control[{}]", "actuator_outputs": "output[{}]"}
-LOST = 5  # an interval above this multiple of a topic's median, or of dt, is a gap and is not interpolated across
+VALID = {"position": ("xy_valid", "z_valid"), "velocity": ("v_xy_valid", "v_z_valid")}
+RESETS = {"position": ("xy_reset_counter", "z_reset_counter"), "velocity": ("vxy_reset_counter", "vz_reset_counter")}
+MOTORS = {"esc_status": "esc[{}].esc_rpm", "actuator_motors": "control[{}]", OUTPUTS: "output[{}]"}  # topic → field
+TOPICS = sorted({topic for each in SOURCES.values() for topic, _ in each} | {*MOTORS, STATUS})
+ROTORS = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}  # MAV_TYPE of multirotors → rotors
+OTHERS = {1: "fixed wing", 3: "coaxial helicopter", 4: "helicopter", 7: "airship", 10: "rover", 11: "boat"}
+OTHERS |= {12: "submarine"} | dict.fromkeys(range(19, 26), "VTOL")
+IDLE_PWM, FULL_PWM = 1000.0, 2000.0  # µs, where a log does not say
+MOST = 16  # motors or outputs in any topic
 
 
-def read_ulog(
-    path: str | Path, *, dt: float = 0.01, motor_order: Sequence[int] = (0, 1, 2, 3), polynomial: Sequence[float] = ()
-) -> FlightLog:
-    """Read one flight at intervals of dt [s]; where a topic has a gap, the log has one too.
-
-    Position, velocity and rates are interpolated linearly, attitude spherically; rotor speeds are means of held values.
-
-    Args:
-        motor_order: which motor (0 is PX4's motor 1) each of the vehicle's rotors is.
-        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ; not needed where the log has ESC rpm.
+def read_ulog(path: str | Path) -> Recording:
+    """Read one log. Commands are shares of the largest, of PWM between the log's minimum and maximum.
 
     Raises:
-        ValueError: file, topic and what to do, in one line; or pyulog is not installed.
+        ValueError: file, topic, time and what to do, in one line; or pyulog is not installed.
     """
-    if not dt > 0:
-        raise ValueError(f"dt must be a positive number of seconds, got {dt!r}")
-    data = _load(path)
-    (tp, local), (tq, q), (tw, omega) = (_samples(data, path, topic, fields) for topic, fields in STATES.items())
-    tu, u = _motors(data, path, motor_order, polynomial)
-    if wrong_norms(q):
-        advice = "cut the log where there is no attitude"
-        raise ValueError(f"{path}: topic vehicle_attitude, field q: norm is not 1; {advice}")
-    times = (tp, tq, tw, tu)
-    first, last = max(at[0] for at in times), min(at[-1] for at in times)
-    if last - first < dt:
-        raise ValueError(f"{path}: the topics share less than one interval of {dt} s; log them at the same time")
-    count = int((last - first) / dt + 1e-6)
-    if count > MAX_ROWS:
-        raise ValueError(f"{path}: {last - first:.4g} s at dt = {dt} are more than {MAX_ROWS} samples; cut the log")
-    t = np.minimum(first + dt * np.arange(count + 1), last)
-    local = interpolate(t, tp, local)
-    x = to_library(local[:, :3], interpolate_attitude(t, tq, q), local[:, 3:], interpolate(t, tw, omega), FRAMES)
-    speeds = mean_of_held(t, tu, u)
-    known = np.logical_and.reduce([_is_known(t, at, dt) for at in times])
-    return FlightLog(t[known] - first, x[known], speeds[known], str(path))
+    log, damage = _load(path)
+    tables = {each.name: each.data for each in reversed(log.data_list)}  # the first instance of each topic
+    notes = [f"{each.name}: instance {each.multi_id} is left out" for each in log.data_list if each.multi_id]
+    kinds = {0: "generic"} | OTHERS | {kind: f"multirotor of {count} rotors" for kind, count in ROTORS.items()}
+    kind = _kind(log.initial_parameters, tables)
+    facts = {"format": "PX4 ULog", "vehicle": kinds.get(kind, "unknown"), "program": _release(log.msg_info_dict)}
+    facts |= {"airframe": str(log.initial_parameters.get("SYS_AUTOSTART", "unknown"))}
+    facts |= {"SDLOG_PROFILE": str(log.initial_parameters.get("SDLOG_PROFILE", "unknown"))}
+    facts |= {"damage": damage} if damage else {}
+    if log.dropouts:
+        longest = max(each.duration for each in log.dropouts)
+        notes.append(f"{len(log.dropouts)} dropouts of the logger, the longest of {longest} ms")
+    parts = dict(_states(path, tables, notes))
+    parts |= _motors(path, tables, log.initial_parameters, ROTORS.get(kind, 0), notes)
+    return samples.record(path, parts, 1e-6, notes, facts)
 
 
-def _load(path: str | Path):
+def _load(path: str | Path) -> tuple[Any, str]:
+    """The log, and how it is damaged; empty if it is not."""
     try:
         import pyulog
     except ImportError as error:
         raise ValueError(f"{path}: reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
     try:
-        # pyulog reports damage on standard output only.
-        with contextlib.redirect_stdout(io.StringIO()):
-            log = pyulog.ULog(str(path), [*STATES, *FIELDS])
+        with contextlib.redirect_stdout(io.StringIO()):  # pyulog reports damage on standard output only
+            log = pyulog.ULog(str(path), TOPICS)
+        cut = _cut(Path(path).read_bytes())
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
     except Exception as error:  # pyulog raises any exception for a damaged file
         raise ValueError(f"{path}: is not a ULog or is damaged; download it again ({type(error).__name__})") from error
+    seconds = (log.last_timestamp - log.start_timestamp) * 1e-6
     if log.file_corruption:
-        raise ValueError(f"{path}: is damaged (pyulog found corrupt messages); download it again")
-    return {dataset.name: dataset.data for dataset in reversed(log.data_list)}  # the first instance of each topic
+        raise ValueError(f"{path}: is damaged before {seconds:.4g} s (corrupt messages); download it again")
+    return log, f"ends in the middle of a message, after {seconds:.4g} s" * cut
 
 
-def _samples(data, path, topic: str, fields: tuple[str, ...], clock: str = "timestamp_sample"):
-    """Time [s] and fields of a topic, sorted by time and without duplicates."""
-    if topic not in data:
-        raise ValueError(f"{path}: has no topic {topic}; add it to the logged topics of the vehicle")
-    table = data[topic]
-    for field in fields:
-        if field not in table:
-            raise ValueError(f"{path}: topic {topic} has no field {field}; is this a log of PX4 1.12 or later?")
+def _cut(content: bytes) -> bool:
+    """Whether the last message is incomplete, which pyulog does not say."""
+    at = 16
+    if content[at + 2 : at + 3] == b"B":  # appended data begin anew at an offset, whatever was cut before it
+        at = max(at, *struct.unpack("<3Q", content[at + 19 : at + 43]))
+    while at + 3 <= len(content):
+        at += 3 + int.from_bytes(content[at : at + 2], "little")
+    return at != len(content)
+
+
+def _kind(parameters, tables) -> int:
+    """The vehicle as of MAV_TYPE; −1 where the log does not say."""
+    kind = int(parameters.get("MAV_TYPE", 0)) or int(tables.get(STATUS, {}).get("system_type", [0])[-1])
+    airframe = int(parameters.get("SYS_AUTOSTART", 0))
+    if 13000 <= airframe < 14000 or any(tables.get(STATUS, {}).get("is_vtol", ())):
+        return 22
+    return kind or -1
+
+
+def _release(info) -> str:
+    number = int(info.get("ver_sw_release", 0))
+    version = f"PX4 {number >> 24}.{number >> 16 & 255}.{number >> 8 & 255}" if number else "PX4"
+    return f"{version} on {info.get('ver_hw', 'unknown hardware')}"
+
+
+def _table(path, tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
+    """Ticks [µs] and fields of a topic."""
+    table = tables[topic]
     # The time of the measurement where it is recorded, else that of the message.
     use_clock = clock in table and table[clock].min(initial=1) > 0
-    t = table[clock if use_clock else "timestamp"].astype(np.int64) * 1e-6
-    with np.errstate(invalid="ignore"):  # damaged numbers are refused below
-        values = np.stack([table[field] for field in fields], axis=1).astype(float)
-    for row, column in () if topic in FIELDS else np.argwhere(~np.isfinite(values))[:1].tolist():
-        where = f"topic {topic}, sample {row}, field {fields[column]}"
-        raise ValueError(f"{path}: {where}: is not finite; cut the log there")
-    t, kept = np.unique(t, return_index=True)
-    if len(t) < 2:
-        raise ValueError(f"{path}: topic {topic} has fewer than two samples; log it at a higher rate")
-    return t, values[kept]
+    ticks = table[clock if use_clock else "timestamp"].astype(np.int64)
+    if len(ticks) > 1 and (np.abs(ticks[-1] - ticks[0]) > 1e12):
+        raise ValueError(f"{path}: {topic}: time stamps span {1e-6 * abs(ticks[-1] - ticks[0]):.3g} s: is damaged")
+    with np.errstate(invalid="ignore"):  # damaged numbers are refused later
+        return ticks, np.stack([table[field] for field in fields], axis=1).astype(float)
 
 
-def _motors(data, path, order, polynomial) -> tuple[Float[np.ndarray, " n"], Float[np.ndarray, "n 4"]]:
-    """Time and rotor speeds [rad/s]: ESC rpm where there are any, else commands through the polynomial."""
-    if sorted(order) != [0, 1, 2, 3]:
-        raise ValueError(f"motor_order must hold 0, 1, 2, 3 in some order, got {order}")
-    for topic, field in FIELDS.items():
-        if topic not in data:
+def _states(path, tables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
+    for quantity, places in SOURCES.items():
+        found = [(topic, fields) for topic, fields in places if topic in tables and {*fields} <= {*tables[topic]}]
+        if not found:
             continue
-        t, values = _samples(data, path, topic, tuple(field.format(motor) for motor in order), "timestamp")
-        if topic == RPM and np.abs(values).max() > 0:
-            return t, np.abs(values) * np.pi / 30
-        if topic == RPM:
+        topic, fields = found[0]
+        ticks, values = _table(path, tables, topic, fields)
+        if quantity in VALID:
+            ticks, values = _valid(tables[topic], quantity, ticks, values, notes)
+        if quantity == "attitude":
+            values = samples.attitude(values, "NED", "FRD")
+        elif quantity != "voltage":
+            values = samples.world(values, "NED") if topic == LOCAL else samples.body(values, "FRD")
+        axes = {"attitude": WXYZ, "voltage": BATTERY}.get(quantity, XYZ)
+        yield quantity, Samples(ticks, values, axes, f"{topic} {' '.join(fields)}")
+
+
+def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.ndarray, np.ndarray]:
+    """The samples that the estimator calls valid."""
+    known = np.ones(len(ticks), bool)
+    for flag in VALID[quantity]:
+        known &= table.get(flag, np.ones(len(ticks))) > 0
+    if not known.all():
+        notes.append(f"{LOCAL}: {quantity} is not valid in {(~known).sum()} of {len(known)} samples: left out")
+    for counter in RESETS[quantity]:
+        resets = np.flatnonzero(np.diff(table.get(counter, np.zeros(1)).astype(int))) + 1
+        times = ", ".join(f"{1e-6 * float(ticks[i] - ticks[0]):.4g}" for i in resets[:5])
+        notes += [f"{LOCAL}: the estimator reset the {quantity} ({counter}) at {times} s"] * bool(len(resets))
+    return ticks[known], values[known]
+
+
+def _motors(path, tables, parameters, expected: int, notes: list[str]) -> dict[str, Samples]:
+    """Rotor speeds and commands of all motors that the log knows."""
+    expected, found = int(parameters.get("CA_ROTOR_COUNT", 0)) or expected, {}
+    for topic, field in MOTORS.items():
+        quantity = "rotor_speed" if topic == "esc_status" else "command"
+        fields = [field.format(i) for i in range(MOST) if topic in tables and field.format(i) in tables[topic]]
+        if not fields or quantity in found:
+            continue
+        ticks, values = _table(path, tables, topic, fields, "timestamp")
+        moving = [i for i in range(len(fields)) if len(np.unique(values[np.isfinite(values[:, i]), i])) > 1]
+        count = max(expected, max(moving, default=-1) + 1)  # no motor is dropped: checks compare with the vehicle
+        if topic == "esc_status" and not moving:
             continue  # ESCs without telemetry report zero
-        if not polynomial:
-            raise ValueError(f"{path}: has only motor commands ({topic}); give the polynomial that maps them to rad/s")
-        on = np.isfinite(values)  # PX4 writes NaN for a motor that is disarmed
-        return t, np.where(on, np.polynomial.polynomial.polyval(np.where(on, values, 0.0), polynomial), 0.0)
-    raise ValueError(f"{path}: has no motors (none of {', '.join(FIELDS)}); log one of these topics and fly again")
+        if not 0 < count <= len(fields):
+            notes.append(f"{topic}: {count} of {len(fields)} motors move: left out")
+            continue
+        used = values[:, :count]
+        if topic == "esc_status":
+            used = np.abs(used) * np.pi / 30
+        elif topic == OUTPUTS:
+            low, full = (_pwm(parameters, end, default) for end, default in (("MIN", IDLE_PWM), ("MAX", FULL_PWM)))
+            used = np.maximum(used - low, 0.0) / (full - low)
+            notes.append(f"{OUTPUTS}: commands are shares from {low:g} to {full:g} µs")
+        # PX4 writes NaN for a motor that is disarmed.
+        found[quantity] = Samples(ticks, np.nan_to_num(used, nan=0.0), tuple(map(str, range(count))), topic)
+    return found
 
 
-def _is_known(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], dt: float):
-    """Whether t lies between two samples without a gap; the start of a gap counts as known."""
-    intervals = np.diff(at)
-    lost = intervals > LOST * max(float(np.median(intervals)), dt)
-    inside = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(intervals) - 1)
-    return ~lost[inside] | (t == at[inside])
+def _pwm(parameters, end: str, default: float) -> float:
+    """PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
+    given = (parameters.get(name, 0) for name in (f"PWM_MAIN_{end}1", f"PWM_MAIN_{end}", f"PWM_{end}"))
+    return float(next((value for value in given if value > 0), default))

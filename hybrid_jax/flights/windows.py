@@ -4,8 +4,7 @@ Windows of one flight overlap and share wind, battery and payload, so a split of
 """
 
 import re
-import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -13,18 +12,16 @@ import jax
 import numpy as np
 
 from hybrid_jax import checks
-from hybrid_jax.flights.cleaning import lag_motors, resample
-from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
-from hybrid_jax.flights.consistency import FAILS, check_log
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.cleaning import in_flight, lag_motors, resample
+from hybrid_jax.flights.column_map import ColumnMap
+from hybrid_jax.flights.consistency import check_log
+from hybrid_jax.flights.loading import Failed, load_logs, report
 from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
-from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
 
 Split = tuple[list[FlightLog], list[FlightLog]]  # training, held out
-SUFFIXES = (".csv", ".csv.gz", ".ulg")  # of log files
-_SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg)$", re.IGNORECASE)
+_SUFFIX = re.compile(r"(\.csv|\.csv\.gz|\.ulg|\.mcap|\.db3|\.bag|\.bbl|\.bfl|\.gz)$", re.IGNORECASE)
 _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORECASE)
 
 
@@ -49,26 +46,33 @@ def load_windows(
     stride: int = 1,
     columns: ColumnMap | str | Path | None = None,
     polynomial: tuple[float, ...] = (),
+    topics: Mapping[str, str] | None = None,
+    motor_order: Sequence[int] = (),
     motor_time_constant: float = 0.0,
-    strict: bool = False,
+    cut_ground: bool = False,
+    failed: Failed = "refuse",
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
 
-    Windows never cross a gap or a repeated sample. Each consistency check that fails is a one-line warning.
+    Windows never cross a gap or a repeated sample. What a check warns of is a one-line warning.
 
     Args:
-        folder: holds one `.csv`, `.csv.gz` or `.ulg` file per flight.
+        folder: holds one log per flight, of any format of `read_recording`; other files are passed over.
         vehicle: constants that the checks compare the logs with.
-        dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one.
+        dt: interval [s] to which logs of other intervals are resampled; by default all logs must share one, and those
+            whose signals have times of their own get 0.01.
         steps: intervals per window.
         stride: samples between the starts of two windows.
         columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
-        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for ULog files without ESC telemetry.
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs of commands from 0 to 1 alone.
+        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.rosbag`.
+        motor_order: which motor of the log, from 0, each rotor of the vehicle is.
         motor_time_constant: first-order lag [s] of the rotors, for logs that record commands and not rotor speeds.
-        strict: raise at the first check that fails.
+        cut_ground: cut out periods with hardly any thrust, on the ground.
+        failed: what a failed check does: "refuse" raises an error, "warn" is a warning.
 
     Returns:
-        Windows in float32: x0 (n, 13), u (n, steps, 4) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
+        Windows in float32: x0 (n, 13), u (n, steps, rotors) [rad/s], x (n, steps, 13), as in `hybrid_jax.state`.
 
     Raises:
         ValueError: the file or argument, and what was expected, in one line.
@@ -77,54 +81,17 @@ def load_windows(
     checks.count("stride", stride)
     if dt is not None:
         checks.positive("dt", dt, "a positive number of seconds")
-    logs = load_logs(folder, columns=columns, polynomial=polynomial)
-    for log in logs:
-        for check in check_log(log, vehicle):
-            if check.verdict == FAILS:
-                message = f"{log.name}: {check.name}: {check.suggestion}"
-                if strict:
-                    raise ValueError(message)
-                warnings.warn(message, stacklevel=2)
+    given = {"columns": columns, "polynomial": polynomial, "topics": topics, "motor_order": motor_order}
+    logs = load_logs(folder, **given, dt=dt, vehicle=vehicle, failed=failed)
     if dt is not None:
         logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
+    if cut_ground:
+        logs = [in_flight(log)[0] for log in logs]
+    report([(log.name, check) for log in logs for check in check_log(log, vehicle)], failed)
     require_common_interval(logs)
     if motor_time_constant:
         logs = [lag_motors(log, motor_time_constant)[0] for log in logs]
     return cut_windows(logs, steps, stride).windows
-
-
-def load_logs(
-    folder: str | Path, *, columns: ColumnMap | str | Path | None = None, polynomial: tuple[float, ...] = ()
-) -> list[FlightLog]:
-    """Read all logs of a folder in the order of their names; see `load_windows` for the arguments.
-
-    Raises:
-        ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
-    """
-    folder = Path(folder)
-    if not folder.is_dir():
-        raise ValueError(f"{folder}: no such folder")
-    files = (path for path in folder.iterdir() if path.is_file() and not path.name.startswith("."))
-    logs = sorted(path for path in files if path.name.lower().endswith(SUFFIXES))
-    if not logs:
-        raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)})")
-    if isinstance(columns, str | Path):
-        columns = load_column_map(columns)
-    return [load_log(path, columns=columns, polynomial=polynomial) for path in logs]
-
-
-def load_log(path: str | Path, *, columns: ColumnMap | None = None, polynomial: tuple[float, ...] = ()) -> FlightLog:
-    """Read one log: a ULog file (`.ulg`), else a CSV file. See `load_windows` for the arguments.
-
-    Raises:
-        ValueError: the file, row, field and what to do, in one line.
-    """
-    if str(path).lower().endswith(".ulg"):
-        return read_ulog(path, polynomial=polynomial)
-    log = read_csv(path) if columns is None else read_mapped(path, columns)
-    if len(log) < 2:
-        raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
-    return log
 
 
 def flight_of(log: FlightLog) -> str:

@@ -14,8 +14,12 @@ from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.reading import reordered
+from hybrid_jax.flights.suitability import check_recording, failures
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.state import QUATERNION
+from hybrid_jax.vehicle import IRIS
 
 pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
 
@@ -36,13 +40,16 @@ def message(kind, payload):
     return struct.pack("<HB", len(payload), ord(kind)) + payload
 
 
-def ulog(topics):
+def ulog(topics, formats=None, parameters=None, ordered=True):
     """Bytes of a log: topic → list of packed samples, each of which begins with its time."""
     parts = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", START), message("B", bytes(40))]
-    parts += [message("F", f"{name}:{fields}".encode()) for name, fields in FORMATS.items()]
+    parts += [message("F", f"{name}:{fields}".encode()) for name, fields in (FORMATS | (formats or {})).items()]
+    for name, value in (parameters or {}).items():
+        key = f"int32_t {name}".encode()
+        parts.append(message("P", bytes([len(key)]) + key + struct.pack("<i", value)))
     parts += [message("A", struct.pack("<BH", 0, at) + name.encode()) for at, name in enumerate(topics)]
     data = [(sample[:8], at, sample) for at, samples in enumerate(topics.values()) for sample in samples]
-    for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0])):
+    for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0]) if ordered else 0):
         parts.append(message("D", struct.pack("<H", at) + sample))
     return b"".join(parts)
 
@@ -100,7 +107,7 @@ def written(tmp_path):
 
 def test_a_flight_with_esc_rpm_is_read(flight, topics, written):
     t = flight.t - flight.t[0]
-    log = read_ulog(written(topics | {"esc_status": escs(t, flight.u)}))
+    log = to_flight(read_ulog(written(topics | {"esc_status": escs(t, flight.u)})))
     np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-9)
     truth = CubicSpline(t, flight.x)(log.t + 0.003)
     # Linear between samples: ẍ / (8 · 50²) of position and velocity, ω̈ / (8 · 200²) of rates; slerp of attitude.
@@ -112,38 +119,82 @@ def test_a_flight_with_esc_rpm_is_read(flight, topics, written):
     np.testing.assert_allclose(log.u[:-1], mean[: len(log) - 1], atol=0.1)
 
 
-def test_commands_are_converted_by_the_polynomial(flight, topics, written):
+def test_commands_are_shares_that_the_polynomial_converts(flight, topics, written):
     path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
-    log = read_ulog(path, polynomial=(100.0, 1000.0), motor_order=(2, 0, 3, 1))
+    log = to_flight(reordered(read_ulog(path), (2, 0, 3, 1)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
-    refusal(lambda: read_ulog(path), path, "actuator_motors", "polynomial")
-    refusal(lambda: read_ulog(path, motor_order=(0, 1, 2, 2)), "motor_order")
-    refusal(lambda: read_ulog(path, dt=0.0), "dt must be")
+    refusal(lambda: to_flight(read_ulog(path)), path, "actuator_motors", "--polynomial")
+    refusal(lambda: reordered(read_ulog(path), (0, 1, 2, 2)), path, "--motor-order")
+    refusal(lambda: to_flight(read_ulog(path), dt=0.0), "dt must be")
 
 
 def test_commands_are_used_if_escs_report_zero(flight, topics, written):
     t = flight.t - flight.t[0] + 0.003
     both = topics | {"esc_status": escs(t, 0 * flight.u), "actuator_motors": commands(t, flight.u)}
-    log = read_ulog(written(both), polynomial=(100.0, 1000.0))
+    log = to_flight(read_ulog(written(both)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-5)
+
+
+def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, written):
+    """PX4 1.6: no timestamp_sample, rates in vehicle_attitude, commands in µs, 1000 … 2000 by default."""
+    t = flight.t - flight.t[0]
+    formats = {
+        "vehicle_attitude": "uint64_t timestamp;float rollspeed;float pitchspeed;float yawspeed;float[4] q;",
+        "actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;",
+    }
+    old = {name: [] for name in formats}
+    for at, q, omega, u in zip(
+        START + np.round(t * 1e6).astype(int), flight.x[:, 3:7], flight.x[:, 10:], flight.u, strict=True
+    ):
+        old["vehicle_attitude"].append(struct.pack("<Q7f", at, *(omega @ BODIES["FRD"]), *q))
+        old["actuator_outputs"].append(struct.pack("<QI16f", at, 6, *(1000 + u), *[900.0] * 2, *[0.0] * 10))
+    recording = read_ulog(written(ulog(old, formats)))
+    np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
+    np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
+    refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "SDLOG_PROFILE")
+
+
+def test_a_moving_motor_is_never_dropped_and_another_airframe_is_refused(flight, topics, written):
+    t = flight.t - flight.t[0]
+    moving = np.concatenate([flight.u[:, :2]] * 3, axis=1)
+    rows = stamped(t, np.concatenate([moving / 2000, np.full((len(t), 6), np.nan)], axis=1))
+    path = written(ulog(topics | {"actuator_motors": rows}, parameters={"MAV_TYPE": 2, "SYS_AUTOSTART": 4001}))
+    assert read_ulog(path).rotors == 6
+    (line,) = failures(check_recording(read_ulog(path), IRIS), "log")
+    assert "6 motors are logged" in line
+    assert "--motor-order 0,1,2,3" in line
+    assert not failures(check_recording(reordered(read_ulog(path), (0, 1, 2, 3)), IRIS), "log")
+    path = written(ulog(topics | {"actuator_motors": rows}, parameters={"MAV_TYPE": 2, "SYS_AUTOSTART": 13014}))
+    assert any("VTOL (SYS_AUTOSTART 13014)" in line for line in failures(check_recording(read_ulog(path)), "log"))
+
+
+def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
+    """ESC telemetry at 4 Hz may not become rotor speeds at 100 Hz."""
+    t = flight.t - flight.t[0]
+    recording = read_ulog(written(topics | {"esc_status": escs(t[::25], flight.u[::25])}))
+    (line,) = failures(check_recording(recording, IRIS, 0.03), "log")
+    assert "motors 4 Hz" in line
+    assert "--cleaning.resample 0.25" in line
+    assert not failures(check_recording(recording, IRIS, 0.25), "log")
 
 
 @pytest.mark.parametrize("missing", STATES)
 def test_a_missing_topic_is_named(flight, topics, written, missing):
     motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
-    refusal(lambda: read_ulog(path), path, missing, "add it")
+    quantity = dict(zip(STATES, ("position", "attitude", "rates"), strict=True))[missing]
+    refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "SDLOG_PROFILE")
 
 
 def test_a_log_without_motors_is_refused(topics, written):
     path = written(topics)
-    refusal(lambda: read_ulog(path), path, "no motors", "actuator_motors", "esc_status")
+    refusal(lambda: to_flight(read_ulog(path)), path, "no motors")
 
 
 def test_a_dropout_becomes_a_gap(flight, topics, written):
     t = flight.t - flight.t[0]
     holed = topics["vehicle_attitude"][:500] + topics["vehicle_attitude"][550:]  # 0.4 s from 4.003 s on
-    log = read_ulog(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)}))
+    log = to_flight(read_ulog(written(topics | {"vehicle_attitude": holed, "esc_status": escs(t, flight.u)})))
     intervals = np.diff(log.t)
     assert intervals.max() == pytest.approx(0.4, abs=0.02)
     assert np.count_nonzero(intervals > 0.015) == 1
@@ -160,7 +211,25 @@ def test_other_files_are_refused(flight, topics, written, tmp_path):
     zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
     refusal(lambda: read_ulog(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
     bad = stamped(np.arange(0.0, 5, 0.01), np.full((500, 3), np.nan))
-    refusal(lambda: read_ulog(written(topics | {"vehicle_angular_velocity": bad})), "sample 0", "xyz[0]", "not finite")
+    refusal(lambda: read_ulog(written(topics | {"vehicle_angular_velocity": bad})), "xyz[0]", "is nan at 0 s")
+
+
+def test_a_log_that_was_cut_off_is_read_and_fails(flight, topics, written):
+    whole = ulog(topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)})
+    (line,) = failures(check_recording(read_ulog(written(whole[:-500])), IRIS), "log")
+    assert "ends in the middle of a message, after 11" in line
+    assert "--anyway" in line
+
+
+def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
+    rates, late = topics["vehicle_angular_velocity"], stamped(np.arange(0.0, 1, 0.005) + 3600, np.ones((200, 3)))
+    recording = read_ulog(written(topics | {"vehicle_angular_velocity": rates + late}))
+    (line,) = [line for line in failures(check_recording(recording), "log") if "longest gap" in line]
+    assert "vehicle_angular_velocity" in line
+    assert "split the file" in line
+    back = rates[:1000] + stamped(np.arange(0.0, 1, 0.005), np.ones((200, 3)))
+    content = ulog({"vehicle_angular_velocity": back}, ordered=False)
+    refusal(lambda: read_ulog(written(content)), "flight.ulg", "vehicle_angular_velocity", "time goes back from")
 
 
 @pytest.fixture(scope="module")

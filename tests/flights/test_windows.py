@@ -24,18 +24,19 @@ def test_windows_are_those_of_all_logs(tmp_path, recwarn):
 @pytest.mark.filterwarnings("ignore")
 def test_logs_are_resampled_to_dt_and_rotors_may_lag(tmp_path):
     write(tmp_path, [LOGS[0], replace(LOGS[1], t=2 * LOGS[1].t)])
-    refusal(lambda: hj.load_windows(tmp_path, IRIS), "0.02 s apart", "dt=0.02")
-    windows = hj.load_windows(tmp_path, IRIS, dt=0.02, motor_time_constant=0.05)
+    refusal(lambda: hj.load_windows(tmp_path, IRIS, failed="warn"), "0.02 s apart", "dt=0.02")
+    windows = hj.load_windows(tmp_path, IRIS, dt=0.02, motor_time_constant=0.05, failed="warn")
     assert windows.dt == 0.02
-    assert windows.u.std() < hj.load_windows(tmp_path, IRIS, dt=0.02).u.std()
+    assert windows.u.std() < hj.load_windows(tmp_path, IRIS, dt=0.02, failed="warn").u.std()
 
 
 def test_failed_checks_are_reported(tmp_path):
     still = FlightLog(LOGS[0].t, LOGS[0].x, LOGS[0].u * [1, 1, 1, 0], "still.csv")
     write(tmp_path, [still])
     with pytest.warns(UserWarning, match=r"still.csv.gz: columns: u3 never changes"):
-        hj.load_windows(tmp_path, IRIS)
-    refusal(lambda: hj.load_windows(tmp_path, IRIS, strict=True), "still.csv.gz")
+        hj.load_windows(tmp_path, IRIS, failed="warn")
+    refusal(lambda: hj.load_windows(tmp_path, IRIS), "still.csv.gz: ", 'failed="warn" goes on')
+    refusal(lambda: hj.load_windows(tmp_path, IRIS, failed="no"), "failed must be")
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,126 @@
+"""From the command line to the page: python -m experiments.inspect_logs --help."""
+
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+from rich.console import Console
+
+from experiments.inspect_logs.estimates import estimate
+from experiments.inspect_logs.page import Inspected, write_page
+from experiments.inspect_logs.vehicle import vehicle_text
+from experiments.real_flight.config import read_topics
+from experiments.runner import command
+from experiments.runner.options import Positive, check_numbers
+from hybrid_jax.flights.column_map import load_column_map
+from hybrid_jax.flights.consistency import check_log
+from hybrid_jax.flights.loading import Reading, asked_interval, read_log
+from hybrid_jax.flights.reading import find_logs, read_recording
+from hybrid_jax.flights.suitability import check_recording
+from hybrid_jax.io.files import json_value, write_atomic
+from hybrid_jax.vehicle import Vehicle, load_vehicle
+
+NAME = "inspect_logs"
+LISTS = ("--polynomial", "--motor-order", "--topics")
+DT = 0.01  # s
+
+
+@dataclass(frozen=True)
+class Options:
+    """Say what is in the logs of a folder, whether it suffices for a model, and what to log instead.
+
+    Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV, each file by itself, so
+    that one that is damaged hides no other. Nothing is trained and no log is changed. OUT/inspect_logs/report.md holds
+    every signal with its rate, all checks with what mends those that fail, and pictures.
+
+    First look at the logs, then write a vehicle file from them, correct it by hand, and look again with it:
+
+      python -m experiments.inspect_logs flights/
+      python -m experiments.inspect_logs flights/ --write-vehicle v.toml --mass 0.68 --arm 0.12
+      python -m experiments.inspect_logs flights/ --vehicle v.toml
+      python -m experiments.real_flight --vehicle v.toml --source flights/
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of logs, or one log."""
+    vehicle: Path | None = None
+    """Vehicle file that the logs are compared with: number and order of motors, spin, thrust, largest speed."""
+    write_vehicle: Path | None = None
+    """Write a vehicle file to start from: hover and thrust, where the rotors are, spin, lag and centre of thrust as the
+    logs tell, with a comment on each number that they do not. An existing file is not overwritten."""
+    mass: Positive | None = None
+    """With --write-vehicle: what the vehicle weighs [kg]. No log tells it; thrust and inertia grow with it."""
+    arm: Positive | None = None
+    """With --write-vehicle: distance of a rotor from the centre [m]. No log tells it; inertia grows with it."""
+    dt: Positive = DT
+    """Interval [s] that a model is to have. A signal that is slower fails a check, as half of it would be invented."""
+    columns: Path | None = None
+    """TOML file of the columns, units and frames of CSV logs: see docs/howto/logs.md."""
+    topics: tuple[str, ...] = ()
+    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
+    motor_order: tuple[int, ...] = ()
+    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
+    polynomial: tuple[float, ...] = ()
+    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
+    from 0 (stop) to 1 (full). It comes from a test stand, or from two points: 100,1000 if a motor turns with 100 rad/s
+    as it starts and with 1100 at the full command. PWM of 1000 … 2000 µs and DShot are turned into 0 … 1 beforehand."""
+    out: Path = Path("runs")
+    """Folder for the page; the subfolder inspect_logs is created in it."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    command.call(NAME, Options, inspect, command.split_lists(given, LISTS))
+
+
+def inspect(options: Options) -> None:
+    check_numbers("--", options)
+    read_topics(options.topics)
+    if options.write_vehicle is not None and options.write_vehicle.exists():
+        raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
+    vehicle = None if options.vehicle is None else load_vehicle(options.vehicle)
+    folder = options.folder
+    paths, left = find_logs(folder) if folder.is_dir() else ([folder], {})
+    if not paths:
+        raise ValueError(f"{folder}: holds no logs, only {', '.join(path.name for path in left) or 'nothing'}")
+    logs = [look(path, vehicle, options) for path in paths]
+    console = Console()
+    write_page(options.out / NAME, logs, left, json_value(_described(options)), console)
+    if options.write_vehicle is not None:
+        found = estimate([log.reading.recording for log in logs if log.reading is not None])
+        write_atomic(options.write_vehicle, vehicle_text(found, folder.resolve().stem, options.mass, options.arm))
+        console.print(f"{options.write_vehicle}: written; read its comments before it is used", highlight=False)
+
+
+def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
+    """Read and check one log; what refuses it is part of the result."""
+    try:
+        columns = None if options.columns is None else load_column_map(options.columns)
+        reading = _read(path, columns, options)
+    except ValueError as error:
+        return Inspected(path, None, [], str(error))
+    checks = check_recording(reading.recording, vehicle, asked_interval(reading, options.dt))
+    try:
+        flight = reading.flight(options.dt, options.polynomial)
+    except ValueError as error:
+        return Inspected(path, reading, checks, str(error))
+    return Inspected(path, reading, [*checks, *(check_log(flight, vehicle) if vehicle is not None else [])], "")
+
+
+def _read(path: Path, columns, options: Options) -> Reading:
+    """The log, also where it is a CSV file without all that a flight needs."""
+    given = {"topics": read_topics(options.topics), "motor_order": options.motor_order}
+    if columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
+        return Reading(read_recording(path, columns, **given))
+    return read_log(path, columns=columns, **given)
+
+
+def _described(options: Options) -> dict:
+    return {name: str(value) if isinstance(value, Path) else value for name, value in asdict(options).items()}
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,189 @@
+"""What the logs of a vehicle tell of it: hover, thrust, where the rotors are and how they spin, lag and trim.
+
+Angular acceleration is regressed on the squares of the motors, both band-passed: ω̇ = B s, s = w², τ ẇ = u − w. The
+signs of B's columns place each rotor and give its spin; the lag is the τ that explains roll and pitch best.
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+from scipy.signal import lfilter
+
+from hybrid_jax.flights.attitude import interpolate, mean_of_held
+from hybrid_jax.flights.cleaning import TIME_CONSTANTS
+from hybrid_jax.flights.conversion import motors_of
+from hybrid_jax.flights.readings import FAST, moving_mean
+from hybrid_jax.flights.recording import Recording, Signal
+
+FASTEST, LONGEST = 0.002, 60.0  # s: least interval, and how much of each log is used
+GRAVITY, HOVER = 9.81, 0.5  # m/s²; the specific force of hover is that close to gravity
+FLYING = 0.3  # share of the motors' 0.9-quantile below which a vehicle stands
+SLOW = 1.0  # s of a trend that is taken out; longer than the lag, which would not show otherwise
+EXPLAINED = 0.3  # correlation of roll and pitch with the regression from which on it counts
+FOLLOWS = 0.5  # correlation of thrust with the motors from which on it tells their lag
+LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
+
+
+class Estimate(NamedTuple):
+    """Numbers of one vehicle with n rotors; motors are speeds [rad/s] or commands from 0 to 1."""
+
+    commands: bool
+    largest: float  # motor value in the logs
+    hover: Float[np.ndarray, " n"]  # root mean square of each motor in hover
+    voltage: float  # in hover [V]; not a number if unknown
+    effect: Float[np.ndarray, "3 n"]  # B, angular acceleration for each s [rad/s² of a squared motor]
+    correlations: Float[np.ndarray, " 3"]  # of roll, pitch and yaw with the regression
+    lag: float  # τ [s]
+    curve: Float[np.ndarray, " 3"] | None  # c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command
+    seconds: float  # in flight
+
+    @property
+    def placed(self) -> bool:
+        """Whether roll and pitch follow the motors well enough to place the rotors."""
+        return bool(self.correlations[:2].min() > EXPLAINED)
+
+    def positions(self, arm: float) -> Float[np.ndarray, "n 2"]:
+        """(x, y) of each rotor at a distance `arm` [m], evenly around the centre, one of them or a gap in front."""
+        count, found = len(self.hover), np.arctan2(self.effect[0], -self.effect[1])
+        rank = np.argsort(np.argsort(found))
+        grids = [2 * np.pi * (rank + shift / 2) / count - np.pi for shift in range(2 * count)]
+        angles = max(grids, key=lambda grid: np.cos(found - grid).sum())
+        return arm * np.stack([np.cos(angles), np.sin(angles)], axis=1)
+
+    def spin(self) -> list[int]:
+        """The sign of each rotor's reaction torque; of an even number of rotors, neighbours differ."""
+        turns = self.effect[2]
+        if len(turns) % 2 == 0:
+            places = self.positions(1.0)
+            pattern = 1 - 2 * (np.argsort(np.argsort(np.arctan2(places[:, 1], places[:, 0]))) % 2)
+            turns = pattern * (pattern @ turns)
+        return [1 if each > 0 else -1 for each in turns]
+
+    def inertia(self, thrust: float, places: Float[np.ndarray, "n 2"]) -> tuple[float, float]:
+        """Ix and Iy [kg m²], of a thrust [N] per squared motor and the places of the rotors [m]."""
+        roll, pitch = self.effect[0], -self.effect[1]
+        y, x = places[:, 1], places[:, 0]
+        return float(thrust * (y @ roll) / (roll @ roll)), float(thrust * (x @ pitch) / (pitch @ pitch))
+
+    def centre(self, places: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, " 2"]:
+        """The centre of thrust in hover [m], above which there is no torque, if all rotors are equal."""
+        return self.hover**2 @ places / (self.hover**2).sum()
+
+
+def estimate(recordings: Sequence[Recording]) -> Estimate:
+    """Estimate from all logs that hold motors; without body rates, what turns the vehicle stays unknown.
+
+    Raises:
+        ValueError: no log holds them in flight.
+    """
+    usable = [each for each in recordings if each.rotors]
+    count = usable[0].rotors if usable else 0
+    pieces = [piece for each in usable if each.rotors == count for piece in _pieces(each)]
+    if not pieces:
+        raise ValueError("--write-vehicle: no log holds motors in flight; see the page for what to log")
+    commands = pieces[0].commands
+    pieces = [piece for piece in pieces if piece.commands == commands]
+    fits = {lag: _regress(pieces, lag) for lag in TIME_CONSTANTS}
+    heave = {lag: found for lag in TIME_CONSTANTS if (found := _curve(pieces, lag)) is not None}
+    # Thrust tells the lag better than roll and pitch, which the controller couples to the motors.
+    scores = {lag: correlation for lag, (_, correlation) in heave.items()}
+    if min(scores.values(), default=0.0) < FOLLOWS:
+        scores = {lag: float(correlations[:2].sum()) for lag, (_, correlations) in fits.items()}
+    lag = max(scores, key=scores.__getitem__)
+    u, force = np.concatenate([piece.u for piece in pieces]), np.concatenate([piece.force for piece in pieces])
+    mean = u.mean(axis=1)
+    hovers = (np.abs(force - GRAVITY) < HOVER) & (mean > FLYING * np.quantile(mean, 0.9))
+    hovers = hovers if hovers.any() else mean > FLYING * np.quantile(mean, 0.9)
+    volts = np.concatenate([piece.volts for piece in pieces])[hovers]
+    return Estimate(
+        commands,
+        float(u.max()),
+        np.sqrt((u[hovers] ** 2).mean(axis=0)),
+        float(np.nanmean(volts)) if np.isfinite(volts).any() else np.nan,
+        *fits[lag],
+        lag,
+        heave[lag][0] if lag in heave else None,
+        sum(len(piece.u) * piece.dt for piece in pieces),
+    )
+
+
+class _Piece(NamedTuple):
+    """Samples at even times, in flight and without gaps."""
+
+    dt: float
+    u: Float[np.ndarray, "m n"]
+    omega: Float[np.ndarray, "m 3"]
+    force: Float[np.ndarray, " m"]  # along z; not a number if unknown
+    volts: Float[np.ndarray, " m"]
+    commands: bool
+
+
+def _pieces(recording: Recording) -> list[_Piece]:
+    """The parts of a log between gaps, and without the ground."""
+    motors = motors_of(recording)
+    still = Signal(motors.t, np.zeros((len(motors), 3)), ("x", "y", "z"), "no body rates")
+    rates = recording.signals.get("rates", still)
+    dt = max(rates.interval, motors.interval, FASTEST)
+    first, last = max(rates.t[0], motors.t[0]), min(rates.t[-1], motors.t[-1])
+    middle = max(first, (first + last - LONGEST) / 2)
+    t = np.arange(middle, min(last, middle + LONGEST), dt)
+    if len(t) < 2:
+        return []
+    u = mean_of_held(t, motors.t, motors.values)
+    known = np.logical_and.reduce(
+        [(t < start) | (t > end) for each in (motors, rates) for start, end in each.gaps()] or [t > -1]
+    )
+    flying = known & (u.mean(axis=1) > FLYING * np.quantile(u.mean(axis=1), 0.9))
+    force, volts = (
+        _column(recording.signals.get(name), axis, t)
+        for name, axis in (("specific_force", "z"), ("voltage", "battery"))
+    )
+    omega, edges = interpolate(t, rates.t, rates.values), np.flatnonzero(np.diff(np.r_[0, flying, 0]))
+    commands = motors is not recording.signals.get("rotor_speed")
+    cut = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if (b - a) * dt > 2 * SLOW]
+    return [_Piece(dt, u[part], omega[part], force[part], volts[part], commands) for part in cut]
+
+
+def _column(signal: Signal | None, axis: str, t: np.ndarray) -> np.ndarray:
+    if signal is None or axis not in signal.axes or len(signal) < 2:
+        return np.full(len(t), np.nan)
+    return np.interp(t, signal.t, signal.values[:, signal.axes.index(axis)])
+
+
+def _lagged(piece: _Piece, lag: float) -> Float[np.ndarray, "m n"]:
+    """The motors behind a first-order lag."""
+    kept = np.exp(-piece.dt / lag) if lag else 0.0
+    return lfilter([1 - kept], [1.0, -kept], piece.u, axis=0, zi=kept * piece.u[:1])[0]
+
+
+def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3 n"], Float[np.ndarray, " 3"]]:
+    """B, and the correlations of ω̇ about each axis with B s."""
+    rows = []
+    for piece in pieces:
+        fast, slow = (max(1, round(span / piece.dt)) for span in (FAST, SLOW))
+        turned = np.diff(piece.omega, axis=0) / piece.dt
+        smooth = moving_mean(np.concatenate([turned, (_lagged(piece, lag) ** 2)[:-1]], axis=1), fast)
+        trend = moving_mean(smooth, slow)
+        rows.append(smooth[slow // 2 :][: len(trend)] - trend)
+    both = np.concatenate(rows)
+    turned, squares = both[:, :3], both[:, 3:]
+    effect = np.linalg.lstsq(squares, turned, rcond=1e-6)[0].T
+    explained = squares @ effect.T
+    size = np.sqrt((explained**2).sum(axis=0) * (turned**2).sum(axis=0))
+    return effect, (explained * turned).sum(axis=0) / np.maximum(size, 1e-12)
+
+
+def _curve(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, " 3"], float] | None:
+    """Specific force along z over the motors, for one rotor of n, and its correlation; None if it hardly varies."""
+    lagged = np.concatenate([_lagged(piece, lag) for piece in pieces])
+    force = np.concatenate([piece.force for piece in pieces])
+    known = np.isfinite(force)
+    if known.sum() < 100 or force[known].std() < LEAST_SPREAD:
+        return None
+    powers = np.stack([(lagged[known] ** power).sum(axis=1) for power in range(3)], axis=1)
+    curve = np.linalg.lstsq(powers, force[known], rcond=None)[0]
+    if curve[1] + 2 * curve[2] * np.quantile(lagged[known], 0.01) <= 0:
+        return None  # it would fall: the commands cover too little
+    return curve, float(np.corrcoef(powers @ curve, force[known])[0, 1])

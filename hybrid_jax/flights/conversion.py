@@ -1,0 +1,104 @@
+"""From a recording, whose signals have times of their own, to the samples of a flight on one grid."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from hybrid_jax import checks
+from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held, rotation_of
+from hybrid_jax.flights.flight_csv import MAX_ROWS
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.recording import GAP, ROTOR_UNITS, Recording, Signal
+
+DT = 0.01  # s, of logs whose signals have times of their own
+STATES = ("position", "velocity", "attitude", "rates")
+# What to log, by format.
+ADVICE = {
+    "PX4 ULog": "set SDLOG_PROFILE 25, and list vehicle_local_position in logger_topics.txt (docs/howto/logs.md)",
+    "Crazyflie µSD": "add stateEstimate.x … z, vx … vz, qw … qz, gyro.x … z, motor.m1 … m4 to the card's config.txt",
+    "ROS bag": "record odometry, IMU and motors, and name them: --topics motors=/TOPIC:FIELD:UNIT",
+    "Betaflight blackbox": "blackbox cannot hold them: it serves to identify thrust, inertia and lag",
+    "CSV": "name the columns in a column map: --columns MAP.toml",
+}
+
+
+def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
+    """The flight at intervals of dt [s], from the time on when all signals have begun; a gap of one is a gap of all.
+
+    States are interpolated linearly, attitudes spherically; rotor speeds are means of held values.
+
+    Args:
+        polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, of commands as shares from 0 to 1; not needed where
+            speeds were measured, but then preferred to speeds that are slower than commands.
+
+    Raises:
+        ValueError: a quantity that is missing and what to log, or signals that share no time, in one line.
+    """
+    checks.positive("dt", dt, "a positive number of seconds")
+    if missing := missing_states(recording):
+        raise ValueError(f"{recording.name}: holds no {' and no '.join(missing)}; {what_to_log(recording)}")
+    signals = recording.signals
+    motors = motors_of(recording, bool(len(polynomial)))
+    used = [signals[name] for name in (*STATES, "body_velocity") if name in signals] + [motors]
+    for signal in used:
+        if len(signal) < 2:
+            raise ValueError(f"{recording.name}: {signal.source} has fewer than two samples; log it at a higher rate")
+    first, last = max(signal.t[0] for signal in used), min(signal.t[-1] for signal in used)
+    if last - first < dt:
+        raise ValueError(f"{recording.name}: the signals share less than {dt} s; log them at the same time")
+    if (last - first) / dt > MAX_ROWS:
+        raise ValueError(f"{recording.name}: {last - first:.4g} s are over {MAX_ROWS} samples of {dt} s; cut the log")
+    t = np.minimum(first + dt * np.arange(int((last - first) / dt + 1e-6) + 1), last)
+    q = interpolate_attitude(t, signals["attitude"].t, signals["attitude"].values)
+    p, omega = (interpolate(t, signals[name].t, signals[name].values) for name in ("position", "rates"))
+    if "velocity" in signals:
+        v = interpolate(t, signals["velocity"].t, signals["velocity"].values)
+    else:
+        v = rotation_of(q).apply(interpolate(t, signals["body_velocity"].t, signals["body_velocity"].values))
+    u = mean_of_held(t, motors.t, _speeds(recording, motors, polynomial))
+    known = np.logical_and.reduce([_is_known(t, signal.t, dt) for signal in used])
+    x = np.concatenate([p, q, v, omega], axis=1)
+    return FlightLog(t[known] - first, x[known], u[known], recording.name)
+
+
+def missing_states(recording: Recording) -> list[str]:
+    """The quantities that a flight needs and the recording lacks, partly or whole."""
+    found = {name for name, signal in recording.signals.items() if len(signal.axes) >= 3}
+    found |= {"velocity"} if "body_velocity" in found else set()
+    return [name for name in STATES if name not in found] + ["motors"] * (not found & ROTOR_UNITS.keys())
+
+
+def what_to_log(recording: Recording) -> str:
+    """What to change in what is logged, or why a quantity that is logged was left out."""
+    invalid = next((f"{note}; wait for the estimator" for note in recording.notes if "is not valid" in note), "")
+    return invalid or ADVICE.get(recording.facts.get("format", ""), "log it and fly again")
+
+
+def motors_of(recording: Recording, convertible: bool = True) -> Signal:
+    """Rotor speeds where there are any, unless commands that can be converted are faster."""
+    speeds, commands = (recording.signals.get(name) for name in ("rotor_speed", "command"))
+    faster = speeds is None or (convertible and commands is not None and commands.interval < 0.9 * speeds.interval)
+    chosen = commands if faster else speeds
+    if chosen is None:
+        raise ValueError(f"{recording.name}: holds no motors; {what_to_log(recording)}")
+    return chosen
+
+
+def _speeds(recording: Recording, motors: Signal, polynomial: Sequence[float]) -> Float[np.ndarray, "n m"]:
+    if motors is recording.signals.get("rotor_speed"):
+        return motors.values
+    if not len(polynomial):
+        need = "--polynomial c0,c1,… maps them to rad/s = c0 + c1 command + …"
+        raise ValueError(f"{recording.name}: has only motor commands from 0 to 1 ({motors.source}); {need}")
+    # A motor at command 0 stands still, whatever the polynomial says.
+    speeds = np.polynomial.polynomial.polyval(motors.values, polynomial)
+    return np.where(motors.values > 0, np.maximum(speeds, 0.0), 0.0)
+
+
+def _is_known(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], dt: float) -> Bool[np.ndarray, " m"]:
+    """Whether t lies between two samples without a gap; the start of a gap counts as known."""
+    intervals = np.diff(at)
+    lost = intervals > GAP * max(float(np.median(intervals)), dt)
+    inside = np.clip(np.searchsorted(at, t, side="right") - 1, 0, len(intervals) - 1)
+    return ~lost[inside] | (t == at[inside])

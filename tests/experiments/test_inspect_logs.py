@@ -1,0 +1,117 @@
+"""A folder of logs is described, checked and drawn, and becomes a vehicle file with the numbers that the logs tell."""
+
+import json
+
+import numpy as np
+import pytest
+from recorded import LOGS, write
+from scipy.signal import lfilter
+
+from experiments.inspect_logs.__main__ import main
+from experiments.inspect_logs.estimates import estimate
+from experiments.inspect_logs.vehicle import vehicle_text
+from experiments.real_flight.logs import vehicle_toml
+from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.vehicle import IRIS, load_vehicle
+
+MASS, ARM, LAG, INERTIA = 0.5, 0.12, 0.06, (2e-3, 2.4e-3)
+CURVE = np.array([0.02, 0.4, 1.9])  # N
+# An order that no autopilot has: rear left, front left, front right, rear right.
+PLACES = ARM / np.sqrt(2) * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
+SPIN = [1, -1, 1, -1]
+
+
+@pytest.fixture(scope="module")
+def commanded():
+    """Thirty seconds of commands around hover, and what gyro and accelerometer would say."""
+    rng, dt, count = np.random.default_rng(0), 0.005, 6000
+    t, slow = dt * np.arange(count), [1 - np.exp(-dt / 0.1)]
+    wander = lfilter(slow, [1, slow[0] - 1], rng.normal(0, 0.7, (count, 4)), axis=0)
+    # Two rotors are trimmed higher, as if the centre of mass were in front.
+    command = np.clip(0.7 + np.array([-0.02, 0.02, 0.02, -0.02]) + wander, 0.2, 1)
+    kept = np.exp(-dt / LAG)
+    speed = lfilter([1 - kept], [1, -kept], command, axis=0, zi=kept * command[:1])[0]
+    thrust = CURVE[0] + CURVE[1] * speed + CURVE[2] * speed**2
+    torque = np.stack([thrust @ PLACES[:, 1], -thrust @ PLACES[:, 0], 0.02 * thrust @ SPIN], axis=1)
+    omega = np.cumsum(torque / [*INERTIA, sum(INERTIA)], axis=0) * dt
+    axes = ("x", "y", "z")
+    force = np.stack([0 * t, 0 * t, thrust.sum(axis=1) / MASS], axis=1) + rng.normal(0, 0.05, (count, 3))
+    signals = {
+        "rates": Signal(t, omega + rng.normal(0, 1e-3, omega.shape), axes, "gyro"),
+        "specific_force": Signal(t, force, axes, "acc"),
+        "command": Signal(t, command, tuple("0123"), "motors"),
+        "voltage": Signal(t, np.full((count, 1), 11.1), ("battery",), "battery"),
+    }
+    return Recording("flight", signals)
+
+
+def test_what_a_log_tells_is_found(commanded, tmp_path):
+    found = estimate([commanded])
+    np.testing.assert_allclose(found.positions(ARM), PLACES, atol=1e-9)
+    assert found.spin() == SPIN
+    assert found.lag == pytest.approx(LAG, rel=0.15)  # of a grid in steps of 17 %
+    (tmp_path / "v.toml").write_text(vehicle_text(found, "twin", MASS, ARM))
+    vehicle = load_vehicle(tmp_path / "v.toml")
+    np.testing.assert_allclose(vehicle.inertia[:2], INERTIA, rtol=0.15)
+    np.testing.assert_allclose(vehicle.rotor_positions, PLACES, atol=1e-4)
+    text = (tmp_path / "v.toml").read_text()
+    assert "nominal_voltage = 11.1" in text
+    assert "PLACEHOLDER: weigh it" not in text
+    x, y = found.centre(found.positions(ARM))
+    assert x > 0.001 > abs(y)
+    np.testing.assert_allclose(np.polynomial.polynomial.polyval(0.7, MASS * found.curve), MASS * 9.81 / 4, rtol=0.03)
+
+
+def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
+    signals = {name: commanded.signals[name] for name in ("command", "voltage")}
+    text = vehicle_text(estimate([Recording("flight", signals)]), "twin", None, None)
+    (tmp_path / "v.toml").write_text(text)
+    assert load_vehicle(tmp_path / "v.toml").mass == 1.0
+    for number in ("mass", "inertia", "spin", "rotor_positions", "max_rotor_speed"):
+        (line,) = [line for line in text.splitlines() if line.startswith(f"{number} =")]
+        assert "PLACEHOLDER" in line
+
+
+def test_a_folder_is_described_whatever_is_in_it(tmp_path, capsys):
+    folder = write(tmp_path / "flights", LOGS[:2])
+    (folder / "broken.csv").write_text("t,px\n0,0\n")
+    (folder / "notes.txt").write_text("windy")
+    (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
+    options = ["--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path)]
+    main([str(folder), *options])
+    said = capsys.readouterr().out
+    assert "broken.csv: not read: row 1, field py" in said
+    assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
+    assert "notes.txt: left: no format that is read" in said
+    assert "2 of 3 logs are ready" in said
+    page = (tmp_path / "inspect_logs" / "report.md").read_text()
+    for words in (
+        "## Signals at their own rates",
+        "## Checks",
+        "## What the checks ask",
+        "## What to do",
+        "signals_1.png",
+    ):
+        assert words in page
+    results = json.loads((tmp_path / "inspect_logs" / "report.json").read_text())["rows"]
+    assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--write-vehicle", "flights/chirp_run1.csv.gz"], "exists; name another file"),
+        (["--topics", "/odom"], "--topics must be words such as"),
+        (["--dt", "0"], "--dt must be a positive"),
+        (["--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
+    ],
+)
+def test_bad_options_end_in_one_line(tmp_path, monkeypatch, capsys, options, words):
+    write(tmp_path / "flights", LOGS[:1])
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as stop:
+        main(["flights", *options])
+    assert stop.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("inspect_logs: ")
+    assert words in line

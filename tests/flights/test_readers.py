@@ -1,0 +1,306 @@
+"""Twins of every format, written here byte by byte, are read as the flight they hold; damaged ones never end badly."""
+
+import gzip
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from surface import outcome, refusal
+
+from hybrid_jax.flights import load_logs
+from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.log import COLUMNS
+from hybrid_jax.flights.reading import find_logs, read_recording
+from hybrid_jax.flights.suitability import check_recording, failures
+from hybrid_jax.vehicle import IRIS
+
+STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
+STATES += ["stateEstimate.vz", *(f"stateEstimate.q{axis}" for axis in "wxyz"), "gyro.x", "gyro.y", "gyro.z"]
+MOTORS = [f"motor.m{i}" for i in range(1, 5)]
+
+
+def usd(columns, ticks, kinds=None):
+    """Bytes of a µSD log of one event type: name → values, and times in µs."""
+    names, kinds = list(columns), kinds or {}
+    head = struct.pack("<BHHH", 0xBC, 2, 1, 7) + b"fixedFrequency\0" + struct.pack("<H", len(names))
+    head += b"".join(f"{name}({kinds.get(name, 'f')})\0".encode() for name in names)
+    form = "<HQ" + "".join(kinds.get(name, "f") for name in names)
+    rows = zip(ticks.tolist(), *(np.asarray(columns[name]).tolist() for name in names), strict=True)
+    body = head + b"".join(struct.pack(form, 7, *row) for row in rows)
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def crazyflie(flight, **changes):
+    x = flight.x.copy()
+    x[:, 10:] *= 180 / np.pi
+    columns = dict(zip(STATES, x[:, [0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 10, 11, 12]].T, strict=True))
+    motors = np.round(60 * flight.u).astype(int)
+    columns |= dict(zip(MOTORS, motors.T, strict=True)) | {"pm.vbatMV": 3700 + 0 * flight.t} | changes
+    return usd(columns, 10**9 + np.round(flight.t * 1e6).astype(int), dict.fromkeys(MOTORS, "H"))
+
+
+@pytest.fixture
+def written(tmp_path):
+    def write(content, name="flight.log"):
+        (tmp_path / name).write_bytes(content)
+        return tmp_path / name
+
+    return write
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_crazyflie_log_is_the_flight_it_holds(flight, written, packed):
+    content = crazyflie(flight)
+    log = to_flight(
+        read_recording(written(gzip.compress(content) if packed else content)), polynomial=(0.0, 65536 / 60)
+    )
+    np.testing.assert_allclose(log.t, flight.t - flight.t[0], atol=1e-6)
+    np.testing.assert_allclose(log.x, flight.x, atol=1e-4)
+    np.testing.assert_allclose(log.u[:-1], flight.u[:-1], atol=0.02)
+
+
+def test_crazyflie_angles_commands_and_accelerations_have_the_signs_of_the_library(written):
+    ones, t = np.ones(5), np.arange(5) * 1000
+    columns = {"stateEstimate.roll": 10 * ones, "stateEstimate.pitch": 20 * ones, "stateEstimate.yaw": 0 * ones}
+    columns |= {"controller.r_roll": ones, "controller.r_pitch": ones, "controller.r_yaw": ones}
+    columns |= {"controller.cmd_thrust": 30000 * ones, "controller.cmd_roll": 0 * ones}
+    columns |= {"controller.cmd_pitch": 2000 * ones, "controller.cmd_yaw": 0 * ones}
+    columns |= {"stateEstimate.ax": 3 * ones, "stateEstimate.ay": 0 * ones, "stateEstimate.az": 3 * ones}
+    signals = read_recording(written(usd(columns, t))).signals
+    np.testing.assert_allclose(signals["rates"].values[0], [1, -1, 1])
+    # Nose up by 20°: body x points up, so a turn about y (left) by −20°.
+    assert signals["attitude"].values[0, 2] < -0.17
+    np.testing.assert_allclose(65536 * signals["command"].values[0], [31000, 29000, 29000, 31000])  # M1, M4 in front
+    assert signals["specific_force"].axes == ("z",)
+    np.testing.assert_allclose(signals["specific_force"].values[0], 9.81 * 5)
+
+
+def test_a_crazyflie_log_that_is_cut_off_or_changed_fails(flight, written):
+    whole = crazyflie(flight)
+    for content in (whole[:-3000], whole[:-9] + b"\0" + whole[-8:], whole + whole):
+        (line,) = failures(check_recording(read_recording(written(content)), IRIS), "log")
+        assert "CRC-32 is wrong" in line
+        assert "records end at 1" in line
+    for content in (b"", whole[:2], whole[:60], usd({}, np.zeros(0, int)), gzip.compress(whole)[:-9]):
+        refusal(lambda content=content: read_recording(written(content, "flight.bin")), "flight.bin")
+
+
+def test_numbers_that_wrapped_are_found(flight, written):
+    height = np.int16(np.round(1000 * np.linspace(30, 40, len(flight.t))).astype(int) & 0xFFFF)
+    columns = {f"stateEstimateZ.{axis}": height for axis in "xyz"}
+    ticks = np.round(flight.t * 1e6).astype(int)
+    path = written(usd(columns, ticks, dict.fromkeys(columns, "h")))
+    refusal(lambda: read_recording(path), path, "stateEstimateZ.x", "32761 to -32767", "at 3.32 s", "16 bits")
+    signed = {
+        name: np.int16(np.round(40000 + u).astype(int) & 0xFFFF) for name, u in zip(MOTORS, flight.u.T, strict=True)
+    }
+    path = written(usd(signed, ticks, dict.fromkeys(MOTORS, "h")))
+    assert "16-bit number wrapped" in "".join(failures(check_recording(read_recording(path)), "log"))
+    refusal(lambda: read_recording(written(usd(signed, ticks % 2**16))), "goes back from", "16 bits began anew")
+
+
+def test_motors_at_rest_and_beyond_their_limits_fail(flight, written):
+    resting = crazyflie(flight, **{name: np.zeros(len(flight.t), int) for name in MOTORS})
+    assert "nothing flew" in failures(check_recording(read_recording(written(resting))), "log")[0]
+    speeds = {f"rpm.m{i + 1}": u * 30 / np.pi for i, u in enumerate(flight.u.T)}
+    speeds["rpm.m2"] = np.where(np.arange(len(flight.t)) == 300, 1e6, speeds["rpm.m2"])
+    (line,) = failures(check_recording(read_recording(written(crazyflie(flight, **speeds))), IRIS), "log")
+    assert "rotor_speed of motor 1 is 1.047e+05 at 3 s, must be from 0 to 1100" in line
+
+
+def test_a_voltage_that_is_no_number_is_left_out_and_said(flight, written):
+    volts = np.where(np.arange(len(flight.t)) > 500, np.nan, 3700.0)
+    recording = read_recording(written(crazyflie(flight, **{"pm.vbatMV": volts})))
+    assert len(recording.signals["voltage"]) == 501
+    assert any("pm.vbatMV: voltage is no number in" in note and "at 5.01 s" in note for note in recording.notes)
+    path = written(crazyflie(flight, **{"gyro.x": volts}))
+    refusal(lambda: read_recording(path), path, "gyro.x", "is nan at 5.01 s")
+
+
+def bag(folder, flight, plugin, second=None):
+    """A bag of ROS 2 with odometry, IMU, battery and rotors in rpm."""
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
+    kinds, zeros = {name.split("/")[-1]: kind for name, kind in store.types.items()}, np.zeros(36)
+    point, wxyz = kinds["Vector3"], lambda q: kinds["Quaternion"](*q[1:], q[0])
+    layout = kinds["MultiArrayLayout"](dim=[], data_offset=0)
+    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]) as writer:
+        named = {"/odom": "nav_msgs/msg/Odometry", "/imu": "sensor_msgs/msg/Imu"}
+        named |= {"/rotors": "std_msgs/msg/Float64MultiArray"} | ({second: "nav_msgs/msg/Odometry"} if second else {})
+        lines = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in named.items()}
+
+        def write(topic, at, message):
+            writer.write(lines[topic], at, store.serialize_cdr(message, lines[topic].msgtype))
+
+        attitudes = flight.x[:, 3:7]
+        for t, x, q, u in zip(flight.t, flight.x, attitudes, flight.u, strict=True):
+            at = 10**18 + round(t * 1e9)
+            stamp = kinds["Time"](sec=at // 10**9, nanosec=at % 10**9)
+            header = kinds["Header"](stamp=stamp, frame_id="")
+            turned = np.linalg.inv(_matrix(q)) @ x[7:10]
+            pose = kinds["PoseWithCovariance"](kinds["Pose"](kinds["Point"](*x[:3]), wxyz(q)), zeros)
+            twist = kinds["TwistWithCovariance"](kinds["Twist"](point(*turned), point(*x[10:])), zeros)
+            for topic in ("/odom", *([second] if second else [])):
+                write(topic, at, kinds["Odometry"](header, "", pose, twist))
+            imu = (wxyz(q), zeros[:9], point(*x[10:]), zeros[:9], point(0.0, 0.0, 9.81), zeros[:9])
+            write("/imu", at, kinds["Imu"](header, *imu))
+            write("/rotors", at, kinds["Float64MultiArray"](layout, u * 30 / np.pi))
+    return folder
+
+
+def _matrix(q):
+    w, x, y, z = q
+    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
+    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
+    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
+    return np.array(rows).reshape(3, 3)
+
+
+@pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
+def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
+    path = bag(tmp_path / "run", flight, plugin)
+    recording = read_recording(path, topics={"motors": "/rotors:data:rpm"})
+    log = to_flight(recording)
+    np.testing.assert_allclose(log.x, flight.x[: len(log)], atol=1e-5)
+    np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-6)
+    assert not failures(check_recording(recording, IRIS, 0.01), "log")
+    assert any("/rotors" in note for note in read_recording(path).notes)
+    refusal(lambda: to_flight(read_recording(path)), path, "no motors", "--topics motors=")
+    for topics, words in [
+        ({"motors": "/rotors"}, ("--topics", "TOPIC:FIELD:UNIT")),
+        ({"motors": "/other:data:rpm"}, ("/other", "/odom")),
+        ({"wings": "/odom"}, ("--topics", "odometry")),
+    ]:
+        refusal(lambda topics=topics: read_recording(path, topics=topics), *words)
+
+
+def test_of_two_topics_one_is_chosen(flight, tmp_path):
+    path = bag(tmp_path / "run", flight[:20], "SQLITE3", second="/truth")
+    refusal(lambda: read_recording(path), path, "/odom and /truth hold odometry", "--topics odometry=/odom")
+    assert "position" in read_recording(path, topics={"odometry": "/truth"}).signals
+
+
+def varint(value):
+    value, found = (value << 1) ^ (value >> 31), b""
+    while value > 127:
+        found, value = found + bytes([value & 127 | 128]), value >> 7
+    return found + bytes([value])
+
+
+def blackbox(flight, ended=True):
+    """Bytes of a blackbox log of intra frames alone, of signed numbers."""
+    names = ["loopIteration", "time", *(f"gyroADC[{i}]" for i in range(3)), *(f"accSmooth[{i}]" for i in range(3))]
+    names += ["vbatLatest", *(f"motor[{i}]" for i in range(4)), *(f"eRPM[{i}]" for i in range(4))]
+    zeros = ",".join("0" * len(names))
+    head = ["Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2", "I interval:1"]
+    head += ["P interval:1", "Firmware type:Cleanflight", "Firmware revision:Betaflight 4.4.0", "minthrottle:1070"]
+    head += [f"Field I name:{','.join(names)}", f"Field I signed:{zeros}", f"Field I predictor:{zeros}"]
+    head += [f"Field I encoding:{zeros}", f"Field P predictor:{zeros}", f"Field P encoding:{zeros}"]
+    head += ["gyro_scale:0x3f800000", "acc_1G:2048", "vbatref:1600", "vbatcellvoltage:330,350,430"]
+    head += ["motorOutput:48,2047", "motor_poles:14"]
+    content = b"".join(f"H {line}\n".encode() for line in head)
+    for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
+        row = [i, 10**6 + round(t * 1e6), *(x[10:] * 180 / np.pi), 0, 0, 2048, 1650]
+        row += [*(48 + u), *(u * 30 / np.pi * 7 / 100)]
+        content += b"I" + b"".join(varint(round(value)) for value in row)
+    return content + (b"E\xffEnd of log\0" if ended else b"")
+
+
+def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
+    pytest.importorskip("orangebox")
+    recording = read_recording(written(blackbox(flight[:200]), "flight.bbl"))
+    signals, last = recording.signals, len(recording.signals["rates"])
+    assert last >= 199
+    np.testing.assert_allclose(signals["rates"].values, flight.x[:last, 10:], atol=0.01)
+    np.testing.assert_allclose(signals["specific_force"].values, [[0, 0, 9.81]] * last)
+    np.testing.assert_allclose(signals["voltage"].values, 16.5)
+    np.testing.assert_allclose(signals["command"].values, flight.u[:last] / 1999, atol=3e-4)
+    np.testing.assert_allclose(signals["rotor_speed"].values, flight.u[:last], atol=1)
+    assert "damage" not in recording.facts
+    assert "damage" in read_recording(written(blackbox(flight[:200], ended=False), "cut.bbl")).facts
+    refusal(lambda: to_flight(recording), "no position", "identify")
+
+
+def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):
+    written(crazyflie(flight), "log00")
+    written(b"", "notes.txt")
+    written(b"\x7fELF", "firmware.bin")
+    (tmp_path / "more").mkdir()
+    bag(tmp_path / "run", flight[:20], "MCAP")
+    logs, left = find_logs(tmp_path)
+    assert [path.name for path in logs] == ["log00", "run"]
+    assert {path.name: why for path, why in left.items()} == {
+        "firmware.bin": "no format that is read",
+        "more": "a folder; give it by itself",
+        "notes.txt": "empty",
+    }
+    refusal(lambda: load_logs(tmp_path / "more"), "holds no flights")
+
+
+def test_logs_of_unequal_start_and_length_go_together(flight, written):
+    written(crazyflie(flight), "log00")
+    written(crazyflie(flight[:700]), "log01")
+    shifted = flight[:900]
+    content = usd(
+        dict(zip(STATES, shifted.x[:, [0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 10, 11, 12]].T, strict=True))
+        | dict(zip([f"rpm.m{i}" for i in range(1, 5)], shifted.u.T * 30 / np.pi, strict=True)),
+        np.round(shifted.t * 1e6 + 1.7e15 + 3217).astype(int),
+    )
+    path = written(content, "log02")
+    logs = load_logs(path.parent, polynomial=(0.0, 65536 / 60), failed="warn")
+    assert [len(log) for log in logs] == [len(flight), 700, 900]
+    assert {log.dt for log in logs} == {0.01}
+    assert {log.t[0] for log in logs} == {0.0}
+
+
+def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
+    path, rows = tmp_path / "flight.csv", [",".join(COLUMNS)]
+    rows += [
+        ",".join(f"{value:.9f}" for value in (t, *x, *u)) for t, x, u in zip(flight.t, flight.x, flight.u, strict=True)
+    ]
+    german = "\n".join(rows).replace(",", ";").replace(".", ",")
+    path.write_text(german)
+    refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "--columns")
+    tables = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\ntime = {columns = ["t"], unit = "s"}\n'
+    tables += 'velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}\n'
+    tables += 'motors = {columns = ["u0", "u1", "u2", "u3"], unit = "pwm"}\n'
+    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";"}')
+    refusal(lambda: read_recording(path, tmp_path / "map.toml"), "row 2, field t", "decimal comma", 'decimal = ","')
+    (tmp_path / "map.toml").write_text(tables + 'format = {delimiter = ";", decimal = ","}')
+    signals = read_recording(path, tmp_path / "map.toml").signals
+    assert [*signals] == ["velocity", "command"]
+    np.testing.assert_allclose(signals["velocity"].values, flight.x[:, 7:10], atol=1e-8)
+    np.testing.assert_allclose(signals["command"].values, (flight.u - 1000) / 1000, atol=1e-8)
+
+
+WHOLES = ("flight.log", "flight.gz", "flight.bbl", "flight.db3", "flight.mcap")
+
+
+@pytest.fixture(scope="module")
+def wholes(flight, tmp_path_factory):
+    """Name → bytes of a small file of each format, as a function, for short messages of hypothesis."""
+    folder, few = tmp_path_factory.mktemp("bags"), flight[:30]
+    made = {"flight.log": crazyflie(few), "flight.gz": gzip.compress(crazyflie(few)), "flight.bbl": blackbox(few)}
+    for plugin, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
+        (path,) = bag(folder / suffix, few, plugin).glob(f"*.{suffix}")
+        made[f"flight.{suffix}"] = path.read_bytes()
+    return made.__getitem__
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_damaged_files_are_read_or_refused_in_one_line(written, wholes, data):
+    name = data.draw(st.sampled_from(WHOLES))
+    content = bytearray(wholes(name))
+    for at in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
+        content[at] ^= data.draw(st.integers(1, 255))
+    end = data.draw(st.one_of(st.none(), st.integers(0, len(content))))
+    path = written(bytes(content[:end]), name)
+    recording = outcome(read_recording, path, topics={"motors": "/rotors:data:rpm"})
+    if recording is not None:
+        assert all(np.isfinite(signal.values).all() for signal in recording.signals.values())
+        assert all("\n" not in line for line in failures(check_recording(recording, IRIS, 0.01), "log"))
+        outcome(to_flight, recording, naming=str(path))
