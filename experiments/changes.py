@@ -8,12 +8,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.paper import study
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
-from experiments.paper.regret import CLAIMS, error_table, regret_figure, regret_table
+from experiments.paper.regret import CLAIMS, error_figure, error_table, regret_figure, regret_table
 from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
@@ -109,7 +110,7 @@ def experiment(config: ChangesConfig, console: Console) -> None:
             environment=environment(stages.seconds),
             rows=rows,
             claims=verdicts,
-            figures=save_figures(out, {"regret": (regret_figure(rows), "Test error over that of the best candidate")}),
+            figures=save_figures(out, draw(rows)),
             notes=stages.notes(),
             head=HEAD.strip(),
             tables=[
@@ -119,6 +120,13 @@ def experiment(config: ChangesConfig, console: Console) -> None:
             ],
         )
         write_report(out, report, Console())
+
+
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    """The figures and their captions, by name."""
+    errors = "Mean test error by change; pale lines reach from the least to the most of all cases"
+    regret = "Test error over that of the best candidate"
+    return {"errors": (error_figure(rows), errors), "regret": (regret_figure(rows), regret)}
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, stages: Stages) -> list[Row]:

@@ -1,5 +1,6 @@
 """What the README shows is what happens."""
 
+import json
 import os
 import re
 import tomllib
@@ -9,8 +10,11 @@ import pytest
 from smoke import ROOT, script, unbegun
 
 import hybrid_jax
+from experiments.paper.regret import AUTO, of_each_case, over
+from experiments.reporting.results import Results
 
 README = (ROOT / "README.md").read_text()
+LINES, EXAMPLE = 110, 20  # at most: of the page, and of code in the example
 
 
 @pytest.mark.slow
@@ -47,3 +51,27 @@ def test_every_command_that_it_names_explains_itself():
         done = unbegun(command, "--help")
         assert done.returncode == 0
         assert "--out" in done.stdout
+
+
+def test_it_is_read_in_a_minute():
+    assert len(README.splitlines()) <= LINES
+    (code,) = re.findall(r"```python\n(.*?)```", README, flags=re.DOTALL)
+    assert len([line for line in code.splitlines() if line.strip()]) <= EXAMPLE
+
+
+@pytest.mark.parametrize("page", ["README.md", "CONTRIBUTING.md", "CHANGELOG.md"])
+def test_its_links_lead_somewhere(page):
+    """Those of the site are checked by `mkdocs build --strict`."""
+    targets = re.findall(r"\]\(([^)#]+)", (ROOT / page).read_text())
+    assert [target for target in targets if "://" not in target and not (ROOT / target).exists()] == []
+
+
+def test_its_table_is_that_of_the_report():
+    report = json.loads((ROOT / "docs/reference/changes/report.json").read_text())
+    lines = [[cell.strip(" *") for cell in line.split("|")[2:-1]] for line in README.splitlines() if line[:2] == "| "]
+    expected = []
+    for own in Results(report["rows"], report["tags"]).group("domain").values():
+        rho = 1 - over(own, "source")
+        errors = [of_each_case(own, name).mean() for name in ("source", "fine_tune", AUTO)]
+        expected.append([*(f"{error:.3g}" for error in errors), f"{rho.mean():.3g}, {rho.min():.3g}"])
+    assert [line for line in lines if line in expected] == expected

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, Undecided
 from experiments.reporting.names import EXTERNAL_FORCE, PARAMETER_SHIFT
-from experiments.reporting.plots import STYLE, legend_below, subplots
+from experiments.reporting.plots import STYLE, legend_below, name_lines, subplots
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table
 
@@ -19,6 +19,13 @@ MEAN_RHO, WORST_RHO = 0.93, 0.85
 HELD = 0.7, 0.9  # share of errors in their 80 % interval
 AUTO = "auto"  # the candidate that was taken
 SHOWN = {AUTO: "#0072B2", "theta": "#D55E00", "fine_tune": "0.5"}
+OUTLINE = {
+    AUTO: ("#0072B2", "hj.adapt", "o"),
+    "source": ("0.45", "not adapted", "s"),
+    "fine_tune": ("#D55E00", "fine-tuned", "^"),
+}
+CHANGES = {PARAMETER_SHIFT: "other inertia", EXTERNAL_FORCE: "side wind", "doubled_drag": "twice the drag"}
+CHANGES |= {"weak_rotor": "weak rotor", "off_centre_load": "load off centre", "gusty_wind": "gusty wind"}
 
 
 def of_each_case(rows: Results, name: str) -> np.ndarray:
@@ -128,6 +135,22 @@ def error_table(rows: Results) -> Table:
 
 
 @mpl.rc_context(STYLE)
+def error_figure(rows: Results) -> Figure:
+    """The mean test error of each change: not adapted, fine-tuned, `adapt`; lines reach from the least to the most."""
+    groups = rows.group("domain")
+    figure, ((axes,),) = subplots((6.4, 1.4 + 0.36 * len(groups)), 1, 1)
+    for y, own in enumerate(groups.values()):
+        for name, (colour, label, marker) in OUTLINE.items():
+            if name in (AUTO, *own.unique("candidate")):
+                errors = of_each_case(own, name)
+                axes.plot([errors.min(), errors.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
+                axes.plot(errors.mean(), y, marker, color=colour, ls="", label="" if y else label)
+    axes.set(xscale="log", xlabel="test error over 1 s of other flights, $L^T_{MSE}$ (log scale)")
+    name_lines(axes, [CHANGES.get(name, name.replace("_", " ")) for name in groups])
+    return legend_below(figure, "What ten seconds of one noisy flight are worth")
+
+
+@mpl.rc_context(STYLE)
 def regret_figure(rows: Results) -> Figure:
     """A dot per case: the error of auto and of two methods over that of the best candidate."""
     groups = rows.group("domain")
@@ -141,7 +164,7 @@ def regret_figure(rows: Results) -> Figure:
             label = name.replace("_", "-") if y == 0 else ""
             axes.plot(ratio, place, "o", ms=4, alpha=0.5, color=SHOWN[name], label=label)
     axes.set(xscale="log", xlabel="test error over that of the best candidate in hindsight (log scale)")
-    axes.set_yticks(range(len(groups)), [name.replace("_", " ") for name in groups])
+    axes.set_yticks(range(len(groups)), [CHANGES.get(name, name.replace("_", " ")) for name in groups])
     axes.invert_yaxis()
     axes.axvline(NEAR, color="0.4", linestyle=":", label=f"{NEAR - 1:.0%} more")
     return legend_below(figure, "Adaptation to one flight of ten seconds", columns=4)

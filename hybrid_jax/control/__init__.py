@@ -1,7 +1,7 @@
 """Closed-loop flight with any vector field: model predictive controller, references, disturbance observer, simulation.
 
 `Controller` is called once per period, `fly` closes the loop in one compiled program, with the observer, and
-`open_loop_costs` compares the predicted cost of plans with the actual one. docs/control.md begins with an example.
+`open_loop_costs` compares the predicted cost of plans with the actual one. An example: docs/howto/control.md.
 """
 
 from hybrid_jax.control.controller import Controller, Plan

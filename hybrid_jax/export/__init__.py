@@ -3,7 +3,7 @@
 - `export_field`, `export_step`, `load_program`: StableHLO in a file, through `jax.export` (extra `export`).
 - `casadi_function`, `casadi_step`: a CasADi function, for optimal control and C code (extra `casadi`).
 
-See docs/export.md for an example.
+See docs/howto/export.md for an example.
 """
 
 from hybrid_jax.export.casadi_functions import casadi_function, casadi_step

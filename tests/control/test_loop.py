@@ -185,7 +185,7 @@ def test_mixed_precision_is_promoted(start, wanted, evaluate):
 
 @pytest.mark.slow
 def test_the_guide_s_example_runs(capsys):
-    code = (ROOT / "docs" / "control.md").read_text().split("```python\n")[1].partition("```")[0]
+    code = (ROOT / "docs" / "howto" / "control.md").read_text().split("```python\n")[1].partition("```")[0]
     exec(compile(code, "example", "exec"), {})
     away = float(capsys.readouterr().out.split()[3])
     assert away < 0.01

@@ -1,4 +1,4 @@
-"""Real commands, killed, starved and given other inputs, lose nothing. See docs/reliability.md."""
+"""Real commands, killed, starved and given other inputs, lose nothing. See docs/notes/reliability.md."""
 
 import json
 import os

@@ -1,11 +1,11 @@
-"""What docs/export.md shows is what happens; a program is read without the library."""
+"""What docs/howto/export.md shows is what happens; a program is read without the library."""
 
 import re
 
 import pytest
 from smoke import ROOT, script
 
-WITH, WITHOUT = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "export.md").read_text(), flags=re.DOTALL)
+WITH, WITHOUT = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "howto" / "export.md").read_text(), flags=re.DOTALL)
 
 
 def said(code, folder):

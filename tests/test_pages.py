@@ -1,0 +1,64 @@
+"""What the pages show is what happens, and every public name has an entry in the reference."""
+
+import re
+import sys
+from importlib import import_module, util
+
+import pytest
+from smoke import ROOT
+
+import hybrid_jax
+
+DOCS = ROOT / "docs"
+PACKAGES = sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py"))
+TOP = DOCS / "api" / "hybrid_jax.md"
+WIDEST = 120  # characters of a line, and of a cell without the targets of its links
+TARGET = re.compile(r"\]\([^)]*\)|\]\[[^\]]*\]")
+
+
+def blocks(page):
+    return re.findall(r"^```python\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+
+
+def written(folder="."):
+    """The pages that people write: all but reports."""
+    return [page for page in sorted((DOCS / folder).rglob("*.md")) if "reference" not in page.parts]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("page", [page for page in written() if blocks(page)], ids=lambda page: page.stem)
+def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
+    """As one module, as a user would write it, since a saved model names the module of its classes."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
+    # Devices are fixed by now, and other tests keep the flags that they began with.
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda cache: None)
+    name = f"page_{page.stem}"
+    path = tmp_path / f"{name}.py"
+    path.write_text("\n".join(blocks(page)))
+    spec = util.spec_from_file_location(name, path)
+    module = util.module_from_spec(spec)
+    monkeypatch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+
+
+def test_every_name_at_the_top_is_in_an_example_that_runs():
+    code = "\n".join(blocks(TOP))
+    assert [name for name in hybrid_jax.__all__ if name[0] != "_" and not re.search(rf"\bhj\.{name}\b", code)] == []
+
+
+def test_every_package_has_a_page_with_an_example():
+    for package in PACKAGES:
+        page = DOCS / "api" / f"{package.partition('.')[2]}.md"
+        code = "\n".join(blocks(page))
+        assert f"::: {package}\n" in page.read_text()
+        assert any(re.search(rf"\b{name}\b", code) for name in import_module(package).__all__), f"{page} shows none"
+
+
+@pytest.mark.parametrize("page", [ROOT / "README.md", *written()], ids=lambda page: page.stem)
+def test_lines_and_cells_are_short(page):
+    prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE).splitlines()
+    rows = [line for line in prose if line.lstrip().startswith("|")]
+    cells = [cell.strip() for row in rows for cell in TARGET.sub("]", row).split("|")]
+    others = [line for line in prose if line not in rows and not line.startswith(("![", "    "))]
+    assert [text for text in cells + others if len(text) > WIDEST] == []

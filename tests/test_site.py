@@ -1,0 +1,47 @@
+"""The site: a folder that needs neither a server nor the network, with an entry for every public name."""
+
+import os
+import re
+import zlib
+from importlib import import_module
+from pathlib import Path
+
+import pytest
+from smoke import LEFT, ROOT, script
+
+PACKAGES = [
+    "hybrid_jax",
+    *sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py")),
+]
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory):
+    """Built with --strict: a page, a link or an anchor that is missing ends it."""
+    pytest.importorskip("mkdocs")
+    if LEFT is not None:
+        return Path(LEFT) / "site"
+    folder = tmp_path_factory.mktemp("site")
+    script("-m", "mkdocs", "build", "--strict", "-q", "--site-dir", folder, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    return folder
+
+
+@pytest.mark.slow
+def test_every_public_name_has_an_entry(site):
+    inventory = zlib.decompress((site / "objects.inv").read_bytes().split(b"zlib.\n", 1)[1]).decode()
+    entries = {line.split(" ")[0] for line in inventory.splitlines()}
+    for package in PACKAGES:
+        for name in (name for name in import_module(package).__all__ if not name.startswith("_")):
+            # `multirotor` and `rigid_body` have the names of their modules.
+            assert {f"{package}.{name}", f"hybrid_jax.dynamics.{name}.{name}"} & entries, f"{package}.{name}"
+
+
+@pytest.mark.slow
+def test_pages_load_only_what_is_in_the_folder(site):
+    for page in site.rglob("*.html"):
+        tags = re.findall(r"<(?:script|img|iframe|link)\b[^>]*>", page.read_text())
+        loaded = [re.findall(r"\b(?:src|href)=\"?([^\" >]*)", tag) for tag in tags if 'rel="canonical"' not in tag]
+        for target in (target.partition("#")[0] for found in loaded for target in found):
+            # The page for lost visitors of a server has absolute paths.
+            place = site / target[1:] if target.startswith("/") else page.parent / target
+            assert target[:5] == "data:" or place.exists(), f"{page}: {target}"
