@@ -138,12 +138,12 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
         config=config.described(),
         environment=environment(seconds),
         rows=rows,
-        figures=save_figures(out, drawn),
+        figures=save_figures(out, drawn, config.paper),
         notes=NOTES,
         head=HEAD,
         tables=ablation_tables(rows, TRUTH),
     )
-    write_report(out, report)
+    write_report(out, report, paper=config.paper)
 
 
 ABOUT = "Which choices of the method matter, and where it breaks."

@@ -14,7 +14,7 @@ from rich.console import Console
 from experiments.paper import study
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, OneFlight, preset_like
-from experiments.paper.regret import CLAIMS, error_figure, error_table, regret_figure, regret_table
+from experiments.paper.regret import CLAIMS, conclusion, error_figure, error_table, regret_figure, regret_table
 from experiments.paper.study import EVERY, flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.claims import verdict_table
@@ -110,16 +110,17 @@ def experiment(config: ChangesConfig, console: Console) -> None:
             environment=environment(stages.seconds),
             rows=rows,
             claims=verdicts,
-            figures=save_figures(out, draw(rows)),
+            figures=save_figures(out, draw(rows), config.paper),
             notes=stages.notes(),
             head=HEAD.strip(),
+            conclusion=conclusion(rows),
             tables=[
                 verdict_table(verdicts, "Hypotheses"),
                 regret_table(rows),
                 error_table(rows),
             ],
         )
-        write_report(out, report, Console())
+        write_report(out, report, Console(), config.paper)
 
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:

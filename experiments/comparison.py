@@ -86,11 +86,12 @@ def experiment(config: ComparisonConfig, console: Console) -> None:
         return
     floor = sine_floor(IRIS.mass, DT * np.arange(1, PAST + 1))
     drawn = ranking(rows, TITLE, {EXTERNAL_FORCE.name: floor})
-    figures = save_figures(out, {"standings": (drawn, "Test errors of all seeds of every method (paper, Table 2)")})
+    caption = "Test errors of all seeds of every method (paper, Table 2)"
+    figures = save_figures(out, {"standings": (drawn, caption)}, config.paper)
     notes = [*stages.notes(), GIVEN_NETWORK]
     true, extra = {each.name: nominal(each.vehicle) for each in DOMAINS}, {"flights": flights}
     report = paper_report(NAME, config, stages.seconds, rows, true, figures, notes, floor, extra)
-    write_report(out, report, Console())
+    write_report(out, report, Console(), config.paper)
 
 
 def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, Fit], Fit | None]:

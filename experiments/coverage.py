@@ -116,7 +116,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
         tables=tables,
         extra={"known_body": known.rows},
     )
-    write_report(config.out / NAME, report, Console())
+    write_report(config.out / NAME, report, Console(), config.paper)
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:

@@ -64,8 +64,8 @@ def flights(domain: Domain, splits: Mapping[str, SplitSpec], seed: int, cache_di
 def read_or_fly(path: Path, domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> Dataset:
     """The dataset in a file; it is flown and saved if the file does not exist."""
     if not path.exists():
-        with Line(f"flying {domain.name}", Console(stderr=True)) as line:
-            dataset = make_dataset(domain, splits, seed, lambda share: line.say(f"{share:.0%}"))
+        with Line(f"flights {domain.name}", Console(stderr=True), "compiling the simulator") as line:
+            dataset = make_dataset(domain, splits, seed, lambda share: line.show_share("flying", share))
         save_dataset(path, dataset)
     return load_dataset(path, configuration(domain, splits, seed))
 

@@ -161,14 +161,14 @@ def write(
         environment=environment(seconds),
         rows=rows,
         claims=verdicts,
-        figures=save_figures(out, drawn),
+        figures=save_figures(out, drawn, config.paper),
         notes=[*missing, *notes],
         extra={"ablation": ablated.rows, "speed": timed},
         head=HEAD.strip(),
         tables=[*titled, speed_table(timed)],
         more_rows=ablated,
     )
-    write_report(out, report, Console())
+    write_report(out, report, Console(), config.paper)
 
 
 def draw(

@@ -20,7 +20,7 @@ from rich.console import Console
 
 from experiments.closed_loop.results import NUMBERS, TAGS, Agent, away
 from experiments.reporting.results import Results
-from experiments.runner.progress import clock
+from experiments.runner.progress import Line, clock
 from hybrid_jax import control
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.control.cost import Scalar
@@ -164,7 +164,8 @@ def flown(
         about, arrays = hosts.from_first(lambda path=path: _cached(path, console, fresh))
         origin = "as found in the cache"
         if about is None:
-            arrays, spent = _fly(scenario, programs, shared)
+            with Line(scenario.name, console) as line:
+                arrays, spent = _fly(scenario, programs, shared, line)
             about = spent | {"devices": jax.device_count(), "versions": versions(*MADE_BY)}
             origin = clock(about["seconds"])
             if hosts.is_main_process():
@@ -192,7 +193,9 @@ def _cached(path: Path, console: Console, fresh: bool) -> tuple[dict[str, Any] |
     return about, arrays
 
 
-def _fly(scenario: Scenario, programs: Mapping[tuple, LaneMap], shared: tuple) -> tuple[Arrays, dict[str, Any]]:
+def _fly(
+    scenario: Scenario, programs: Mapping[tuple, LaneMap], shared: tuple, line: Line
+) -> tuple[Arrays, dict[str, Any]]:
     """Results of all flights of a scenario, one per row, and the time they took without compiling [s]."""
     groups, flights = defaultdict(list), list(scenario.flights())
     for i, flight in enumerate(flights):
@@ -201,11 +204,16 @@ def _fly(scenario: Scenario, programs: Mapping[tuple, LaneMap], shared: tuple) -
         partial(programs[key], stack([flights[i] for i in own]), shared, np.ones(len(own)))
         for key, own in groups.items()
     ]
+    line.say(f"compiling {len(runs)} programs for {len(flights)} flights")
     # Processes of one run must compile in the same order.
     with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
         list(pool.map(lambda run: run([]), runs))  # compile: fly nothing
     began, worked = time.perf_counter(), time.process_time()
-    found = [run(range(len(own))) for run, own in zip(runs, groups.values(), strict=True)]
+    found, flown = [], 0
+    for run, own in zip(runs, groups.values(), strict=True):
+        line.show_share("flying", flown / len(flights))
+        found.append(run(range(len(own))))
+        flown += len(own)
     spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
     order = np.argsort(np.concatenate(list(groups.values())))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[order], *found), spent

@@ -53,7 +53,9 @@ class Case:
     def tested(self, name: str, fields: Any) -> np.ndarray:
         """L^T_MSE of stacked fields on the steps after the past."""
         _, future = split(self.target.splits["test_with_past"], PAST)
-        return self.stages.timed(f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)))
+        return self.stages.timed(
+            f"test {name} {self.name}", lambda: evaluate(fields, future, 1, settings(self.config)), "testing"
+        )
 
 
 def source_only(case: Case, model: str) -> Lanes:
@@ -88,7 +90,7 @@ def _augmented(case: Case) -> Lanes:
     assert experts is not None
 
     encoded = partial(_encoded, experts.fields, windows, settings(case.config).solver)
-    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: jax.device_get(encoded()))
+    errors, physics = case.stages.timed(f"test {name} {case.name}", lambda: jax.device_get(encoded()), "testing")
     seeds = case.config.seeds
     return lanes_of(case.name, name, names.SOURCE_ONLY, (0,), seeds, experts, errors, theta_of(physics))
 

@@ -16,7 +16,7 @@ from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.lanes import BAND_EDGES, BANDS, BASELINES, by_domain, lowest_altitude, save_models
 from experiments.paper.study import EVERY, Study, study
-from experiments.paper.tables import altitudes, by_size, parameters, ranking, run_notes
+from experiments.paper.tables import altitudes, by_size, conclusion, parameters, ranking, run_notes
 from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY, label
@@ -77,13 +77,13 @@ def adapt_and_report(experiment: str, domain: Domain, floor: float, config: Adap
         return
     out, truth, rows = config.out / experiment, nominal(domain.vehicle), found.rows
     save_models(out / "models", found.lanes, rows)
-    figures = save_figures(out, draw(domain, config, found, truth, floor))
+    figures = save_figures(out, draw(domain, config, found, truth, floor), config.paper)
     lowest = np.digitize(lowest_altitude(found.target.splits["test"]), BAND_EDGES)
     counted = ", ".join(f"{np.sum(lowest == i)} {band}" for i, band in enumerate(BANDS.values()))
     notes = [*found.notes, f"Test windows by lowest altitude: {counted}."]
     extra = {"flights": {"source": found.source.metadata, "target": found.target.metadata}}
     report = paper_report(experiment, config, found.seconds, rows, truth, figures, notes, floor, extra)
-    write_report(out, report, Console())
+    write_report(out, report, Console(), config.paper)
 
 
 def paper_report(
@@ -102,7 +102,7 @@ def paper_report(
     headline = ranking if experiment == COMPARISON else by_size
     altitude = altitudes(rows) if experiment != COMPARISON else []
     rate = [RATE_NOTE] if experiment == "param_shift" else []
-    sine = f"About {floor:.2e} of a test error in the wind is due to its sine, which no model without a clock can see."
+    sine = f"About {floor:.3g} of a test error in the wind is due to its sine, which no model without a clock can see."
     return Report(
         experiment=experiment,
         config=config.described(),
@@ -113,6 +113,7 @@ def paper_report(
         notes=[*run_notes(rows), *notes, *rate, *([sine] if floor else [])],
         extra={"truth_theta": truth, **(extra or {}), **({FLOOR: floor} if floor else {})},
         head=introduction(experiment, rows),
+        conclusion=conclusion(rows),
         tables=[*headline(rows), verdict_table(verdicts, "Claims of the paper"), *altitude, *parameters(rows, truth)],
     )
 

@@ -24,7 +24,11 @@ OUTLINE = {
     "source": ("0.45", "not adapted", "s"),
     "fine_tune": ("#D55E00", "fine-tuned", "^"),
 }
-CHANGES = {PARAMETER_SHIFT: "other inertia", EXTERNAL_FORCE: "side wind", "doubled_drag": "twice the drag"}
+CHANGES: dict[str, str] = {
+    PARAMETER_SHIFT: "other inertia",
+    EXTERNAL_FORCE: "side wind",
+    "doubled_drag": "twice the drag",
+}
 CHANGES |= {"weak_rotor": "weak rotor", "off_centre_load": "load off centre", "gusty_wind": "gusty wind"}
 
 
@@ -109,6 +113,21 @@ CLAIMS: Sequence[Claim[Results]] = (
 )
 
 
+def conclusion(rows: Results) -> list[str]:
+    """One sentence: the share of the source's error that is gone, and what fine-tuning does."""
+    gains = {domain: 1 - over(own, "source").mean() for domain, own in rows.group("domain").items()}
+    sentence = (
+        f"`adapt` removes {min(gains.values()):.0%} to {max(gains.values()):.0%} of the source's error, by change"
+    )
+    if "fine_tune" not in rows.unique("candidate"):
+        return [f"{sentence}."]
+    worse = [
+        of_each_case(own, "fine_tune").mean() > of_each_case(own, "source").mean()
+        for own in rows.group("domain").values()
+    ]
+    return [f"{sentence}; fine-tuning is worse than the source in {sum(worse)} of {len(worse)} changes."]
+
+
 def regret_table(rows: Results) -> Table:
     """A line per domain: regret, ρ, and how often each candidate was taken."""
     lines = []
@@ -131,7 +150,7 @@ def error_table(rows: Results) -> Table:
         return f"{of_each_case(own, name).mean():.3g}"
 
     lines = [(name, *(text(own, name) for own in groups.values())) for name in (AUTO, *rows.unique("candidate"))]
-    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines)
+    return Table("Mean test error L^T_MSE (less is better)", ("method", *groups), lines, "column")
 
 
 @mpl.rc_context(STYLE)
@@ -146,7 +165,7 @@ def error_figure(rows: Results) -> Figure:
                 axes.plot([errors.min(), errors.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
                 axes.plot(errors.mean(), y, marker, color=colour, ls="", label="" if y else label)
     axes.set(xscale="log", xlabel="test error over 1 s of other flights, $L^T_{MSE}$ (log scale)")
-    name_lines(axes, [CHANGES.get(name, name.replace("_", " ")) for name in groups])
+    name_lines(axes, [CHANGES.get(name, name.replace("_", " ")) for name in map(str, groups)])
     return legend_below(figure, "What ten seconds of one noisy flight are worth")
 
 
@@ -164,7 +183,7 @@ def regret_figure(rows: Results) -> Figure:
             label = name.replace("_", "-") if y == 0 else ""
             axes.plot(ratio, place, "o", ms=4, alpha=0.5, color=SHOWN[name], label=label)
     axes.set(xscale="log", xlabel="test error over that of the best candidate in hindsight (log scale)")
-    axes.set_yticks(range(len(groups)), [CHANGES.get(name, name.replace("_", " ")) for name in groups])
+    axes.set_yticks(range(len(groups)), [CHANGES.get(name, name.replace("_", " ")) for name in map(str, groups)])
     axes.invert_yaxis()
     axes.axvline(NEAR, color="0.4", linestyle=":", label=f"{NEAR - 1:.0%} more")
     return legend_below(figure, "Adaptation to one flight of ten seconds", columns=4)

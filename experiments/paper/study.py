@@ -171,7 +171,9 @@ def tested(
     for column, flown_in in {"source_mse": home, "test_mse": target}.items():
         if flown_in is not None:
             given = fit.fields, flown_in.splits["test"], EVERY, settings(config), capacity(config)[0]
-            errors, each = stages.timed(f"test {mode} {model}", partial(evaluate_windows, *given))
+            errors, each = stages.timed(
+                f"test {mode} {model}", partial(evaluate_windows, *given), "compiling and testing"
+            )
             more |= {column: errors, **by_altitude(column, given[1], each)}
     sizes = (0,) if mode == SOURCE_ONLY else config.sizes
     return lanes_of(target.config["domain"], model, mode, sizes, config.seeds, fit, errors, more=more)

@@ -10,7 +10,15 @@ from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
 from experiments.reporting.statistics import spread
-from experiments.reporting.tables import EMPTY, Table, cross_table, mean_over_seeds, over_seeds, spread_text, tabulate
+from experiments.reporting.tables import (
+    EMPTY,
+    Table,
+    cross_table,
+    mean_over_seeds,
+    over_seeds,
+    spread_text,
+    tabulate,
+)
 
 TUNED, PHYSICS = (HYBRID, FINE_TUNED, FEW), (PHYSICS_ONLY, FINE_TUNED, FEW)
 EXPERT = (names.EXPERT_AUGMENTATION, SOURCE_ONLY, 0)
@@ -23,8 +31,8 @@ PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] =
 
 
 def error_text(rows: Results) -> str:
-    """1.23e-02 ± 4.5e-04, or ∞ with the count of seeds that make it so and the median of all."""
-    return spread_text(rows.spread("test_mse"), ".2e", ".1e")
+    """0.0123 ± 0.0004, or ∞ with the count of seeds that make it so and the median of all."""
+    return spread_text(rows.spread("test_mse"))
 
 
 def rho_text(rows: Results) -> str:
@@ -54,8 +62,27 @@ def by_size(rows: Results) -> list[Table]:
         ):
             sizes = own.sort(n_train=None).group("n_train")
             lines = {str(n) if n else f"none ({label(SOURCE_ONLY)})": cell for n, cell in sizes.items()}
-            tables.append(cross_table(title, lines, columns, text, "N, target trajectories"))
+            table = cross_table(title, lines, columns, text, "N, target trajectories")
+            tables.append(table._replace(best="line") if text is error_text else table)
     return tables
+
+
+def conclusion(rows: Results) -> list[str]:
+    """Of each domain the method with the smallest mean error at the smallest N, against the source's model."""
+    sentences = []
+    for place, group in _places(rows):
+        n = min(adapted_sizes(group), default=0)
+        found = {cell: own.spread("test_mse") for cell, own in cells(group).items() if cell[2] in (0, n)}
+        finite = {cell: values.mean for cell, values in found.items() if math.isfinite(values.mean)}
+        if not finite:
+            continue
+        best = min(finite, key=finite.__getitem__)
+        sentence = (
+            f"With N = {n}{place}, {label(*best[:2])} has the smallest test error, {error_text(cells(group)[best])}"
+        )
+        source = found.get((HYBRID, SOURCE_ONLY, 0))
+        sentences.append(sentence + (f"; without adaptation it is {spread_text(source)}." if source else "."))
+    return sentences
 
 
 def altitudes(rows: Results) -> list[Table]:
@@ -74,12 +101,12 @@ def altitudes(rows: Results) -> list[Table]:
 
     def text(column: str, group: Results) -> str:
         values = group.spread(column)
-        return EMPTY if values.non_finite == values.count else spread_text(values, ".2e", ".1e")
+        return EMPTY if values.non_finite == values.count else spread_text(values)
 
     columns = {"": "all", **{f"_{name}": title for name, title in BANDS.items()}}
     lines = [(*key, *(text(f"{column}{end}", group) for end in columns)) for key, (column, group) in groups.items()]
     title = f"Test error by the lowest altitude of the window, and its floor ({mean_over_seeds(own)})"
-    return [Table(title, ("model", "mode", "N", *columns.values()), lines)]
+    return [Table(title, ("model", "mode", "N", *columns.values()), lines, "column", labels=3)]
 
 
 def ranking(rows: Results) -> list[Table]:
@@ -103,10 +130,10 @@ def ranking(rows: Results) -> list[Table]:
                 error, std = quoted[cell]
                 shown = f"{error:.2e} (smallest)" if std is None else f"{error:.2e} ± {std:.2e}"
                 paper = shown, _ratio(error, quoted[PHYSICS][0], kind)
-            smallest = f"{values.smallest:.2e}".replace("inf", "∞")
+            smallest = f"{values.smallest:.3g}".replace("inf", "∞")
             lines.append((method_label(cell), str(cell[2] or EMPTY), smallest, error_text(of_cell), own, *paper))
         of = f"experiment {[*PAPER].index(domain) + 1} of the paper; {over_seeds(group)}; less is better"
-        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines))
+        tables.append(Table(f"Test error L^T_MSE, {label(domain)} ({of})", header, lines, "column", labels=2))
     return tables
 
 
@@ -163,7 +190,7 @@ def ablation_tables(rows: Results, truth: Mapping[str, Mapping[str, float]]) -> 
         return ", ".join(f"{100 * (tuned.spread(f'theta.{k}').mean / true[k] - 1):+.1f}" for k in true)
 
     columns = {
-        "source, validation": lambda group: spread_text(group.where(mode=SOURCE_ONLY).spread("val_mse"), ".2e", ".1e"),
+        "source, validation": lambda group: spread_text(group.where(mode=SOURCE_ONLY).spread("val_mse")),
         "source-only": lambda group: error_text(group.where(mode=SOURCE_ONLY)),
         "fine-tuned": lambda group: error_text(group.where(mode=FINE_TUNED)),
         "off in Ix, Iy, k [%]": bias,

@@ -71,16 +71,35 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
         "outside": {flight: each for flight, (_, each) in shares.items()},
         "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
-    figures = save_figures(out, make_figures(experiment, outputs))
+    figures = save_figures(out, make_figures(experiment, outputs), experiment.config.paper)
     given = (experiment.config.described(), environment(stages.seconds), rows, claims, figures)
     head = introduction(name, experiment, outputs)
     tables = [*log_tables(records), main[0], outside_table(shares), *main[1:], *more]
     notes = [*stages.notes(), *NOTES]
-    report.write_report(out, report.Report(name, *given, notes, extra, head, tables))
-    print_tables(console, main)
-    for line in warnings_of(shares):
-        console.print(line, highlight=False, soft_wrap=True, style="yellow", markup=False)
-    console.print(f"Folds, parameters and log checks: {out / 'report.md'}", highlight=False, soft_wrap=True)
+    warned = warnings_of(shares)
+    made = report.Report(name, *given, notes, extra, head, tables, conclusion=conclusion(outputs), warnings=warned)
+    report.write_report(out, made, paper=experiment.config.paper)
+    print_tables(console, [table for table in main if not (made.meaningless and table.verdicts)])
+    for line in (*warned, *made.conclusions()):
+        console.print(line, highlight=False, soft_wrap=True, style="yellow" * (line in warned), markup=False)
+    console.print(
+        f"Report, with folds, parameters and log checks: {out / report.HTML_NAME}", highlight=False, soft_wrap=True
+    )
+
+
+def conclusion(outputs: Outputs) -> list[str]:
+    """What was chosen, and the position error to expect of it in the last fold, with the largest N."""
+    if not outputs.selections:
+        return []
+    selected = outputs.selections[-1]
+    place, label = max((i, label) for i, label in enumerate(selected.labels) if label != SUM)
+    value, low, high = (end[place, 0] for end in selected.expected)
+    interval = f" ({LEVEL:.0%} interval {low:.2g} to {high:.2g})" if np.isfinite(high) else ""
+    chosen = ", ".join(dict.fromkeys(each.chosen for each in outputs.selections))
+    return [
+        f"Chosen by flights left out of training: {chosen}.",
+        f"After {label} steps of a flight not seen, expect a position RMSE of {value:.2g} m{interval}.",
+    ]
 
 
 def introduction(name: str, experiment: Experiment, outputs: Outputs) -> str:
@@ -149,7 +168,7 @@ def expected_table(selections: Sequence[Selection]) -> Table:
         f"Error to expect on a flight not seen [{LEVEL:.0%} interval], from those left out of training; after the "
         "colon what came out on test flights: median, and how many lie inside"
     )
-    return Table(title, ("tested on", "chosen", "N", "step", *_errors("")), lines)
+    return Table(title, ("tested on", "chosen", "N", "step", *_errors("")), lines, labels=4)
 
 
 def outside_of_training(fold: Fold) -> dict[str, dict[str, float]]:
@@ -165,7 +184,7 @@ def outside_table(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> Tabl
         for flight, (fold, each) in shares.items()
     ]
     title = "Test flights against those trained on: share of samples outside the 1 to 99 % range; ! above 10 %"
-    return Table(title, ("flight", "tested on", *next(iter(shares.values()))[1]), lines)
+    return Table(title, ("flight", "tested on", *next(iter(shares.values()))[1]), lines, labels=2)
 
 
 def warnings_of(shares: Mapping[str, tuple[str, Mapping[str, float]]]) -> list[str]:
@@ -187,7 +206,10 @@ def score_tables(rows: Results, dt: float) -> list[Table]:
     if SUM in score_labels(rows):
         titles[SUM] = "Mean error of steps 1 to 50, summed"
     named, of = {cell_name(*cell): group for cell, group in cells(rows).items()}, mean_over_seeds(rows)
-    return [tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label)) for label, at in titles.items()]
+    return [
+        tabulate(f"{at}; {of}, test windows of all folds", named, _errors(label))._replace(best="column")
+        for label, at in titles.items()
+    ]
 
 
 def fold_tables(rows: Results) -> list[Table]:
@@ -204,7 +226,9 @@ def fold_tables(rows: Results) -> list[Table]:
         for cell in kept
         for label in score_labels(rows)
     ]
-    return [Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_errors("")), lines)]
+    return [
+        Table("Fold by fold (mean ± std over seeds)", ("tested on", "model", "step", *_errors("")), lines, labels=3)
+    ]
 
 
 def parameter_tables(rows: Results, nominal: Mapping[str, Any]) -> list[Table]:
@@ -232,7 +256,7 @@ def choice_table(selections: Sequence[Selection]) -> Table:
             mean = f"{np.exp(scores.mean()):.3f}"
             lines.append((selected.fold, str(selected.n_train or EMPTY), name, mean, worst, mark))
     title = "Candidates: error on flights left out of training over that of thrust with frozen rates (geometric mean)"
-    return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines)
+    return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines, labels=3)
 
 
 def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:

@@ -61,7 +61,18 @@ def evaluate(claims: Iterable[Claim[Evidence]], evidence: Evidence) -> list[Verd
 
 def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     lines = [(each.id, each.text, OUTCOMES[each.holds], each.measured) for each in verdicts]
-    return Table(title, ("", "claim", "verdict", "measured"), lines)
+    return Table(title, ("", "claim", "verdict", "measured"), lines, verdicts=True)
+
+
+def summary(verdicts: Sequence[Verdict]) -> list[str]:
+    """One sentence: how many hypotheses hold, and which fail or are undecided."""
+    if not verdicts:
+        return []
+    names = {holds: [each.id for each in verdicts if each.holds is holds] for holds in OUTCOMES}
+    words = [f"{len(names[True])} of {len(verdicts)} hypotheses hold"]
+    words += [f"{', '.join(names[False])} fail{'s' * (len(names[False]) == 1)}"] * bool(names[False])
+    words += [f"{', '.join(names[None])} {'is' if len(names[None]) == 1 else 'are'} undecided"] * bool(names[None])
+    return [f"{'; '.join(words)}."]
 
 
 def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:

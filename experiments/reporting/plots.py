@@ -62,10 +62,10 @@ def subplots(size: tuple[float, float], rows: int, columns: int, **options: Any)
     return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
-def save_figure(figure: Figure, path: str | Path) -> list[Path]:
-    """Write `path`.png and `path`.svg, the same bytes for the same figure; returns the two paths."""
+def save_figure(figure: Figure, path: str | Path, paper: bool = False) -> list[Path]:
+    """Write `path`.png and `path`.svg, and .pdf for a paper, the same bytes for the same figure; returns the paths."""
     paths = []
-    for suffix, metadata in (("png", {}), ("svg", {"Date": None})):
+    for suffix, metadata in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None}))[: 2 + paper]:
         content = io.BytesIO()
         with mpl.rc_context(STYLE):
             figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
@@ -75,10 +75,10 @@ def save_figure(figure: Figure, path: str | Path) -> list[Path]:
     return paths
 
 
-def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]]) -> dict[str, str]:
+def save_figures(out: Path, figures: Mapping[str, tuple[Figure, str]], paper: bool = False) -> dict[str, str]:
     """Write figures, given with their captions by name; returns the captions by file, as a report takes them."""
     for name, (figure, _) in figures.items():
-        save_figure(figure, out / name)
+        save_figure(figure, out / name, paper)
     return {f"{name}.png": caption for name, (_, caption) in figures.items()}
 
 

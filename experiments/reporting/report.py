@@ -1,4 +1,4 @@
-"""What an experiment leaves in its folder: report.json, rows.csv and report.md, and the same in a terminal."""
+"""What an experiment leaves in its folder, report.html, report.md, report.json and rows.csv, and in a terminal."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -8,14 +8,16 @@ from typing import Any
 from rich.console import Console
 from rich.text import Text
 
-from experiments.reporting import claims
+from experiments.reporting import claims, html, latex
 from experiments.reporting.claims import Verdict
 from experiments.reporting.results import Results, leaves
 from experiments.reporting.tables import Table, markdown, plain, print_tables
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
 FORMAT = 2  # of report.json; 1 had no key "format", and rows of some experiments without all their tags
-JSON_NAME, CSV_NAME, PAGE_NAME = "report.json", "rows.csv", "report.md"
+JSON_NAME, CSV_NAME, PAGE_NAME, HTML_NAME = "report.json", "rows.csv", "report.md", "report.html"
+PAPER = "paper"  # the subfolder of LaTeX tables
+MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
 
 
 @dataclass(frozen=True)
@@ -31,21 +33,38 @@ class Report:
     head: str = ""  # title and introduction of the page, Markdown
     tables: Sequence[Table] = ()  # of the page and the terminal
     more_rows: Results = field(default_factory=Results)  # of rows.csv; report.json holds them in `extra`
+    conclusion: Sequence[str] = ()  # sentences before that on hypotheses
+    warnings: Sequence[str] = ()  # what a reader must know before any number
+
+    @property
+    def meaningless(self) -> bool:
+        return self.config.get("preset") == "smoke"
+
+    def conclusions(self) -> list[str]:
+        """What the page begins with."""
+        return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
+
+    def shown(self) -> list[Table]:
+        """The tables of the page; numbers that mean nothing have no verdicts."""
+        return [table for table in self.tables if not (self.meaningless and table.verdicts)]
 
 
-def write_report(out: str | Path, report: Report, console: Console | None = None) -> None:
-    """Write report.json, rows.csv and report.md into the folder `out`, each atomically, report.json last.
+def write_report(out: str | Path, report: Report, console: Console | None = None, paper: bool = False) -> None:
+    """Write report.html, report.md, rows.csv and report.json into the folder `out`, each atomically, report.json last.
 
-    The tables and the notes are printed to the console, if any.
+    The tables, the notes and where the report is are printed to the console, if any. `paper`: also LaTeX tables.
     """
-    record = json_text(to_json(report))
-    contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report), JSON_NAME: record}
+    out, record = Path(out), json_text(to_json(report))
+    tables = {f"{PAPER}/{latex.file_name(table)}.tex": latex.latex(table) for table in report.shown() if paper}
+    contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report)} | tables
+    contents |= {HTML_NAME: html.document(report, out), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
-        write_atomic(Path(out) / name, content)
+        write_atomic(out / name, content)
     if console is not None:
-        print_tables(console, report.tables)
-        for note in report.notes:
-            console.print(Text(note))
+        print_tables(console, report.shown())
+        for line in (*report.notes, *report.warnings, *report.conclusions()):
+            console.print(Text(line))
+        console.print(Text(f"Report: {out / HTML_NAME}"), soft_wrap=True)
 
 
 def to_json(report: Report) -> dict[str, Any]:
@@ -59,8 +78,10 @@ def to_json(report: Report) -> dict[str, Any]:
 
 def page(report: Report) -> str:
     """report.md: head, tables, figures, notes, environment and configuration."""
-    parts = [report.head or f"# {report.experiment}"]
-    for table in report.tables:
+    title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
+    said = [" ".join(map(plain, report.conclusions())), *map(plain, report.warnings), introduction.strip()]
+    parts = [title, *(text for text in said if text)]
+    for table in report.shown():
         parts += [f"## {plain(table.title)}", markdown(table)]
     if report.figures:
         captions = {path: plain(caption) for path, caption in report.figures.items()}

@@ -1,5 +1,6 @@
 """Progress on stderr: a live line in a terminal, an occasional plain line in a file."""
 
+import threading
 import time
 from contextlib import AbstractContextManager
 from typing import Self
@@ -10,50 +11,74 @@ from rich.text import Text
 
 from hybrid_jax.sweep.training import Progress
 
-FIRST, INTERVAL = 5.0, 30.0  # s before the first line in a file, and between lines
+FIRST, INTERVAL = 1.0, 30.0  # s before the first line in a file, and between lines
 
 
 class Line(AbstractContextManager):
-    """One line about a stage, updated by `say`."""
+    """One line about a stage: what is being done, the time since it began and, where it is known, the time left.
 
-    def __init__(self, name: str, console: Console):
-        self._name, self._console, self._began = name, console, time.perf_counter()
-        self._live = Live(Text(f"{name}: compiling"), console=console, transient=True) if console.is_terminal else None
-        self._due = self._began + FIRST
+    A terminal shows it at once, with a running clock. A file gets it after a second, so that short stages add no line.
+    """
+
+    def __init__(self, name: str, console: Console, doing: str = "compiling"):
+        self._name, self._console, self._doing, self._began = name, console, doing, time.perf_counter()
+        self._due = self._began + INTERVAL
+        self._live = self._timer = None
+        if console.is_terminal:
+            self._live = Live(self, console=console, transient=True)
+        else:
+            self._timer = threading.Timer(FIRST, self._print)
+            self._timer.daemon = True
+
+    def __rich__(self) -> Text:
+        return Text(f"{self}, {clock(self._elapsed())} elapsed", no_wrap=True, overflow="ellipsis")
+
+    def __str__(self) -> str:
+        return f"{self._name}: {self._doing}"
 
     def __enter__(self) -> Self:
         if self._live is not None:
-            self._live.start()
+            self._live.start(refresh=True)
+        if self._timer is not None:
+            self._timer.start()
         return self
 
     def __exit__(self, *exception) -> None:
+        if self._timer is not None:
+            self._timer.cancel()
         if self._live is not None:
             self._live.stop()
 
-    def say(self, text: str) -> None:
-        """Show the text; in a file at most once per INTERVAL."""
-        line = f"{self._name}: {text}"
-        if self._live is not None:
-            self._live.update(Text(line))
-        elif time.perf_counter() > self._due:
+    def say(self, doing: str) -> None:
+        """Show what is being done; in a file at most once per INTERVAL."""
+        self._doing = doing
+        if self._live is None and time.perf_counter() > self._due:
             self._due = time.perf_counter() + INTERVAL
-            self._console.print(line, highlight=False, soft_wrap=True)
+            self._print()
+
+    def show_share(self, doing: str, share: float) -> None:
+        """Show the finished share of the work, 0 … 1, and the time left if the rest is as fast."""
+        left = f", {clock(self._elapsed() * (1 - share) / share)} left" if share > 0 else ""
+        self.say(f"{doing} {share:.0%}{left}")
 
     def show_parts(self, done: int, parts: int) -> None:
         """Show the number of finished parts and the time left, if the others take as long."""
-        elapsed = time.perf_counter() - self._began
-        left = elapsed / done * (parts - done)
-        self.say(f"{done} of {parts} parts, {clock(elapsed)} elapsed, {clock(left)} left")
+        self.show_share(f"{done} of {parts} parts,", done / parts)
 
     def show_sweep(self, progress: Progress) -> None:
-        """Show active runs, best loss, elapsed time, and bounds of the time left."""
+        """Show active runs, best loss, and bounds of the time left."""
         share = progress.active / progress.lanes  # stopped runs cost nothing
         epoch = share * progress.seconds / max(progress.epochs, 1)
         self.say(
-            f"{progress.active} of {progress.lanes} runs active, epoch {progress.epochs}, best validation loss "
-            f"{progress.best:.3g}, {clock(progress.seconds)} elapsed, "
-            f"{clock(epoch * progress.at_least)} to {clock(epoch * progress.at_most)} left"
+            f"training {progress.active} of {progress.lanes} runs, epoch {progress.epochs}, best validation loss "
+            f"{progress.best:.3g}, {clock(epoch * progress.at_least)} to {clock(epoch * progress.at_most)} left"
         )
+
+    def _elapsed(self) -> float:
+        return time.perf_counter() - self._began
+
+    def _print(self) -> None:
+        self._console.print(str(self), highlight=False, soft_wrap=True)
 
 
 def clock(seconds: float) -> str:

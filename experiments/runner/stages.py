@@ -2,6 +2,7 @@
 
 import time
 from collections.abc import Callable, Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any, TypeVar
@@ -104,17 +105,18 @@ class Stages:
         self._say(f"{name}: {summary(states)}, {clock(self.seconds[name])}")
         return states
 
-    def timed(self, name: str, work: Callable[[], Result]) -> Result:
-        """The result of `work()`; its time is added to that of the stage `name`."""
+    def timed(self, name: str, work: Callable[[], Result], doing: str = "") -> Result:
+        """The result of `work()`; its time is added to that of the stage `name`. `doing` is shown meanwhile."""
         began = time.perf_counter()
-        result = work()
+        with Line(name, self._console, doing) if doing else nullcontext():
+            result = work()
         self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - began
         return result
 
     def parts(self, name: str, jobs: Sequence[Callable[[], Result]]) -> list[Result]:
         """The results of jobs run one after the other, with progress, as one timed stage."""
         results: list[Result] = []
-        with Line(name, self._console) as line:
+        with Line(name, self._console, "compiling and solving") as line:
             for job in jobs:
                 results.append(self.timed(name, job))
                 line.show_parts(len(results), len(jobs))

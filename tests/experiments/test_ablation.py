@@ -76,7 +76,7 @@ def test_tables_have_a_line_per_value_and_domain():
         for value in ("batch (default)", "none")
     ]
     assert [line[1] for line in solver.lines] == ["heun", "heun"]
-    assert norm.lines[0][4].startswith("1.50e-01")  # of 0.1 and 0.2
+    assert norm.lines[0][4].startswith("0.15 ")  # of 0.1 and 0.2
     assert norm.lines[1][5] == "+25.0, +0.0, +0.0"
     assert "∞" in norm.lines[1][2]  # a pre-training that was not finite
 

@@ -19,7 +19,7 @@ from experiments.paper.tables import altitudes, parameters, run_notes
 from experiments.reporting.claims import OUTCOMES
 from experiments.reporting.report import write_report
 from experiments.reporting.results import Results
-from experiments.reporting.tables import spread_text
+from experiments.reporting.tables import measured, number_in, spread_text
 from experiments.runner.run_record import PACKAGES
 from hybrid_jax.sim.flight import SplitSpec
 
@@ -81,8 +81,8 @@ def test_altitudes_and_the_sources_own_error_are_in_table_and_figure():
     (table,) = altitudes(rows)
     lines = {line[:3]: line[3:] for line in table.lines}
     tuned = lines["hybrid", "fine-tuned", "100"]
-    assert tuned == ("2.20e-02 ± 4.4e-04", "5.00e-01 ± 0.0e+00", "2.50e-01 ± 0.0e+00", "–")
-    assert lines["hybrid", "source-only, on source flights", "–"][0].startswith("1.50e-02")
+    assert tuned == ("0.0220 ± 0.0004", "0.5 ± 0", "0.25 ± 0", "–")
+    assert lines["hybrid", "source-only, on source flights", "–"][0].startswith("0.015")
     assert {key[2] for key in lines} == {"–", "100", "1000"}  # the smallest and the largest N
     left, _ = scores(rows, "Scores").axes
     drawn = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))
@@ -108,7 +108,7 @@ def test_page_has_everything_once(tmp_path):
         assert page.count(f"| {claim.id} | {claim.text} |") == 1
     assert "](a/scores.png)" in page
     assert "Odd\\|note." in page
-    assert "1.23e-03" in page
+    assert "0.00123" in page
     assert f"3 of {len(rows)} runs have a test error that is not finite" in page
     assert "∞ (3 of 3 seeds not finite" in page
     tables = [line for line in page.splitlines() if line.startswith("|")]
@@ -145,10 +145,22 @@ def test_nothing_is_written_if_a_value_has_no_json_form(tmp_path):
      ([0.1, math.inf], "∞ (1 of 2 seeds not finite, median ∞)"),
      ([0.1, 0.2, -math.inf], "−∞ (1 of 3 seeds not finite, median 1.00e-01)")],
 )  # fmt: skip
-def test_spread_text(values, text):
+def test_spread_text_in_a_given_format(values, text):
     rows = Results([{"seed": seed, "error": value} for seed, value in enumerate(values)])
     missing = -math.inf if -math.inf in values else math.inf
     assert spread_text(rows.spread("error", missing), ".2e", ".1e") == text
+
+
+@pytest.mark.parametrize(
+    ("mean", "std", "text"),
+    [(0.0671, 0.0093, "0.067 ± 0.009"), (0.6944, 0.0131, "0.694 ± 0.013"), (22.31, 0.44, "22.3 ± 0.4"),
+     (3.21e-4, 2.2e-5, "(3.2 ± 0.2)e-04"), (-0.26, 0.021, "-0.26 ± 0.02"), (0.2, 14.2, "0 ± 14"),
+     (2.204, 0.0, "2.2 ± 0"), (2.204, math.nan, "2.2"), (math.inf, 1.0, "inf ± 1")],
+)  # fmt: skip
+def test_a_mean_ends_with_the_last_digit_that_its_deviation_leaves(mean, std, text):
+    assert measured(mean, std) == text
+    if math.isfinite(mean) and "±" in text:
+        assert number_in(text) == pytest.approx(mean, abs=max(std, 1e-2 * abs(mean)))
 
 
 @settings(max_examples=40, deadline=None)
