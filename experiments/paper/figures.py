@@ -8,15 +8,28 @@ from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from experiments.paper.claims import THETA_TOLERANCE
 from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
 from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
-from experiments.reporting.plots import DRAWABLE, STYLE, Line, colour, error_legend, error_panel, legend_below, subplots
+from experiments.reporting.plots import (
+    COLUMN,
+    DRAWABLE,
+    PAGE,
+    STYLE,
+    Line,
+    colour,
+    error_legend,
+    error_panel,
+    subplots,
+    tick_errors,
+)
 from experiments.reporting.results import Column, Results, Row
 
 DASHES = {FINE_TUNED: "-", TARGET_ONLY: "--", SOURCE_ONLY: ":"}
@@ -25,7 +38,7 @@ MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
-MEANING = "mean ± one standard deviation over seeds; hollow: over the finite seeds only"
+MEANING = "mean ± std over seeds; hollow: of the finite ones"
 
 
 class _Curve(NamedTuple):
@@ -46,15 +59,26 @@ _Curves = dict[tuple[str, str], _Curve]  # by model and mode
 @mpl.rc_context(STYLE)
 def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     """Figs. 3 and 5: test error, above a floor that no model can get below, and ρ against N; mean ± std over seeds."""
-    figure, ((left, right),) = subplots((9, 4.8), 1, 2)
-    _draw_errors(left, _curves(rows, "test_mse"), floor)
-    _draw_home(left, rows.where(lambda row: "source_mse" in row))
-    _draw_gains(right, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
+    figure, ((upper,), (lower,)) = subplots((COLUMN, 5.4), 2, 1, sharex=True, height_ratios=(1.25, 1))
+    curves = _curves(rows, "test_mse")
+    _draw_errors(upper, curves, floor)
+    _draw_home(upper, rows.where(lambda row: "source_mse" in row))
+    _draw_gains(lower, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
     sizes = adapted_sizes(rows)
-    for axes in (left, right):
-        axes.set_xlabel("N, target trajectories trained on")
-        axes.set_xticks(sizes, [str(n) for n in sizes])
-    return legend_below(figure, title, MEANING, columns=3)
+    lower.set_xlabel("N, target trajectories trained on")
+    lower.set_xticks(sizes, [str(n) for n in sizes])
+    return _legend(figure, title, curves)
+
+
+def _legend(figure: Figure, title: str, curves: "_Curves") -> Figure:
+    """Colours of the models, then lines of the ways to train them."""
+    models, modes = (dict.fromkeys(key[i] for key in curves) for i in (0, 1))
+    entries: dict[str, Artist] = {label(model): Line2D([], [], color=colour(model), linewidth=4) for model in models}
+    style = {"color": "0.2", "markersize": 4}
+    entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
+    figure.suptitle(title)
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title=MEANING)
+    return figure
 
 
 @mpl.rc_context(STYLE)
@@ -62,7 +86,7 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     """Ix, Iy and k relative to the truth, none of them 0, against N; mean ± std over seeds."""
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
     sizes = adapted_sizes(known)
-    figure, (panels,) = subplots((9, 4.1), 1, len(THETA))
+    figure, (panels,) = subplots((PAGE, 3.2), 1, len(THETA))
     for axes, name in zip(panels, THETA, strict=True):
 
         def bias(row: Row, name: str = name) -> float:
@@ -73,7 +97,8 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
         axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
         axes.set_xticks(sizes, [str(n) for n in sizes])
     panels[0].set_ylabel("recovered / true − 1  [%]")
-    return legend_below(figure, "Physical parameters after training", MEANING, columns=4)
+    known_by = _curves(known, lambda row: 0.0)
+    return _legend(figure, "Physical parameters after training; grey: within 5 % of the truth", known_by)
 
 
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:
@@ -112,7 +137,7 @@ def ablation(rows: Results, title: str, floors: Mapping[str, float]) -> Figure:
 def _error_panels(panels: Mapping[str, Sequence[Line]], title: str, floors: Mapping[str, float]) -> Figure:
     counts = [len(lines) for lines in panels.values()]
     height = 0.8 + sum(0.9 + 0.3 * count for count in counts)
-    figure, column = subplots((9, height), len(panels), 1, height_ratios=counts)
+    figure, column = subplots((PAGE, height), len(panels), 1, height_ratios=counts)
     for axes, (domain, lines) in zip(column.flat, panels.items(), strict=True):
         error_panel(axes, lines, label(domain).capitalize(), floors.get(domain, 0.0))
     failed = any(np.isinf(line.errors).any() for lines in panels.values() for line in lines)
@@ -135,7 +160,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
     means = means[means > 1 / DRAWABLE]
     lowest = min(means, default=1.0)
     limits = lowest / 2, min(2 * max(means, default=1.0), lowest * 10.0**DECADES)
-    axes.set(yscale="log", ylabel="$L^T_{MSE}$  (state in SI units, squared)", title="Test error (log scale)")
+    axes.set(yscale="log", ylabel="test error $L^T_{MSE}$ (log scale)")
     # One std may reach below 0, which a log axis has not; the whisker then ends at the best seed.
     curves = {key: c._replace(low=np.where(c.low > 0, c.low, c.smallest)) for key, c in curves.items()}
     trained = {key: curve for key, curve in curves.items() if key[1] != SOURCE_ONLY}
@@ -146,6 +171,8 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if floor > 1 / DRAWABLE:
         axes.axhline(floor, color="0.4", linestyle="-.", label=plots.FLOOR_LABEL)
+        _name_line(axes, floor, plots.FLOOR_LABEL)
+    tick_errors(axes.yaxis, *axes.get_ylim(), room=3.5)
 
 
 def _draw_home(axes: Axes, rows: Results) -> None:
@@ -156,15 +183,20 @@ def _draw_home(axes: Axes, rows: Results) -> None:
             axes.axhline(home, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1,
                          label=f"{label(model, SOURCE_ONLY)}, on source flights")  # fmt: skip
             axes.set_ylim(bottom=min(axes.get_ylim()[0], home / 2))
+            _name_line(axes, home, "source's own error on flights before the change")
+
+
+def _name_line(axes: Axes, y: float, words: str, right: float = 0.99) -> None:
+    style = {"ha": "right", "va": "top", "fontsize": 6, "color": "0.3"}
+    axes.text(right, y, f"{words} ", transform=axes.get_yaxis_transform(), **style)
 
 
 def _draw_gains(axes: Axes, curves: _Curves) -> None:
     lows = np.concatenate([curve.low for curve in curves.values()] or [np.zeros(1)])
     lowest = max(LOWEST_RHO, min(lows[np.isfinite(lows)], default=0.0))
     axes.axhline(0.0, color="0.4", linestyle=":")
-    style = {"ha": "right", "va": "top", "fontsize": 8, "color": "0.4"}
-    axes.text(0.99, -0.01, "0: no gain over source-only", transform=axes.get_yaxis_transform(), **style)
-    axes.set(ylabel="ρ = 1 − error / source error", title="Improvement over source-only (1 is perfect)")
+    _name_line(axes, -0.01, "no gain", 0.6)
+    axes.set(ylabel="gain ρ (1 is perfect)")
     _draw_curves(axes, curves, min(lowest, 0.0) - 0.1, 1.08, lost_at_top=False)
 
 
@@ -178,15 +210,15 @@ def _draw_biases(axes: Axes, curves: _Curves) -> None:
 
 
 def _draw_curves(axes: Axes, curves: _Curves, bottom: float, top: float, lost_at_top: bool = True) -> None:
-    """Draw within [bottom, top], each curve a little beside the next; mark what lies outside or is not finite."""
+    """Draw within [bottom, top], the spread as a band; mark what lies outside or is not finite."""
     axes.set_ylim(bottom, top)
-    span = max((np.ptp(curve.n) for curve in curves.values()), default=0.0) or 1.0
-    for index, ((model, mode), curve) in enumerate(curves.items()):
-        x = curve.n + 0.012 * span * (index - (len(curves) - 1) / 2)
+    for (model, mode), curve in curves.items():
+        x = curve.n
         inside = (curve.mean >= bottom) & (curve.mean <= top)
         mean, low, high = (np.where(inside, np.clip(part, bottom, top), np.nan) for part in curve[1:4])
-        style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markersize": 5}
-        axes.errorbar(x, mean, np.stack([mean - low, high - mean]), capsize=3, label=label(model, mode), **style)
+        style = {"color": colour(model), "linestyle": DASHES[mode], "marker": MARKERS[mode], "markeredgewidth": 0}
+        axes.plot(x, mean, label=label(model, mode), **style)
+        axes.fill_between(x, low, high, color=colour(model), alpha=0.15, linewidth=0)
         lost = top if lost_at_top else bottom
         for at, *point in zip(x, *curve, strict=True):
             _mark_failure(axes, at, point, lost, colour(model))
@@ -206,5 +238,5 @@ def _mark_failure(axes: Axes, at: float, point: Sequence[float], lost: float, co
         down = y > axes.transData.inverted().transform(axes.transAxes.transform((0.0, 0.5)))[1]
         offset, align = ((5, -5), "top") if down else ((5, 5), "bottom")
         box = {"facecolor": "white", "alpha": 0.75, "linewidth": 0, "pad": 0.5}
-        style = {"va": align, "fontsize": 8, "color": colour, "bbox": box, "zorder": 6}
+        style = {"va": align, "fontsize": 6, "color": colour, "bbox": box, "zorder": 6}
         axes.annotate(words, (at, y), offset, textcoords="offset points", **style)

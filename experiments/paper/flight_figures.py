@@ -1,4 +1,4 @@
-"""Figures of flights: predicted paths in the horizontal plane (Figs. 2 and 4) and an example of the data (Fig. 7)."""
+"""Figures of flights: how predictions part from the truth (Figs. 2 and 4), and an example of the data (Fig. 7)."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,34 +10,55 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from experiments.reporting.names import HYBRID, label
-from experiments.reporting.plots import COLOURS, STYLE, colour, legend_below, subplots
+from experiments.reporting.plots import COLOURS, DRAWABLE, PAGE, STYLE, colour, legend_below
 from hybrid_jax.state import INPUT_NAMES, INPUT_SIZE, POSITION, QUATERNION, VELOCITY
 
 MIN_HALF_WIDTH = 0.2  # m, of a view: a hovering vehicle is not magnified beyond it
-VIEW_RATIO = 1.6  # width of a view over the extent of the truth
+VIEW_RATIO = 1.3  # width of a view over the extent of the truth
+SMALLEST = 1e-6  # m, of an error on a log axis
+DECADES = 4  # of errors that are shown
+DASH = 1.2  # line widths
+MOST = 100.0  # m: no error beyond it is shown
 
 States = Float[np.ndarray, "t+1 13"]
+Flights = Float[np.ndarray, "n t+1 13"]
 
 
 @mpl.rc_context(STYLE)
-def predictions(truth: States, predicted: Mapping[int, Mapping[str, States]], title: str) -> Figure:
-    """Figs. 2 and 4: one test flight in the horizontal plane, a panel for each N, every model against the truth.
+def predictions(
+    predicted: Mapping[int, Mapping[str, Flights]], truth: Flights, shown: int, dt: float, title: str
+) -> Figure:
+    """Figs. 2 and 4: how the position error of many flights grows, by N and model, and one flight in space.
 
-    The truth alone sets the view; a prediction, N → model → its states, that leaves it is cut, and the panel says so.
+    Args:
+        predicted: N → model → predicted states (flights, t + 1, 13).
+        truth: the states of the same flights.
+        shown: index of the flight that is drawn in space, as predicted with the smallest N.
     """
-    figure, (panels,) = subplots((3.1 * max(len(predicted), 2), 4.1), 1, len(predicted), sharey=True)
-    for axes, (n, models) in zip(panels, sorted(predicted.items()), strict=True):
-        _draw_paths(axes, truth, models)
-        axes.set(title=f"N = {n} trajectories", xlabel="x [m]")
-    panels[0].set_ylabel("y [m]")
-    return legend_below(figure, title, columns=4)
+    sizes = sorted(predicted)
+    figure = Figure(figsize=(PAGE, 5.6), layout="constrained")
+    grid = figure.add_gridspec(2, len(sizes), height_ratios=(1, 1.35))
+    first = None
+    for column, n in enumerate(sizes):
+        first = axes = figure.add_subplot(grid[0, column], sharey=first)
+        _draw_growth(axes, predicted[n], truth, dt)
+        axes.set(title=f"N = {n}", xlabel="time [s]", yscale="log")
+        axes.tick_params(labelleft=column == 0)
+    assert first is not None
+    figure.axes[0].set_ylabel("position error [m]")
+    top = min(first.get_ylim()[1], MOST)
+    first.set_ylim(top / 10.0**DECADES, top)
+    space = figure.add_subplot(grid[1, :], projection="3d")
+    models = {name: states[shown] for name, states in predicted[sizes[0]].items()}
+    _draw_predicted_paths(space, truth[shown], models, f"one of these flights, N = {sizes[0]}")
+    return legend_below(figure, title, "line: median flight; band: 10 to 90 % of flights", columns=4)
 
 
 @mpl.rc_context(STYLE)
 def example_flight(states: States, inputs: Float[np.ndarray, "t 4"], dt: float) -> Figure:
     """Fig. 7: the path in space, and altitude, speed, tilt and rotor speeds [rad/s], held for dt [s], over time."""
     time = dt * np.arange(len(states))
-    figure = Figure(figsize=(9, 5.4), layout="constrained")
+    figure = Figure(figsize=(PAGE, 4.6), layout="constrained")
     grid = figure.add_gridspec(4, 2, width_ratios=(1.15, 1))
     _draw_space(figure.add_subplot(grid[:, 0], projection="3d"), states)
     panels = [figure.add_subplot(grid[row, 1]) for row in range(4)]
@@ -55,32 +76,43 @@ def example_flight(states: States, inputs: Float[np.ndarray, "t 4"], dt: float) 
     for index, (name, tint) in enumerate(zip(INPUT_NAMES, COLOURS.values(), strict=False)):
         rotors.stairs(inputs[:, index], time, baseline=None, color=tint, label=name, linewidth=1)
     rotors.set(xlabel="time [s]", ylabel="rotors\n[rad/s]")
-    rotors.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=7, columnspacing=1, handlelength=1, frameon=True)
+    rotors.legend(ncols=INPUT_SIZE, loc="upper right", fontsize=6, columnspacing=1, handlelength=1, frameon=True)
     figure.align_ylabels(panels)
-    figure.suptitle("An example flight of the data", fontsize=12)
+    figure.suptitle("An example flight of the data")
     return figure
 
 
-def _draw_paths(axes: Axes, truth: States, models: Mapping[str, States]) -> None:
-    start, path = truth[0, :2], truth[:, :2]
-    centre = (path.min(axis=0) + path.max(axis=0)) / 2
-    half = max(MIN_HALF_WIDTH, VIEW_RATIO * np.ptp(path, axis=0).max() / 2)
+def _draw_growth(axes: Axes, models: Mapping[str, Flights], truth: Flights, dt: float) -> None:
+    time = dt * np.arange(1, truth.shape[1])
     for name, states in models.items():
-        # A path ends where it first is not finite, or so far off that drawing it would overflow.
-        near = np.all(np.abs(states[:, :2] - centre) < 1e3 * half, axis=1)
-        drawn = states[: len(near) if near.all() else int(np.argmin(near)), :2]
-        shown, tint = label(name), colour(name)
-        axes.plot(*drawn.T, color=tint, linewidth=1.8, marker=".", markersize=4, label=shown)
-        if np.all(np.abs(states[:, :2] - centre) <= half):
-            continue
-        with np.errstate(over="ignore"):
-            off = np.linalg.norm(states[:, :2] - centre, axis=1).max()
-        words = f"{shown} leaves the view,\nup to {off:.2g} m off" if np.isfinite(off) else f"{shown} ends: not finite"
-        y = 0.02 + 0.12 * len(axes.texts)
-        axes.text(0.03, y, words, transform=axes.transAxes, color=tint, fontsize=8, va="bottom")
-    axes.plot(*path.T, color="black", linestyle="--", linewidth=1.5, label="truth", zorder=4)
-    axes.plot(*start, marker="o", color="black", markerfacecolor="white", linestyle="", label="start", zorder=5)
-    axes.set(xlim=(centre[0] - half, centre[0] + half), ylim=(centre[1] - half, centre[1] + half), aspect="equal")
+        with np.errstate(all="ignore"):
+            errors = np.linalg.norm(states[:, 1:, POSITION] - truth[:, 1:, POSITION], axis=-1)
+        errors = np.where(errors < DRAWABLE, errors, DRAWABLE)  # a flight that diverged counts as the worst
+        low, middle, high = np.maximum(np.quantile(errors, (0.1, 0.5, 0.9), axis=0), SMALLEST)
+        axes.plot(time, middle, color=colour(name), label=label(name))
+        axes.fill_between(time, low, high, color=colour(name), alpha=0.15, linewidth=0)
+
+
+def _draw_predicted_paths(axes: Any, truth: States, models: Mapping[str, States], title: str) -> None:
+    """Paths in space, in a box around the truth with one scale; a prediction ends with × where it leaves the box."""
+    path, count = truth[:, POSITION], len(models)
+    centre, half = (path.min(axis=0) + path.max(axis=0)) / 2, VIEW_RATIO * np.ptp(path, axis=0) / 2
+    half = np.maximum(half, max(MIN_HALF_WIDTH, half.max() / 3))
+    axes.plot(*path.T, color="0.8", linewidth=7, label="truth", solid_capstyle="round")  # wide, so that none hides it
+    axes.plot(*path[:1].T, "o", color="black", markerfacecolor="white", label="start")
+    for i, (name, states) in enumerate(models.items()):
+        inside = np.all(np.abs(states[:, POSITION] - centre) <= half, axis=1)
+        end = len(inside) if inside.all() else int(np.argmin(inside))
+        drawn = states[:end, POSITION].T
+        # Dashes of different places, so that of paths that agree each is seen.
+        dashes: Any = (DASH * i, (DASH, DASH * (count - 1))) if count > 1 else "-"
+        axes.plot(*drawn, color=colour(name), linewidth=2, linestyle=dashes)
+        axes.plot(*drawn[:, -1:], "o" if end == len(inside) else "x", color=colour(name), markersize=6)
+    low, high = centre - half, centre + half
+    axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
+    axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
+    axes.locator_params(nbins=4)
+    axes.set_box_aspect(half, zoom=1.25)
 
 
 def _draw_space(axes: Any, states: States) -> None:

@@ -17,7 +17,7 @@ from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, STYLE, legend_below, name_lines, subplots, tick_errors
+from experiments.reporting.plots import COLOURS, COLUMN, PAGE, STYLE, legend_below, name_lines, subplots, tick_errors
 from experiments.reporting.results import Results
 from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.flights.log import segments
@@ -28,7 +28,8 @@ from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
 MODEL_COLOURS = COLOURS | {"chosen": "#E69F00", "linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
 BINS, MIN_SAMPLES = 12, 10  # bins of speed, and samples of one that is drawn
-OFFSET = 1.02  # factor in N between the points of two models
+BASELINE: Cell = ("thrust", "nominal", 0)  # thrust with frozen body rates, which errors are drawn over
+WORST = 4.0  # times its error: no curve is drawn beyond
 MARGIN = 1.5  # factor in N on both sides of a single one
 PIECES = 6  # predictions in the figure of a flight
 
@@ -37,13 +38,13 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
     """Draw all figures: name → figure and caption."""
     nanodrone, rows = experiment.config.protocol == "nanodrone", outputs.table
     caption = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
-    steps = f"Error against horizon, {caption}, test flights of all folds"
+    steps = f"Error against horizon over that of thrust with frozen rates, {caption}, test flights of all folds"
     figures = {"errors_by_step": (errors_by_step(experiment, outputs), steps)}
     ranges = "Motion of test flights (median, 1 to 99 %) against that of the flights trained on (band)"
     figures["ranges"] = (ranges_of_motion(outputs.folds), ranges)
     if any(rows["n_train"]):
         by_size = errors_by_size(rows, experiment.dt, "Error against the amount of target flight")
-        figures["errors_by_size"] = (by_size, "Error against N, the number of target windows trained on")
+        figures["errors_by_size"] = (by_size, "Error over that of thrust with frozen rates, against N, target windows")
     modes = ("fine_tuned", "source_only", "zero_shot")
     hybrids = {mode: outputs.trained[0, "hybrid", mode] for mode in modes if (0, "hybrid", mode) in outputs.trained}
     if hybrids:
@@ -56,37 +57,45 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
 
 @mpl.rc_context(STYLE)
 def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
-    """A panel for each quantity: the error of the main cells against the time since the start of the prediction."""
-    measure, power, kind = ("mean error", 1, 1) if experiment.config.protocol == "nanodrone" else ("RMSE", 2, 0)
-    figure, panels = subplots((9.5, 7.2), 2, 2, sharex=True)
+    """A panel for each quantity: the errors of the main cells over the baseline's, against the time of prediction."""
+    power, kind = (1, 1) if experiment.config.protocol == "nanodrone" else (2, 0)
+    figure, panels = subplots((PAGE, 5.6), 2, 2, sharex=True)
     most = max(outputs.table["n_train"])
     curves_of = {tuple(row[tag] for tag in TAGS): errors[kind] for row, errors in outputs.tests}
-    for cell, group in cells(outputs.table).items():
-        model, mode, n = cell
-        if n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
-            continue
-        by_seed = []  # over the test windows of all folds
+
+    def curves(group: Results) -> np.ndarray:
+        """Of each seed and quantity, over the test windows of all folds."""
+        by_seed = []
         for own in group.group("seed").values():
             weights = own.numbers("windows")
             errors = np.array([curves_of[tuple(row[tag] for tag in TAGS)] for row in own])
             by_seed.append((np.tensordot(weights, errors**power, 1) / weights.sum()) ** (1 / power))
+        return np.array(by_seed)
+
+    found = cells(outputs.table)
+    baseline = curves(found[BASELINE]).mean(axis=0)
+    for cell, group in found.items():
+        model, mode, n = cell
+        if cell == BASELINE or n not in (0, most) or (mode == "scratch" and model not in ("hybrid", "linear_residual")):
+            continue
+        by_seed = curves(group) / baseline
         for axes, mean, std in zip(panels.flat, np.mean(by_seed, axis=0), np.std(by_seed, axis=0), strict=True):
             time, low = experiment.dt * np.arange(1, len(mean) + 1), np.maximum(mean - std, 0.5 * mean)
             axes.plot(time, mean, DASHES[mode], color=MODEL_COLOURS[model], label=cell_name(*cell))
             axes.fill_between(time, low, mean + std, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
-    for axes, (name, unit) in zip(panels.flat, QUANTITIES.items(), strict=True):
-        axes.set(yscale="log", title=name.replace("_", " ").capitalize(), ylabel=f"{measure} [{unit}]")
-        tick_errors(axes.yaxis, *axes.get_ylim())
+    for axes, name in zip(panels.flat, QUANTITIES, strict=True):
+        axes.set(title=name.replace("_", " ").capitalize(), ylabel="error / baseline")
+        _over_baseline(axes)
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
-    return legend_below(figure, "Error against horizon", "mean over seeds; band: ± one standard deviation")
+    return legend_below(figure, "Error over that of thrust with frozen rates", "mean over seeds; band: ± std")
 
 
 @mpl.rc_context(STYLE)
 def ranges_of_motion(folds: Sequence[Fold]) -> Figure:
     """A panel for each kind of motion, a line for each test flight, before the range of its fold's training flights."""
     tested = [(motion_of_logs([*fold.train, *fold.validation]), log) for fold in folds for log in fold.test]
-    figure, panels = subplots((12, 1.6 + 0.2 * len(tested)), 1, 4, sharey=True)
+    figure, panels = subplots((PAGE, 1.4 + 0.18 * len(tested)), 1, 4, sharey=True)
     for line, (known, log) in enumerate(tested):
         for axes, (name, values) in zip(panels.flat, motion_of_logs([log]).items(), strict=True):
             low, middle, high = np.quantile(values, (RANGE[0], 0.5, RANGE[1]))
@@ -95,28 +104,29 @@ def ranges_of_motion(folds: Sequence[Fold]) -> Figure:
             axes.plot(middle, line, "o", color=COLOURS["hybrid"], markersize=3.5)
             axes.set_xlabel(name)
     name_lines(panels[0, 0], [flight_of(log) for _, log in tested])
-    figure.suptitle("What is asked of the models, and what they were trained on", fontsize=12)
+    figure.suptitle("What is asked of the models, and what they were trained on")
     return figure
 
 
 @mpl.rc_context(STYLE)
 def errors_by_size(rows: Results, dt: float, title: str) -> Figure:
-    """A row of panels for each horizon: the error against N; models without target windows are horizontal lines."""
+    """A row of panels for each horizon: the error over the baseline's against N; models without N are lines."""
     found, labels = cells(rows), score_labels(rows)
     sizes = sorted({n for _, _, n in found} - {0})
-    figure, panels = subplots((12, 0.9 + 2.7 * len(labels)), len(labels), len(QUANTITIES), sharex=True)
+    figure, panels = subplots((PAGE, 1.2 + 1.9 * len(labels)), len(labels), len(QUANTITIES), sharex=True)
     for label, line in zip(labels, panels, strict=True):
         when = "summed over 50 steps" if label == SUM else f"{int(label) * dt:.3g} s"
-        for (name, unit), axes in zip(QUANTITIES.items(), line, strict=True):
+        for name, axes in zip(QUANTITIES, line, strict=True):
             _draw_sizes(axes, found, sizes, label, name)
-            axes.set(title=f"{name.replace('_', ' ').capitalize()}, {when}", ylabel=f"error [{unit}]")
+            axes.set_title(f"{name.replace('_', ' ').capitalize()}, {when}")
+        line[0].set_ylabel("error / baseline")
     for axes in panels[-1]:
         axes.set(xscale="log", xlabel="N, target windows")
         axes.set_xticks(sizes, [str(size) for size in sizes])
         axes.xaxis.set_minor_formatter(NullFormatter())
         if len(sizes) == 1:
             axes.set_xlim(sizes[0] / MARGIN, sizes[0] * MARGIN)
-    return legend_below(figure, title, "mean over seeds; bars: ± one standard deviation")
+    return legend_below(figure, title, "over thrust with frozen rates; mean over seeds; band: ± std", columns=3)
 
 
 @mpl.rc_context(STYLE)
@@ -125,8 +135,10 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     config, dt = experiment.config, experiment.dt
     log = require_length(outputs.folds[0].test, config.longest)[0]
     part = max(segments(log), key=lambda part: part.stop - part.start)
-    begin, windows = log.t[part.start] - log.t[0], cut_windows([log[part]], config.longest, config.longest).windows
-    windows = windows[:PIECES]
+    windows = cut_windows([log[part]], config.longest, config.longest).windows
+    first = _liveliest(np.asarray(windows.x)[..., VELOCITY.start :], PIECES)
+    begin = log.t[part.start] - log.t[0] + first * config.longest * dt
+    windows = windows[first : first + PIECES]
     fields = {(model, mode): _largest(outputs.trained[0, model, mode]) for model in config.models}
     fields["thrust", "nominal"] = thrust_baseline(experiment.after)
     truth = np.concatenate([windows.x0[:1], *windows.x])
@@ -137,7 +149,7 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     for cell, field in fields.items():
         predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
         states[cell] = np.concatenate([windows.x0[:, None], predicted, gap], axis=1)
-    figure, panels = subplots((12, 6), 2, 3, sharex=True)
+    figure, panels = subplots((PAGE, 4.4), 2, 3, sharex=True)
     names = ("vx", "vy", "vz", "ωx", "ωy", "ωz")
     for axes, place, name in zip(panels.flat, range(VELOCITY.start, BODY_RATES.stop), names, strict=True):
         axes.plot(time, truth[:, place], color="black", linewidth=1.6, label="measured")
@@ -164,7 +176,7 @@ def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> 
         residuals[cell_name("hybrid", mode)] = np.asarray(network(x, windows.u[:, 0]))
     every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
     parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
-    figure = Figure(figsize=(4 * max(len(parts), 1), 4.2), layout="constrained")
+    figure = Figure(figsize=(max(COLUMN, PAGE / 3 * len(parts)), 3.2), layout="constrained")
     for column, (name, part) in enumerate(parts.items(), 1):
         axes = figure.add_subplot(1, len(parts), column)
         for colour, (label, residual) in zip(COLOURS.values(), residuals.items(), strict=False):
@@ -175,6 +187,22 @@ def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> 
     return legend_below(figure, "Output of the network against speed", meaning)
 
 
+def _liveliest(motion: np.ndarray, pieces: int) -> int:
+    """The first of so many windows (n, t, k) in a row in which the vehicle moves most: each channel by its spread."""
+    scaled = motion / (motion.std(axis=(0, 1)) + 1e-9)
+    starts = range(max(len(motion) - pieces, 0) + 1)
+    return max(starts, key=lambda i: float(scaled[i : i + pieces].std(axis=(0, 1)).mean()))
+
+
+def _over_baseline(axes: Axes) -> None:
+    """A log axis of ratios up to WORST, with the baseline as a line."""
+    axes.axhline(1.0, color=MODEL_COLOURS[BASELINE[0]], linestyle=DASHES[BASELINE[1]], label=cell_name(*BASELINE))
+    axes.set_yscale("log")
+    low, high = axes.get_ylim()
+    axes.set_ylim(low, min(high, WORST))
+    tick_errors(axes.yaxis, *axes.get_ylim(), room=2.0)
+
+
 def _largest(trained: TrainedModel) -> Any:
     """The field of the first seed with the most windows."""
     return trained.run(int(np.argmax([len(subset) for subset in trained.subsets])))
@@ -182,20 +210,25 @@ def _largest(trained: TrainedModel) -> Any:
 
 def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, quantity: str) -> None:
     drawn = dict.fromkeys((model, mode) for model, mode, _ in found)
-    adapted = [each for each in drawn if (*each, 0) not in found]
+    baseline = pooled(found[BASELINE], label, quantity).mean()
     for model, mode in drawn:
-        own = {n: pooled(found[model, mode, n], label, quantity) for n in (0, *sizes) if (model, mode, n) in found}
+        if (model, mode) == BASELINE[:2]:
+            continue
+        own = {
+            n: pooled(found[model, mode, n], label, quantity) / baseline
+            for n in (0, *sizes)
+            if (model, mode, n) in found
+        }
         style: Any = {"color": MODEL_COLOURS[model], "linestyle": DASHES[mode], "label": cell_name(model, mode)}
         if 0 in own:
             axes.axhline(own[0].mean(), linewidth=1.2, **style)
             continue
-        spread = [values.std(ddof=1) if len(values) > 1 else 0.0 for values in own.values()]
-        # Offset, or bars would hide each other.
-        factor = OFFSET ** (adapted.index((model, mode)) - (len(adapted) - 1) / 2)
-        at, means = [n * factor for n in own], [values.mean() for values in own.values()]
-        axes.errorbar(at, means, spread, capsize=2, marker="o", markersize=3.5, **style)
-    axes.set_yscale("log")
-    tick_errors(axes.yaxis, *axes.get_ylim())
+        spread = np.array([values.std(ddof=1) if len(values) > 1 else 0.0 for values in own.values()])
+        at, means = list(own), np.array([values.mean() for values in own.values()])
+        axes.plot(at, means, marker="o", markersize=3, **style)
+        low = np.maximum(means - spread, 0.5 * means)
+        axes.fill_between(at, low, means + spread, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
+    _over_baseline(axes)
 
 
 def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:

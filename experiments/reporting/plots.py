@@ -18,17 +18,9 @@ from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormat
 from experiments.reporting import names
 from hybrid_jax.io.files import write_atomic
 
-STYLE: dict[Any, Any] = {
-    "font.size": 10,
-    "axes.titlesize": 10,
-    "axes.grid": True,
-    "grid.alpha": 0.25,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "legend.frameon": False,
-    "legend.fontsize": 9,
-    "svg.hashsalt": "hybrid_jax",  # otherwise names inside an SVG are random
-}
+STYLE: dict[Any, Any] = dict(mpl.rc_params_from_file(Path(__file__).with_name("style.mplstyle"), False, False))
+COLUMN, PAGE = 3.5, 7.2  # inches: the width of a column, and of a page of text
+DPI = 200
 # Okabe and Ito's palette, which the colour-blind can tell apart.
 COLOURS = {
     names.HYBRID: "#0072B2",
@@ -68,7 +60,7 @@ def save_figure(figure: Figure, path: str | Path, paper: bool = False) -> list[P
     for suffix, metadata in (("png", {}), ("svg", {"Date": None}), ("pdf", {"CreationDate": None}))[: 2 + paper]:
         content = io.BytesIO()
         with mpl.rc_context(STYLE):
-            figure.savefig(content, format=suffix, dpi=150, metadata=metadata)
+            figure.savefig(content, format=suffix, dpi=DPI, metadata=metadata)
             figure.set_layout_engine("none")  # the second file keeps the layout of the first, which saves half the time
         paths.append(Path(f"{path}.{suffix}"))
         write_atomic(paths[-1], content.getvalue())
@@ -90,7 +82,7 @@ def legend_below(
     for axes in figure.axes:
         shown |= {label: handle for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)}
     if title:
-        figure.suptitle(title, fontsize=12)
+        figure.suptitle(title)
     figure.legend(shown.values(), shown.keys(), loc="outside lower center", ncols=columns, title=meaning or None)
     return figure
 
@@ -131,10 +123,10 @@ def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, f
     axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 7, **style})
 
 
-def tick_errors(axis: Axis, low: float, high: float) -> None:
-    """Ticks of a log axis: at decades if it is long, at 1, 2, 5 or at round steps if it is short."""
+def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
+    """Ticks of a log axis: decades, of at most `room` decades 1, 2 and 5 as well, of a short one round steps."""
     decades = math.log10(high / low)
-    room = 2.2 if low > LONG_NUMBER else 1.5  # decades
+    room = room or (2.2 if low > LONG_NUMBER else 1.5)
     subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if decades < 0.8 else (1.0, 2.0, 5.0) if decades < room else (1.0,)
     axis.set_major_locator(MaxNLocator(5) if decades < 0.5 else LogLocator(subs=subs))
     axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

@@ -78,7 +78,8 @@ class Line(AbstractContextManager):
         return time.perf_counter() - self._began
 
     def _print(self) -> None:
-        self._console.print(str(self), highlight=False, soft_wrap=True)
+        elapsed = f", {clock(self._elapsed())} elapsed" if self._elapsed() >= INTERVAL else ""
+        self._console.print(f"{self}{elapsed}", highlight=False, soft_wrap=True)
 
 
 def clock(seconds: float) -> str:

@@ -148,7 +148,8 @@ def stages_of(config: Run, console: Console) -> Stages:
 
 def summary(states: FitState) -> str:
     epochs, best = states.epoch, states.best_mse.min()
-    return f"{len(epochs)} runs, {epochs.min()} to {epochs.max()} epochs, best validation loss {best:.3g}"
+    runs, least, most = f"{len(epochs)} run{'s' * (len(epochs) > 1)}", epochs.min(), epochs.max()
+    return f"{runs}, {least if least == most else f'{least} to {most}'} epochs, best validation loss {best:.3g}"
 
 
 def _stem(name: str) -> str:

@@ -25,11 +25,12 @@ def straight_flight(steps=10):
     return states
 
 
+FLIGHTS = np.stack([straight_flight()] * 2)
 FIGURES = {
     "scores": lambda: scores(make_rows(), "Scores", floor=0.01),
     "theta": lambda: theta(make_rows(), TRUTH),
     "ranking": lambda: ranking(compared_rows(), "Ranking", {"external_force": 2e-3}),
-    "predictions": lambda: predictions(straight_flight(), {100: {"hybrid": straight_flight() * 1.01}}, "Paths"),
+    "predictions": lambda: predictions({100: {"hybrid": FLIGHTS * 1.01}}, FLIGHTS, 0, 0.1, "Paths"),
     "example_flight": lambda: example_flight(straight_flight(), np.full((10, 4), 656.0), 0.1),
 }
 
@@ -63,7 +64,7 @@ def test_scores_show_every_mean():
     }
     assert left.get_yscale() == "log"
     handles = dict(zip(labels(left), left.get_legend_handles_labels()[0], strict=True))
-    assert handles["hybrid, fine-tuned"][0].get_ydata() == pytest.approx([0.022, 0.018, 0.016])
+    assert handles["hybrid, fine-tuned"].get_ydata() == pytest.approx([0.022, 0.018, 0.016])
     assert [tick.get_text() for tick in right.get_xticklabels()] == [str(n) for n in SIZES]
 
 
@@ -114,22 +115,26 @@ def test_failed_methods_are_marked_at_the_edge_of_the_ranking():
 def test_theta_is_relative_to_the_truth_in_percent():
     rows = make_rows(theta={"Ix": 0.0404, "Iy": 0.0196, "k": 8.5e-6})
     for axes, bias in zip(theta(rows, TRUTH).axes, (1.0, -2.0, 0.0), strict=True):
-        curve = axes.containers[0][0]
+        curve = next(line for line in axes.lines if line.get_label() == "hybrid, fine-tuned")
         assert curve.get_ydata() == pytest.approx([bias] * 3, abs=1e-9)
         assert curve.get_color() == COLOURS["hybrid"]
 
 
-def test_the_truth_sets_the_view_of_predictions():
-    truth, off, lost = straight_flight(), straight_flight(), straight_flight()
-    off[5:, 1] = 1e30
-    lost[3:] = math.nan
-    figure = predictions(truth, {100: {"no_physics": off, "hybrid": lost}, 1000: {"hybrid": truth}}, "Paths")
-    few, many = figure.axes
-    assert few.get_xlim() == many.get_xlim() == pytest.approx((-0.3, 1.3))
-    words = [text.get_text() for text in few.texts]
-    assert "leaves the view" in words[0]
-    assert words[1] == "hybrid ends: not finite"
-    assert not many.texts
+def test_predictions_show_quantiles_of_flights_and_one_flight_in_a_box_around_the_truth():
+    truth = np.stack([straight_flight()] * 5)
+    near, off, lost = truth.copy(), truth.copy(), truth.copy()
+    near[:, 1:, 1] += 0.1 * np.arange(5)[:, None]  # of the flights 0 … 0.4 m off
+    off[:, 5:, 1] = 1e30
+    lost[:, 3:] = math.nan
+    predicted = {100: {"no_physics": off, "hybrid": near}, 1000: {"hybrid": lost}}
+    few, many, space = predictions(predicted, truth, 0, 0.1, "Flights").axes
+    curves = {line.get_label(): line.get_ydata() for line in few.lines}
+    assert curves["hybrid"] == pytest.approx(np.full(10, 0.2))
+    assert few.get_ylim() == many.get_ylim()
+    assert few.get_ylim()[1] <= 100
+    assert np.ptp(space.get_xlim()) == pytest.approx(1.3)
+    ends = [line.get_marker() for line in space.lines if line.get_marker() in "ox" and line.get_label()[0] == "_"]
+    assert ends == ["x", "o"]  # where a prediction leaves the box, and where it ends
 
 
 def test_tilt_is_the_angle_of_roll_and_pitch_alone():
