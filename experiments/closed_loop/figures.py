@@ -4,7 +4,7 @@ Each raises ValueError if the rows hold nothing to draw.
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from operator import attrgetter
 from typing import Any
 
@@ -40,25 +40,65 @@ XLABEL = "position RMSE [cm]  (log scale)"
 
 @mpl.rc_context(STYLE)
 def errors(rows: Results, domain: str, ablation: bool = False) -> Figure:
-    """A panel per reference at home, a line per agent, a dot per seed; of an ablation also away, a line per variant."""
+    """A row of panels per question, a column per reference at home; a line per agent, a dot per seed.
+
+    Of an ablation there is one row, also away, and a line per variant.
+    """
     rows = rows.where(domain=domain)
     if not ablation:
         rows = rows.where(distance=0.0).sort(reference=list(REFERENCES))
-    what = "ablation of the invariant residual" if ablation else "position error of each model"
     label = attrgetter("variant" if ablation else "name")
-    groups = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
-    if not groups:
+    places = {place: by_agent(group) for place, group in rows.group("reference", "distance").items()}
+    if not places:
         raise ValueError(f"rows must not be empty: nothing was flown in {domain}")
-    figure, grid = _grid(len(groups), [label(agent) for group in groups.values() for agent in group])
-    for axes, ((reference, distance), group) in zip(grid, groups.items(), strict=False):
-        drawn = {agent: np.maximum(100 * own.numbers(ERROR), SMALLEST_ERROR) for agent, own in group.items()}
-        marks = {ORACLE: "the true vehicle as its own model"}
-        lines = [Line(label(a), values, COLOURS_OF[a.model], marks.get(a, "")) for a, values in drawn.items()]
-        plots.error_panel(axes, lines, REFERENCES[reference] + away(distance))
-        axes.set_xlabel(XLABEL)
+    agents = list(dict.fromkeys(agent for group in places.values() for agent in group))
+    asked = {"": agents} if ablation else questions(agents)
+    counts = [len(group) for group in asked.values()]
+    size = (
+        1.25 * len(places) + 0.075 * max(len(label(agent)) for agent in agents),
+        1.0 + sum(0.55 + 0.2 * n for n in counts),
+    )
+    figure, panels = subplots(size, len(asked), len(places), height_ratios=counts)
+    for line, (question, group) in zip(panels, asked.items(), strict=True):
+        for axes, ((reference, distance), found) in zip(line, places.items(), strict=True):
+            _draw_errors(axes, found, group, label)
+            axes.tick_params(labelleft=axes is line[0], labelbottom=line[0] is panels[-1, 0])
+            if line[0] is panels[0, 0]:
+                axes.set_title(REFERENCES[reference] + away(distance))
+        line[0].text(-0.02, 1.02, question, transform=line[0].transAxes, fontweight="bold", ha="right", va="bottom")
+    panels[-1, len(places) // 2].set_xlabel(XLABEL)
     note = floor_note(100 * rows.numbers(ERROR).min(), SMALLEST_ERROR, "; ")
+    what = "ablation of the invariant residual" if ablation else "position error of each model"
     title = f"{DOMAINS[domain].capitalize()}: {what} (not finite: crashed{note})"
     return plots.error_legend(figure, title, any(rows["crashed"]))
+
+
+def questions(agents: Sequence[Agent]) -> dict[str, list[Agent]]:
+    """The agents that answer each question, each question with some; the true vehicle is a line in all panels."""
+    few = min((agent.n_train for agent in agents if agent.n_train), default=0)
+    networks = ("hybrid", "no_physics")
+    found = {
+        "Does more flight help?": [a for a in agents if a.model in networks and not a.observer],
+        "Which model?": [a for a in agents if a.model not in ("oracle", *networks) and not a.observer],
+        "With an observer?": [a for a in agents if a.observer],
+    }
+    same = [a for a in agents if a.model == "hybrid" and a.n_train == few and not a.observer]
+    found["Which model?"] = [*same, *found["Which model?"]]
+    return {question: group for question, group in found.items() if group}
+
+
+def _draw_errors(
+    axes: Axes, found: Mapping[Agent, Results], group: Sequence[Agent], label: Callable[[Agent], str]
+) -> None:
+    def line(agent: Agent) -> Line:
+        errors = 100 * found[agent].numbers(ERROR) if agent in found else np.empty(0)
+        return Line(label(agent), np.maximum(errors, SMALLEST_ERROR), COLOURS_OF[agent.model])
+
+    plots.error_panel(axes, [line(agent) for agent in group], "", beside=[line(agent) for agent in found])
+    axes.set_xlabel("")
+    if ORACLE in found and ORACLE not in group:
+        best = max(100 * found[ORACLE].spread(ERROR).mean, SMALLEST_ERROR)
+        axes.axvline(best, color="black", linestyle=":", linewidth=1, label="the true vehicle as its own model")
 
 
 @mpl.rc_context(STYLE)
@@ -69,8 +109,8 @@ def away_from_home(rows: Results) -> Figure:
     if not cells:
         raise ValueError("rows must not be empty: nothing was flown both at home and away from it")
     domains, references = (list(dict.fromkeys(cell[i] for cell in cells)) for i in (0, 1))
-    height = 1.4 + len(domains) * (0.7 + 0.27 * max(len(by_agent(found[cell])) for cell in cells))
-    figure, panels = subplots((3.6 * len(references) + 2, height), len(domains), len(references), sharey="row")
+    height = 1.1 + len(domains) * (0.6 + 0.21 * max(len(by_agent(found[cell])) for cell in cells))
+    figure, panels = subplots((1.9 * len(references) + 1.8, height), len(domains), len(references), sharey="row")
     smallest = math.inf
     for domain, reference, distance in cells:
         axes = panels[domains.index(domain), references.index(reference)]
@@ -93,7 +133,7 @@ def shares(rows: Results, domain: str) -> Figure:
     names = [name for name in REFERENCES if any(name in line for line in found.values())]
     if not names:
         raise ValueError(f"rows must hold a source model and the true vehicle in {domain}")
-    figure, panels = _grid(len(names), [agent.name for agent in found], width=2.6)
+    figure, panels = _grid(len(names), [agent.name for agent in found], width=1.8)
     for axes, name in zip(panels, names, strict=False):
         axes.set(xlim=SHARES, xticks=[0, 50, 100], xlabel="share of the gap closed [%]")
         axes.set_title(REFERENCES[name], pad=16)
@@ -104,7 +144,7 @@ def shares(rows: Results, domain: str) -> Figure:
         for y, (agent, line) in enumerate(found.items()):
             _draw_share(axes, y, line.get(name, Interval()), COLOURS_OF[agent.model])
     what = "share of the gap from source to true vehicle (bar: 95 %; hollow: gap not significant)"
-    figure.suptitle(f"{DOMAINS[domain].capitalize()}: {what}", fontsize=12)
+    figure.suptitle(f"{DOMAINS[domain].capitalize()}: {what}")
     return figure
 
 
@@ -114,7 +154,7 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
     found = {domain: rows.where(domain=domain, distance=0.0) for domain in DOMAINS if domain in rows["domain"]}
     if not any(agent in by_agent(group) for group in found.values() for agent in agents):
         raise ValueError("rows must hold one of the agents: there is nothing to draw")
-    figure, (panels,) = subplots((4.4 * len(found) + 2.2, 4.6), 1, len(found), sharex=True, sharey=True)
+    figure, (panels,) = subplots((2.5 * len(found) + 1.9, 3.2), 1, len(found), sharex=True, sharey=True)
     for axes, (domain, group) in zip(panels, found.items(), strict=True):
         _draw_costs(axes, group, agents)
         axes.set(title=DOMAINS[domain].capitalize(), xlabel="predicted cost of a plan", ylabel="actual cost, open loop")
@@ -124,7 +164,7 @@ def open_loop_costs(rows: Results, agents: Sequence[Agent]) -> Figure:
     handles = [Line2D([], [], color=c, marker=m, linestyle="", label=label) for label, c, m in entries]
     figure.legend(handles=handles, loc="outside right center")
     title = "Predicted and actual cost of plans, open loop for 1 s (grey: within 10 %; below 0.001 drawn there)"
-    figure.suptitle(title, fontsize=12)
+    figure.suptitle(title)
     return figure
 
 
@@ -133,11 +173,11 @@ def floor_note(smallest: float, floor: float, before: str, after: str = "") -> s
     return f"{before}below {floor:g} cm drawn there{after}" if smallest < floor else ""
 
 
-def _grid(count: int, labels: Sequence[str], width: float = 3.2) -> tuple[Figure, list[Axes]]:
+def _grid(count: int, labels: Sequence[str], width: float = 1.9) -> tuple[Figure, list[Axes]]:
     """So many panels, with room for the labels of lines in the first column."""
     columns = 2 if count == 4 else min(count, 3)
-    rows, room = -(-count // columns), 0.085 * max(map(len, labels))
-    size = width * columns + room, rows * (1.0 + 0.25 * len(set(labels))) + 0.9
+    rows, room = -(-count // columns), 0.06 * max(map(len, labels))
+    size = width * columns + room, rows * (0.8 + 0.17 * len(set(labels))) + 0.6
     figure, panels = subplots(size, rows, columns)
     for i, axes in enumerate(panels.flat):
         axes.tick_params(labelleft=i % columns == 0)

@@ -87,15 +87,18 @@ def legend_below(
     return figure
 
 
-def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0) -> None:
-    """Draw the lines, the first on top, and the error that no model can get below (`floor`), if it is not 0."""
-    limits = _limits([line.errors for line in lines], floor)
+def error_panel(axes: Axes, lines: Sequence[Line], title: str, floor: float = 0.0, beside: Sequence[Line] = ()) -> None:
+    """Draw the lines, the first on top, and the error that no model can get below (`floor`), if it is not 0.
+
+    `beside`: the lines of panels above and below, which share the limits; notes then stay inside of the panel.
+    """
+    limits = _limits([line.errors for line in [*lines, *beside]], floor)
     axes.set(xscale="log", xlim=limits, title=title)
     axes.set_xlabel("test error $L^T_{MSE}$  (state in SI units, squared; log scale)")
     name_lines(axes, [line.name for line in lines])
     tick_errors(axes.xaxis, *limits)
     for y, line in enumerate(lines):
-        mean = _draw_line(axes, y, line.errors, line.colour, limits)
+        mean = _draw_line(axes, y, line.errors, line.colour, limits, inside=bool(beside))
         if line.marked and limits[0] < mean < limits[1]:
             axes.axvline(mean, color=line.colour, linestyle=":", linewidth=1, label=line.marked)
     if limits[0] < floor < limits[1]:
@@ -120,7 +123,7 @@ def name_lines(axes: Axes, names: Sequence[str]) -> None:
 
 def note(axes: Axes, words: str, at: tuple[float, float], offset: tuple[float, float], **style: Any) -> None:
     """Small words beside a point, also outside the axes; the offset is in points."""
-    axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 7, **style})
+    axes.annotate(words, at, offset, textcoords="offset points", annotation_clip=False, **{"fontsize": 6, **style})
 
 
 def tick_errors(axis: Axis, low: float, high: float, room: float = 0.0) -> None:
@@ -144,14 +147,14 @@ def _limits(errors: Iterable[np.ndarray], floor: float) -> tuple[float, float]:
     return near.min() / PADDING, near.max() * PADDING
 
 
-def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float]) -> float:
+def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[float, float], inside: bool) -> float:
     """A dot for each seed and a bar for the mean of the finite ones, which is returned; errors outside are marked."""
     low, high = limits
     finite = values < DRAWABLE
-    inside = finite & (values >= low) & (values <= high)
+    near = finite & (values >= low) & (values <= high)
     # Spread over the line's height, or seeds of one error would hide each other.
     heights = y + np.linspace(-HALF_LINE, HALF_LINE, len(values) + 2)[1:-1]
-    axes.plot(values[inside], heights[inside], "o", color=tint, alpha=0.55, markersize=4, markeredgewidth=0)
+    axes.plot(values[near], heights[near], "o", color=tint, alpha=0.55, markersize=4, markeredgewidth=0)
     mean = float(values[finite].mean()) if finite.any() else math.nan
     if low <= mean <= high:
         style = {"linewidth": 2.2, "linestyle": "-" if finite.all() else (0, (1.2, 0.6))}
@@ -164,6 +167,7 @@ def _draw_line(axes: Axes, y: int, values: np.ndarray, tint: str, limits: tuple[
     marks += [("<", low, f"{below} of {len(values)} below")] if below else []
     for marker, x, text in marks:
         axes.plot(x, y, marker, color=tint, markersize=7, clip_on=False, zorder=5)
-        # Right of the marker: outside the panel at its right edge, where they hide no seed.
-        note(axes, text, (x, y), (8, 0), va="center", fontsize=8, color=tint)
+        # Right of the marker: outside the panel at its right edge, where they hide no seed, if there is room.
+        offset, align = ((-6, 5), "right") if inside and x == high else ((8, 0), "left")
+        note(axes, text, (x, y), offset, va="center", ha=align, fontsize=6 if inside else 7, color=tint)
     return mean

@@ -196,9 +196,12 @@ def test_cost_hypothesis_also_reports_the_unchanged_vehicle():
 
 
 def test_figures_have_a_panel_per_reference():
-    drawn = figures.errors(ROWS, "external_force").axes
-    assert [axes.get_title() for axes in drawn] == list(REFERENCES.values())
-    assert [label.get_text() for label in drawn[0].get_yticklabels()] == [agent.name for agent in AGENTS]
+    drawn = np.reshape(figures.errors(ROWS, "external_force").axes, (3, len(REFERENCES)))  # a row for each question
+    assert [axes.get_title() for axes in drawn[0]] == list(REFERENCES.values())
+    shown = [label.get_text() for axes in drawn[:, 0] for label in axes.get_yticklabels()]
+    assert set(shown) == {agent.name for agent in AGENTS if agent.model != "oracle"}
+    for column in drawn.T:
+        assert len({axes.get_xlim() for axes in column}) == 1
     assert len(figures.shares(ROWS, "external_force").axes) == len(REFERENCES)
     assert len(figures.away_from_home(ROWS).axes) == 2
     assert len(figures.open_loop_costs(ROWS, [Agent("hybrid")]).axes) == 2
@@ -221,7 +224,8 @@ def test_ticks_of_small_errors_do_not_overlap():
     rows = changed(changed(ROWS, Agent("oracle"), position_rmse=0.0), Agent("hybrid"), position_rmse=0.009)
     axes = figures.errors(rows, "external_force").axes[0]
     low, high = axes.get_xlim()
-    assert [tick for tick in axes.get_xticks() if low < tick < high] == pytest.approx([0.01, 0.1, 1.0])
+    shown = [float(f"{tick:g}") for tick in axes.get_xticks() if low < tick < high]
+    assert {0.01, 1.0} <= set(shown) <= {0.01, 0.1, 1.0}
 
 
 def test_references_away_are_among_those_at_home():

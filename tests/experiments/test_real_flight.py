@@ -201,15 +201,15 @@ def test_parameter_is_the_mean_over_folds_that_learn_it(second, text):
 
 
 @pytest.mark.parametrize("sizes", [(20,), (100, 1000)])
-def test_points_are_centred_at_their_number_of_windows(sizes):
-    rows = [row("zero_shot", 1.0, n=0), row("nominal", 1.0, n=0, model="hold")]
+def test_errors_are_drawn_over_the_baselines_at_their_number_of_windows(sizes):
+    rows = [row("zero_shot", 1.0, n=0), row("nominal", 2.0, n=0, model="thrust")]
     rows += [row(mode, 1.0, n=n) for n in sizes for mode in ("fine_tuned", "scratch")]
     rows = Results([each | {"scores": {"10": each["scores"]["10"]}} for each in rows], TAGS)
     for axes in errors_by_size(rows, DT, "").axes:
-        places = np.array([bars.lines[0].get_xdata() for bars in axes.containers], float)
-        assert places.shape == (2, len(sizes))
-        np.testing.assert_allclose(places.prod(axis=0), np.square(sizes))
-        np.testing.assert_array_less(1.04, [places.min() / axes.get_xlim()[0], axes.get_xlim()[1] / places.max()])
+        curves = [line for line in axes.lines if line.get_marker() == "o"]
+        assert [list(line.get_xdata()) for line in curves] == [list(sizes)] * 2
+        np.testing.assert_allclose([line.get_ydata() for line in curves], 0.5)
+        np.testing.assert_array_less(1.04, [min(sizes) / axes.get_xlim()[0], axes.get_xlim()[1] / max(sizes)])
 
 
 @pytest.mark.skipif(not (REAL / "nanodrone").exists(), reason="no real flights: set HYBRID_JAX_FLIGHTS to their folder")
