@@ -11,7 +11,7 @@ from rich.text import Text
 
 from hybrid_jax.sweep.training import Progress
 
-FIRST, INTERVAL = 1.0, 30.0  # s before the first line in a file, and between lines
+FIRST, SECOND, INTERVAL = 1.0, 5.0, 30.0  # s before the first and the second line in a file, and between later ones
 
 
 class Line(AbstractContextManager):
@@ -22,7 +22,7 @@ class Line(AbstractContextManager):
 
     def __init__(self, name: str, console: Console, doing: str = "compiling"):
         self._name, self._console, self._doing, self._began = name, console, doing, time.perf_counter()
-        self._due = self._began + INTERVAL
+        self._due = self._began + SECOND
         self._live = self._timer = None
         if console.is_terminal:
             self._live = Live(self, console=console, transient=True)
@@ -78,7 +78,7 @@ class Line(AbstractContextManager):
         return time.perf_counter() - self._began
 
     def _print(self) -> None:
-        elapsed = f", {clock(self._elapsed())} elapsed" if self._elapsed() >= INTERVAL else ""
+        elapsed = f", {clock(self._elapsed())} elapsed" if self._elapsed() >= SECOND else ""
         self._console.print(f"{self}{elapsed}", highlight=False, soft_wrap=True)
 
 

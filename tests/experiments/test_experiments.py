@@ -135,7 +135,7 @@ def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder
     run = [sys.executable, "-m", "experiments.param_shift", *options, "--out", str(folder / sent.name)]
     with subprocess.Popen(run, stderr=subprocess.PIPE, text=True, cwd=ROOT) as process:
         try:
-            assert any("runs active" in line for line in process.stderr)  # said after a few seconds of training
+            assert any(": training " in line for line in process.stderr)  # said after a few seconds of training
             if sent == signal.SIGTERM:
                 second = subprocess.run(run, capture_output=True, text=True, cwd=ROOT, timeout=120)
                 assert "another run is writing" in refused(second, "param_shift")
