@@ -22,7 +22,16 @@ def site(tmp_path_factory):
     if LEFT is not None:
         return Path(LEFT) / "site"
     folder = tmp_path_factory.mktemp("site")
-    script("-m", "mkdocs", "build", "--strict", "-q", "--site-dir", folder, env=os.environ | {"PYTHONPATH": str(ROOT)})
+    script(
+        "-m",
+        "mkdocs",
+        "build",
+        "--strict",
+        "-q",
+        "--site-dir",
+        folder,
+        env=os.environ | {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false"},
+    )
     return folder
 
 
