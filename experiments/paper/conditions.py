@@ -65,6 +65,7 @@ def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.nd
             outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
             hidden=config.hidden,
             norm=config.norm,
+            activation=config.activation,
             scaling=hover if config.inputs == "hover" else InputScaling(),
             linear=config.residual_linear,
             vehicle=vehicle,

@@ -117,6 +117,8 @@ class Config(Run):
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Literal["batch", "layer", "none"] = "batch"
     """Normalisation of f_d's hidden layer."""
+    activation: Literal["relu", "softplus", "tanh", "silu"] = "relu"
+    """Activation of f_d's hidden layer. All but ReLU suit solvers of optimal control problems."""
     residual_inputs: ResidualInputs = "all"
     """Inputs of f_d from the state. no_xy: without p_x, p_y. no_xy_yaw: without yaw too. near_ground: also each rotor's
     distance to the ground. body: altitude, and velocity, rates and gravity in the body frame."""

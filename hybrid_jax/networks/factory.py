@@ -44,6 +44,7 @@ def make_residual(
     outputs: str = "all",
     hidden: int = 64,
     norm: str = "batch",
+    activation: str = "relu",
     scaling: AbstractScaling | None = None,
     linear: bool = False,
     vehicle: Vehicle | None = None,
@@ -58,7 +59,7 @@ def make_residual(
             second network (`RotorThrust`), which starts at zero; "angular_acceleration", ω̇ alone; "motion", v̇ and ω̇
             and corrections of ṗ and q̇ (`Motion`).
         hidden: units of each network.
-        norm: as in `residual_network`.
+        norm, activation: as in `residual_network`.
         linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
         vehicle: gives the number of rotors, by default four; needed by "near_ground" and "rotors".
 
@@ -75,12 +76,13 @@ def make_residual(
     if vehicle is None and (needing := [name for name in (inputs, outputs) if name in OF_ROTORS]):
         raise ValueError(f"{needing[0]!r} needs the vehicle whose rotors feel the ground, got None")
     rotors = INPUT_SIZE if vehicle is None else vehicle.rotors
-    network = residual_network(reads, rotors, key, hidden=hidden, scaling=scaling, norm=norm, outputs=writes)
+    options: dict = {"hidden": hidden, "scaling": scaling, "activation": activation}
+    network = residual_network(reads, rotors, key, norm=norm, outputs=writes, **options)
     field = zero_output(LinearSkip(jnp.zeros((writes, reads + rotors)), network)) if linear else network
     field = field if written is None else written(field)
     if seen is not None:
         field = seen(field, vehicle) if seen is views.GroundDistance else seen(field)
     if vehicle is None or outputs != "rotors":
         return field
-    thrust = residual_network(1, 1, jax.random.fold_in(key, 1), hidden=hidden, scaling=scaling, norm="none")
+    thrust = residual_network(1, 1, jax.random.fold_in(key, 1), norm="none", **options)
     return Hybrid(zero_output(views.RotorThrust(thrust, vehicle)), field)

@@ -1,6 +1,7 @@
 """f_d: a fully connected network with one hidden layer and batch normalisation (paper, App. A.1), and linear maps."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -11,6 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns
 from hybrid_jax.dynamics.batching import RunningStats, expand_trailing
+from hybrid_jax.networks.activations import ACTIVATIONS, Activation, SmoothRelu
 from hybrid_jax.networks.normalisation import (
     UNROLLED_INPUTS,
     AbstractAffineNorm,
@@ -27,7 +29,7 @@ from hybrid_jax.networks.normalisation import (
 
 
 class FusedNetwork(AbstractVectorField):
-    """ẋ = W₂ relu(W₁ z + c) + A z + b, z = [x, scaled u]: a network with its normalisation folded in, and a linear map.
+    """ẋ = W₂ σ(W₁ z + c) + A z + b, z = [x, scaled u]: a network with its normalisation folded in, and a linear map.
 
     The same map as `ResidualNetwork`, or `LinearSkip` around one, laid out for few samples at a time, as a controller
     evaluates it: one product serves W₁ and A, and the weights of an input are contiguous.
@@ -39,10 +41,11 @@ class FusedNetwork(AbstractVectorField):
     bias: Float[Array, " h+d"]  # [c; b]
     weight_out: Float[Array, "h d"]  # W₂ᵀ
     scaling: AbstractScaling
+    activation: Activation = eqx.field(static=True, default=jax.nn.relu)
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         hidden, linear = self.layer(self.scaling.concatenate(x, u))
-        return (jax.nn.relu(hidden).T @ self.weight_out).T + linear
+        return (self.activation(hidden).T @ self.weight_out).T + linear
 
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
         """W₁ z + c and A z + b."""
@@ -55,12 +58,13 @@ class FusedNetwork(AbstractVectorField):
         z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
         hidden, linear = self.layer(z)
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
-        jacobian = jnp.where(hidden > 0, self.weight_out.T, 0) @ weight.T + skip.T
-        return jax.nn.relu(hidden) @ self.weight_out + linear, jacobian @ dz
+        active, slope = jax.jvp(self.activation, (hidden,), (jnp.ones_like(hidden),))
+        jacobian = (slope * self.weight_out.T) @ weight.T + skip.T
+        return active @ self.weight_out + linear, jacobian @ dz
 
 
 class ResidualNetwork(AbstractVectorField):
-    """ẋ = W₂ relu(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13 with batch normalisation in the paper.
+    """ẋ = W₂ σ(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13, batch normalisation and ReLU in the paper.
 
     W₁ has no bias: batch normalisation would remove it, and the others have a shift.
     """
@@ -72,6 +76,7 @@ class ResidualNetwork(AbstractVectorField):
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
+    activation: Activation = eqx.field(static=True, default=jax.nn.relu)  # σ
 
     # d and m, where the network is a field by itself.
     state_size = property(lambda self: len(self.bias_out))
@@ -82,14 +87,15 @@ class ResidualNetwork(AbstractVectorField):
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units in inference mode, in which the output layer is linear."""
-        return jax.nn.relu(self.norm.infer(self.weight_in, self.inputs(x, u)))
+        return self.activation(self.norm.infer(self.weight_in, self.inputs(x, u)))
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
         """z = [x, scaled u]."""
         return self.scaling.concatenate(x, u)
 
     def train_batch(self, x, u):
-        y = self.norm.train_layers(self.weight_in, self.weight_out, self.bias_out, self.inputs(x, u))
+        layers = self.weight_in, self.weight_out, self.bias_out
+        y = self.norm.train_layers(self.activation, *layers, self.inputs(x, u))
         return self.scaling.outputs(y)
 
     def update_running_stats(self, x, u):
@@ -106,7 +112,7 @@ class ResidualNetwork(AbstractVectorField):
         weight_out, bias_out = self.scaling.outputs(self.weight_out), self.scaling.outputs(self.bias_out)
         weight_in, bias_in = self.norm.fold(self.weight_in)
         weight, bias = jnp.concatenate([weight_in, linear]).T, jnp.concatenate([bias_in, bias_out])
-        return FusedNetwork(weight, bias, weight_out.T, self.scaling)
+        return FusedNetwork(weight, bias, weight_out.T, self.scaling, self.activation)
 
 
 class LinearResidual(AbstractVectorField):
@@ -124,7 +130,7 @@ class LinearResidual(AbstractVectorField):
 class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear skip connection around a network.
 
-    Linear drag is such a map, which ReLU units only approximate, and which extrapolates beyond the data.
+    Linear drag is such a map, which hidden units only approximate, and which extrapolates beyond the data.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -154,6 +160,7 @@ def residual_network(
     scaling: AbstractScaling | None = None,
     norm: str = "batch",
     outputs: int | None = None,
+    activation: str = "relu",
 ) -> ResidualNetwork:
     """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
 
@@ -161,12 +168,15 @@ def residual_network(
         scaling: by default read off the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of what it returns, by default `state_size`.
+        activation: of the hidden units: "relu" (paper), "softplus", "tanh" or "silu". Solvers of optimal control
+            problems want one with continuous derivatives; see `smoothed` for a network that has ReLU.
 
     Raises:
-        ValueError: another norm, sizes that are no positive integers, or no random key.
+        ValueError: another norm or activation, sizes that are no positive integers, or no random key.
     """
-    if norm not in tuple(NORMS):  # it may not be hashable
-        raise ValueError(f"norm must be one of {', '.join(NORMS)}, got {checks.short_repr(norm)}")
+    for name, chosen, known in (("norm", norm, tuple(NORMS)), ("activation", activation, tuple(ACTIVATIONS))):
+        if chosen not in known:  # it may not be hashable
+            raise ValueError(f"{name} must be one of {', '.join(known)}, got {checks.short_repr(chosen)}")
     outputs = state_size if outputs is None else outputs
     for name, size in {"state_size": state_size, "hidden": hidden, "outputs": outputs}.items():
         checks.count(name, size)
@@ -180,6 +190,7 @@ def residual_network(
         weight_out=_uniform(key_out, (outputs, hidden), hidden),
         bias_out=_uniform(key_bias, (outputs,), hidden),
         scaling=ChannelScaling() if scaling is None else scaling,
+        activation=ACTIVATIONS[activation],
     )
 
 
@@ -215,3 +226,23 @@ def zero_output(field: AbstractVectorField) -> AbstractVectorField:
         return node
 
     return jax.tree.map(zeroed, field, is_leaf=has_outputs)
+
+
+def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
+    """The field with `SmoothRelu` in the place of ReLU; other activations stay. ValueError unless β > 0.
+
+    Solvers of optimal control problems that use second derivatives need this: those of ReLU are zero but for its kink.
+    ReLU is found in networks of this library, and where a module holds `jax.nn.relu` as a field, as Equinox' MLP does;
+    not where the code of a module calls it.
+    """
+    smooth = SmoothRelu(beta)
+
+    def is_network(node) -> bool:
+        return isinstance(node, ResidualNetwork | FusedNetwork)
+
+    def changed(node):
+        if is_network(node):
+            return replace(node, activation=smooth) if node.activation is jax.nn.relu else node
+        return smooth if node is jax.nn.relu else node
+
+    return jax.tree.map(changed, field, is_leaf=is_network)

@@ -1,4 +1,4 @@
-"""Scaling of what a network reads and returns, and normalisation of its hidden units before the ReLU.
+"""Scaling of what a network reads and returns, and normalisation of its hidden units before the activation.
 
 Batch normalisation (paper, App. A.1), layer normalisation, or a bias: with the last two a network is the same map in
 training and in inference.
@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
+from hybrid_jax.networks.activations import Activation
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
 Channels = tuple[float, ...]
@@ -68,15 +69,17 @@ class ChannelScaling(AbstractScaling):
 
 
 class AbstractNorm(eqx.Module):
-    """Normalisation of the hidden pre-activations h = W z before the ReLU."""
+    """Normalisation of the hidden pre-activations h = W z."""
 
     @abstractmethod
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The normalised W z of each sample in inference mode."""
 
-    def train_layers(self, weight_in, weight_out, bias_out, z: Float[Array, "m b"]) -> Float[Array, "d b"]:
-        """W₂ relu(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
-        return affine(weight_out, bias_out, jax.nn.relu(self.infer(weight_in, z)))
+    def train_layers(
+        self, activation: Activation, weight_in, weight_out, bias_out, z: Float[Array, "m b"]
+    ) -> Float[Array, "d b"]:
+        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
+        return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
     def observed(self, hidden: Float[Array, "h b"]) -> Self:
         """This after the pre-activations of a training batch."""
@@ -112,8 +115,8 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         scale = self.gain * jax.lax.rsqrt(self.running.variance + self.epsilon)
         return weight * scale[:, None], self.shift - scale * self.running.mean
 
-    def train_layers(self, weight_in, weight_out, bias_out, z):
-        return _normalised_layer(self.epsilon, weight_in, self.gain, self.shift, weight_out, bias_out, z)
+    def train_layers(self, activation, weight_in, weight_out, bias_out, z):
+        return _normalised_layer(self.epsilon, activation, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
     def observed(self, hidden):
         mean = _row_means(hidden)
@@ -173,33 +176,34 @@ def product(weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Arra
     return reduce(jnp.add, (expand_trailing(column, z) * row for column, row in zip(weight.T, z, strict=True)))
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _normalised_layer(epsilon, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """W₂ relu(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
+@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
+def _normalised_layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
+    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
 
     The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
     on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
     """
-    return _forward(epsilon, weight_in, gain, shift, weight_out, bias_out, z)[0]
+    return _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z)[0]
 
 
-def _forward(epsilon, weight_in, gain, shift, weight_out, bias_out, z):
+def _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z):
     # W₁ (z − z̄) is W₁ z less its mean, and needs no subtraction of two large numbers for its variance.
     centred = z - _row_means(z)[:, None]
     hidden = weight_in @ centred
     inverse_deviation = jax.lax.rsqrt(_row_means(jnp.square(hidden)) + epsilon)
-    active = jax.nn.relu((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
+    active = activation((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
     # The active units are computed again in `_backward`: that takes less than to keep them for forty evaluations.
     saved = (weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation)
     return weight_out @ active + bias_out[:, None], saved
 
 
-def _backward(_, saved, d_out: Float[Array, "d b"]):
+def _backward(_, activation, saved, d_out: Float[Array, "d b"]):
     weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation = saved
     columns = centred.shape[1]
     scale = gain * inverse_deviation
     normal = scale[:, None] * hidden + shift[:, None]
-    d_active = jnp.where(normal > 0, _transposed(weight_out) @ d_out, 0.0)
+    active, pullback = jax.vjp(activation, normal)
+    (d_active,) = pullback(_transposed(weight_out) @ d_out)
     d_scale = columns * _row_means(d_active * hidden)
     # Through the scale γ r, and through r = (mean of h² + ε)^(−½).
     through_deviation = -(d_scale * gain) * inverse_deviation**3 / columns
@@ -207,7 +211,7 @@ def _backward(_, saved, d_out: Float[Array, "d b"]):
     d_centred = _transposed(weight_in) @ d_hidden
     d_z = d_centred - _row_means(d_centred)[:, None]
     d_shift, d_bias = columns * _row_means(d_active), columns * _row_means(d_out)
-    d_weight_out = d_out @ jax.nn.relu(normal).T
+    d_weight_out = d_out @ active.T
     return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
 
 

@@ -1,5 +1,7 @@
 """Laws of the network f_d and its normalisations."""
 
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,6 +10,7 @@ import pytest
 
 from hybrid_jax import load, save
 from hybrid_jax.dynamics import base
+from hybrid_jax.networks.activations import SmoothRelu
 from hybrid_jax.networks.mlp import (
     FusedNetwork,
     InputScaling,
@@ -15,16 +18,18 @@ from hybrid_jax.networks.mlp import (
     LinearSkip,
     ResidualNetwork,
     residual_network,
+    smoothed,
 )
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, LayerNorm
 
 STATES, INPUTS, HIDDEN, COLUMNS = 5, 2, 7, 11
 
 
-def network(seed=0, hidden=HIDDEN):
+def network(seed=0, hidden=HIDDEN, activation="relu"):
     """A network whose gains, shifts and running statistics are not those of a fresh one."""
     keys = jax.random.split(jax.random.key(seed), 5)
-    fresh = residual_network(STATES, INPUTS, keys[0], hidden=hidden, scaling=InputScaling(2.0, 3.0))
+    options = {"hidden": hidden, "scaling": InputScaling(2.0, 3.0), "activation": activation}
+    fresh = residual_network(STATES, INPUTS, keys[0], **options)
     gain, shift, mean = (jax.random.normal(key, (hidden,)) for key in keys[1:4])
     running = base.RunningStats(mean, jax.random.uniform(keys[4], (hidden,), minval=0.5, maxval=2.0))
     return eqx.tree_at(lambda field: field.norm, fresh, BatchNorm(gain, shift, running))
@@ -35,32 +40,78 @@ def batch(seed=0, columns=COLUMNS):
     return jnp.asarray(3 + 2 * rng.normal(size=(STATES, columns))), jnp.asarray(rng.normal(size=(INPUTS, columns)))
 
 
-def plain(field, x, u):
+def plain(field, x, u, activation=lambda h: jnp.maximum(h, 0)):
     """The training formula as the papers write it, for autodiff: γ (h − mean) / √(variance + ε) + β."""
     hidden = field.weight_in @ jnp.concatenate([x, (u - field.scaling.offset) / field.scaling.scale])
     mean, variance = hidden.mean(1, keepdims=True), hidden.var(1, keepdims=True)
     normal = (hidden - mean) / jnp.sqrt(variance + field.norm.epsilon)
-    active = jnp.maximum(field.norm.gain[:, None] * normal + field.norm.shift[:, None], 0)
+    active = activation(field.norm.gain[:, None] * normal + field.norm.shift[:, None])
     return field.weight_out @ active + field.bias_out[:, None]
 
 
-@pytest.mark.parametrize("seed", range(2))
-def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(seed):
+# Written as in the papers, not as the library has them.
+PLAIN = {
+    "relu": lambda h: jnp.maximum(h, 0),
+    "softplus": lambda h: jnp.log(1 + jnp.exp(h)),
+    "tanh": jnp.tanh,
+    "silu": lambda h: h / (1 + jnp.exp(-h)),
+}
+
+
+@pytest.mark.parametrize("activation", PLAIN)
+def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(activation):
     with jax.enable_x64(True):
-        field, (x, u) = network(seed), batch(seed)
+        field, (x, u) = network(activation=activation), batch()
         weights = jax.random.normal(jax.random.key(9), (STATES, COLUMNS))
 
         def gradients(formula):
             parameters, rest = eqx.partition((field, x, u), eqx.is_inexact_array)
             return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
 
-        np.testing.assert_allclose(base.train_batch(field, x, u), plain(field, x, u), rtol=0, atol=1e-12)
-        found, expected = (jax.tree.leaves(gradients(formula)) for formula in (base.train_batch, plain))
+        formula = partial(plain, activation=PLAIN[activation])
+        np.testing.assert_allclose(base.train_batch(field, x, u), formula(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(one)) for one in (base.train_batch, formula))
         assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
         for one, other in zip(found, expected, strict=True):
             # Round-off of float64 on gradients of up to about 100.
             np.testing.assert_allclose(one, other, rtol=0, atol=1e-10)
         assert sum(float(jnp.abs(leaf).max()) > 1e-3 for leaf in expected) == 7
+
+
+@pytest.mark.parametrize("activation", PLAIN)
+def test_what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file(activation, tmp_path):
+    with jax.enable_x64(True):
+        field, (x, u) = network(activation=activation), (part[:, 0] for part in batch())
+        fused = base.fuse_for_inference(field)
+        assert isinstance(fused, FusedNetwork)
+        directions = jnp.eye(STATES + INPUTS)
+        value, slopes = base.linearize(fused, x, u, directions[:STATES], directions[STATES:])
+        np.testing.assert_allclose(value, field(x, u), rtol=0, atol=1e-12)
+        np.testing.assert_allclose(slopes, jnp.hstack(jax.jacfwd(field, (0, 1))(x, u)), rtol=0, atol=1e-12)
+        save(tmp_path / "field.npz", fused)
+        assert eqx.tree_equal(load(tmp_path / "field.npz").field, fused)
+
+
+@pytest.mark.parametrize("beta", [3.0, 30.0])
+def test_a_smoothed_network_is_as_near_as_beta_says_and_only_relu_is_smoothed(beta, tmp_path):
+    field, (x, u) = network(), batch()
+    smooth = smoothed(base.Hybrid(field, network(activation="tanh")), beta)
+    off = smooth.physics(x, u) - field(x, u)
+    # Each hidden unit is between 0 and 1/(2β) above ReLU.
+    assert (jnp.abs(off) <= jnp.abs(field.weight_out).sum(axis=1)[:, None] / (2 * beta) + 1e-5).all()
+    assert jnp.abs(off).max() > 0.01 / beta
+    assert eqx.tree_equal(smooth.residual, network(activation="tanh"))
+    assert smoothed(eqx.nn.MLP(2, 2, 3, 1, key=jax.random.key(0)), beta).activation == SmoothRelu(beta)
+    save(tmp_path / "smooth.npz", smooth)
+    assert eqx.tree_equal(load(tmp_path / "smooth.npz").field, smooth)
+
+
+def test_what_is_no_activation_is_refused():
+    with pytest.raises(ValueError, match=r"^activation must be one of relu, softplus, tanh, silu, got 'step'$"):
+        residual_network(STATES, INPUTS, jax.random.key(0), activation="step")
+    for beta in (0.0, -1.0, float("nan"), "30"):
+        with pytest.raises(ValueError, match=r"^beta must be"):
+            smoothed(network(), beta)
 
 
 def test_in_training_hidden_units_have_mean_zero_and_variance_one():
