@@ -1,6 +1,6 @@
 """Fields and steps as CasADi functions, for optimal control, estimation and generated C code (extra `casadi`)."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import jax
 
@@ -13,7 +13,12 @@ if TYPE_CHECKING:
 
 
 def casadi_function(
-    field: AbstractVectorField, *, state_size: Size = None, input_size: Size = None, name: str = "f"
+    field: AbstractVectorField,
+    *,
+    state_size: Size = None,
+    input_size: Size = None,
+    name: str = "f",
+    smooth: float | None = None,
 ) -> "casadi.Function":
     """ẋ = f(x, u) of a field in inference mode, from x (d × 1) and u (m × 1) to xdot (d × 1), in double precision.
 
@@ -22,24 +27,55 @@ def casadi_function(
     Args:
         state_size: d; by default what the field knows (see `sizes_of`).
         input_size: m; likewise.
+        smooth: β of ½ (z + √(z² + 1/β²)), to take the place of the ReLU of networks (see `smoothed`). Solvers that use
+            second derivatives, such as IPOPT, need it.
 
     Raises:
         ValueError: unknown sizes, a field that does not accept such x and u, or an operation that CasADi does not
             have, by its name.
         ImportError: casadi is not installed.
     """
-    return _function(field, None, state_size, input_size, name, "xdot")
+    return _function(field, None, state_size, input_size, name, smooth, "xdot")
 
 
 def casadi_step(
-    field: AbstractVectorField, dt: float, *, state_size: Size = None, input_size: Size = None, name: str = "F"
+    field: AbstractVectorField,
+    dt: float,
+    *,
+    state_size: Size = None,
+    input_size: Size = None,
+    name: str = "F",
+    smooth: float | None = None,
 ) -> "casadi.Function":
     """x⁺ = F(x, u), one step of RK4 over dt [s] with u held; its output is xnext. Otherwise as `casadi_function`."""
     checks.positive("dt", dt, "a positive number of seconds")
-    return _function(field, float(dt), state_size, input_size, name, "xnext")
+    return _function(field, float(dt), state_size, input_size, name, smooth, "xnext")
 
 
-def _function(field, dt: float | None, state_size: Size, input_size: Size, name: str, output: str) -> "casadi.Function":
+def acados_model(
+    field: AbstractVectorField,
+    *,
+    state_size: Size = None,
+    input_size: Size = None,
+    name: str = "model",
+    smooth: float | None = None,
+) -> dict[str, Any]:
+    """The attributes of an `AcadosModel` of acados: name, x, u, xdot, f_expl_expr and f_impl_expr = xdot − f(x, u).
+
+    Set them one by one: `model = AcadosModel(); [setattr(model, *one) for one in acados_model(field).items()]`. acados
+    integrates by itself, so there is no step. Arguments and errors as of `casadi_function`.
+    """
+    function = casadi_function(field, state_size=state_size, input_size=input_size, name=name, smooth=smooth)
+    import casadi as ca
+
+    x, u = ca.SX.sym("x", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
+    xdot, slope = ca.SX.sym("xdot", function.numel_out(0)), function(x, u)
+    return {"name": name, "x": x, "u": u, "xdot": xdot, "f_expl_expr": slope, "f_impl_expr": xdot - slope}
+
+
+def _function(
+    field, dt: float | None, state_size: Size, input_size: Size, name: str, smooth: float | None, output: str
+) -> "casadi.Function":
     try:
         import casadi as ca
 
@@ -53,5 +89,5 @@ def _function(field, dt: float | None, state_size: Size, input_size: Size, name:
     # In double precision throughout, so that the constants of the physics are not rounded.
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in sizes]
-        result = evaluate(jax.make_jaxpr(program_of(field, likes, dt))(*likes), symbols)
+        result = evaluate(jax.make_jaxpr(program_of(field, likes, dt, smooth))(*likes), symbols)
     return ca.Function(name, symbols, [result], ["x", "u"], [output])

@@ -1,6 +1,6 @@
 """What is exported of a field: a function of x and u in one precision, and its sizes."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from typing import Any
 
@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
+from hybrid_jax.networks import smoothed
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
@@ -18,15 +19,17 @@ Size = int | None  # d or m; by default what the field knows
 
 
 def program_of(
-    field: AbstractVectorField, likes: Sequence[jax.ShapeDtypeStruct], dt: float | None, batched: bool = False
+    field: AbstractVectorField,
+    likes: Sequence[jax.ShapeDtypeStruct],
+    dt: float | None,
+    smooth: float | None,
+    batched: bool = False,
 ) -> Derivative:
     """ẋ = f(x, u), or the step of RK4 over dt [s], of a field with its numbers in the precision of `likes`.
 
     `likes` are of one x and one u; if `batched`, the function is one of rows of them. ValueError if they do not fit.
     """
-    precision = likes[0].dtype
-    field = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision) if eqx.is_inexact_array(leaf) else leaf, field)
-    check_field(field, *likes)
+    field = prepared(field, likes, smooth)
 
     def of_rows(x, u):
         return jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
@@ -34,6 +37,22 @@ def program_of(
     derivative = of_rows if batched else field
     whole = derivative if dt is None else partial(rk4_step, derivative, dt=dt)
     return lambda x, u: whole(x, u)  # jax.jit needs a hashable function
+
+
+def prepared(
+    field: AbstractVectorField, likes: Sequence[jax.ShapeDtypeStruct], smooth: float | None
+) -> AbstractVectorField:
+    """The field with its numbers in the precision of x and u, and with `SmoothRelu` of β = `smooth` if that is given.
+
+    ValueError if the field does not take such x and u.
+    """
+    precision = likes[0].dtype
+    field = jax.tree.map(lambda leaf: jnp.asarray(leaf, precision) if eqx.is_inexact_array(leaf) else leaf, field)
+    if smooth is not None:
+        checks.positive("smooth", smooth)
+        field = smoothed(field, smooth)
+    check_field(field, *likes)
+    return field
 
 
 def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
@@ -50,11 +69,25 @@ def sizes_of(field: Any, state_size: Size, input_size: Size) -> tuple[int, int]:
     return d, m  # pyright: ignore[reportReturnType]
 
 
+def vehicle_in(field: Any) -> Vehicle | None:
+    """The vehicle that a field, or a field in it, is of."""
+    vehicles = (getattr(part, "vehicle", None) for part in _parts(field))
+    return next((one for one in vehicles if isinstance(one, Vehicle)), None)
+
+
 def _known_sizes(tree: Any) -> tuple[int, int] | None:
     """Those of the outermost module in a tree that knows them."""
-    if isinstance(vehicle := getattr(tree, "vehicle", None), Vehicle):
-        return STATE_SIZE, vehicle.rotors
-    if isinstance(tree, eqx.Module) and hasattr(tree, "state_size") and hasattr(tree, "input_size"):
-        return tree.state_size, tree.input_size  # pyright: ignore[reportAttributeAccessIssue]
-    children = jax.tree.leaves(tree, is_leaf=lambda node: node is not tree)
-    return next(filter(None, (_known_sizes(child) for child in children if child is not tree)), None)
+    for part in _parts(tree):
+        if isinstance(vehicle := getattr(part, "vehicle", None), Vehicle):
+            return STATE_SIZE, vehicle.rotors
+        if isinstance(part, eqx.Module) and hasattr(part, "state_size") and hasattr(part, "input_size"):
+            return part.state_size, part.input_size  # pyright: ignore[reportAttributeAccessIssue]
+    return None
+
+
+def _parts(tree: Any) -> Iterator[Any]:
+    """A tree and all trees in it, each before its own parts."""
+    yield tree
+    for child in jax.tree.leaves(tree, is_leaf=lambda node: node is not tree):
+        if child is not tree:
+            yield from _parts(child)

@@ -61,6 +61,7 @@ def export_field(
     input_size: int | None = None,
     batched: bool = False,
     platforms: tuple[str, ...] = ("cpu",),
+    smooth: float | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write ẋ = f(x, u) of a field in inference mode, in single precision, to a file that `load_program` reads.
@@ -70,6 +71,7 @@ def export_field(
         input_size: m; likewise.
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: a subset of PLATFORMS; each makes the file longer.
+        smooth: as of `casadi_function`.
         about: JSON values to store with the program.
 
     Raises:
@@ -78,7 +80,7 @@ def export_field(
         ImportError: flatbuffers is not installed (extra `export`).
         OSError: the folder cannot be written.
     """
-    _export(path, field, None, state_size, input_size, batched, platforms, about)
+    _export(path, field, None, state_size, input_size, batched, platforms, smooth, about)
 
 
 def export_step(
@@ -90,11 +92,12 @@ def export_step(
     input_size: int | None = None,
     batched: bool = False,
     platforms: tuple[str, ...] = ("cpu",),
+    smooth: float | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> None:
     """Write x⁺ = F(x, u), one step of RK4 over dt [s] with the input held. Otherwise as `export_field`."""
     checks.positive("dt", dt, "a positive number of seconds")
-    _export(path, field, float(dt), state_size, input_size, batched, platforms, about)
+    _export(path, field, float(dt), state_size, input_size, batched, platforms, smooth, about)
 
 
 def load_program(path: str | Path) -> Program:
@@ -118,14 +121,15 @@ def load_program(path: str | Path) -> Program:
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
 
 
-def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, about) -> None:
+def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, smooth, about) -> None:
     _need_flatbuffers()
     sizes = sizes_of(field, state_size, input_size)
     if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
         known = ", ".join(PLATFORMS)
         raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
     with jax.enable_x64(False), _without_source_locations():
-        program = program_of(field, [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes], dt, batched)
+        likes = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes]
+        program = program_of(field, likes, dt, smooth, batched)
         batch = jax.export.symbolic_shape(BATCH) if batched else ()
         x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
         exported = jax.export.export(jax.jit(program), platforms=platforms)(x, u)

@@ -1,5 +1,7 @@
 """`python -m experiments.export`: a model's file becomes programs, or the command says in one line why not."""
 
+import re
+
 import jax
 import numpy as np
 import pytest
@@ -7,6 +9,7 @@ import pytest
 import hybrid_jax as hj
 from experiments import export as command
 from hybrid_jax.export import load_program
+from hybrid_jax.io.datasets import Dataset, save_dataset
 
 ca = pytest.importorskip("casadi")
 X, U = np.array([0, 0, 1, 1.0, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1]), np.full(4, 650.0)
@@ -32,6 +35,28 @@ def test_all_that_is_written_is_the_model(field, tmp_path, capsys):
     np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
 
 
+def test_c_alone_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hj.save("model.npz", field, {"dt": 0.02})
+    command.main(["model.npz", "--c", "board", "--name", "iris", "--double", "--smooth", "30"])
+    *written, said = capsys.readouterr().out.splitlines()
+    assert written == ["board/iris.h", "board/iris.c"]
+    assert "IRIS_DT 0.02" in (tmp_path / "board" / "iris.h").read_text()
+    assert "typedef double real" in (tmp_path / "board" / "iris.c").read_text()
+    found = float(re.search(r"smooth 30: ẋ differs by at most ([\d.e-]+)", said)[1])
+    assert 0 < found <= np.abs(field.residual.weight_out).sum(axis=1).max() / 60
+    assert not (tmp_path / "runs").exists()
+
+
+def test_smoothing_is_looked_at_over_a_data_set(field, tmp_path, capsys):
+    model, data = tmp_path / "model.npz", tmp_path / "data.npz"
+    hj.save(model, field, {"dt": 0.02})
+    windows = hj.Trajectories(np.tile(X, (3, 1)), np.tile(U, (3, 2, 1)), np.tile(X, (3, 2, 1)), 0.02)
+    save_dataset(data, Dataset({"train": windows}, {}))
+    command.main([str(model), "--c", str(tmp_path), "--smooth", "30", "--data", str(data)])
+    assert capsys.readouterr().out.splitlines()[-1].endswith(f"3 of {data}")
+
+
 @pytest.mark.parametrize(
     ("about", "options", "message"),
     [
@@ -41,6 +66,8 @@ def test_all_that_is_written_is_the_model(field, tmp_path, capsys):
             for dt in ("-0.01", "0", "nan")
         ),
         ({}, [], "--dt is needed"),
+        ({"dt": 0.02}, ["--smooth", "-1"], "--smooth must be"),
+        ({"dt": 0.02}, ["--c", "c", "--name", "1"], "name must be a lower-case C identifier"),
     ],
     ids=str,
 )

@@ -8,8 +8,9 @@ from choices import FEW
 from fields import FIELDS, KEY, SIZES, body, double, field_of, samples
 
 from hybrid_jax import Hybrid, residual_network
-from hybrid_jax.export import casadi_function, casadi_step
+from hybrid_jax.export import acados_model, casadi_function, casadi_step
 from hybrid_jax.integrate import rollout
+from hybrid_jax.networks import smoothed
 
 ca = pytest.importorskip("casadi")
 ROUND_OFF = 1e-12  # of the largest entry: a few hundred operations of 1e-16 each
@@ -57,6 +58,28 @@ def test_inputs_and_outputs_have_names_and_sizes_of_another_system_too():
     assert str(function) == "pendulum:(x[2],u)->(xdot[2]) SXFunction"
     assert casadi_step(body(), 0.01).name_out() == ["xnext"]
     assert function(x=[0.1, 0.2], u=0.3)["xdot"].shape == (2, 1)
+
+
+def test_smooth_takes_the_place_of_relu_alone():
+    relu, tanh = (Hybrid(body(), residual_network(13, 4, KEY, hidden=5, activation=name)) for name in ("relu", "tanh"))
+    x, u = (part[0] for part in samples())
+    with jax.enable_x64(True):
+        for field, smooth in ((relu, smoothed(relu, 30.0)), (tanh, tanh)):
+            close(casadi_function(field, smooth=30.0)(x, u), double(smooth)(x, u))
+            close(casadi_step(field, 0.02, smooth=30.0)(x, u), rollout(double(smooth), x, u[None], 0.02)[0])
+    assert abs(casadi_function(relu)(x, u) - casadi_function(relu, smooth=30.0)(x, u)).full().max() > 1e-6
+
+
+def test_a_model_of_acados_has_the_field_explicitly_and_implicitly():
+    """As far as CasADi goes: acados itself is on no package index."""
+    model, (x, u) = acados_model(field_of("hybrid, norm none"), name="iris"), (part[0] for part in samples())
+    assert (model["name"], model["x"].shape, model["u"].shape) == ("iris", (13, 1), (4, 1))
+    expected = casadi_function(field_of("hybrid, norm none"))(x, u)
+    explicit = ca.Function("e", [model["x"], model["u"]], [model["f_expl_expr"]])
+    implicit = ca.Function("i", [model["x"], model["xdot"], model["u"]], [model["f_impl_expr"]])
+    close(explicit(x, u), expected)
+    assert abs(implicit(x, expected, u)).full().max() == 0
+    assert abs(implicit(x, expected + 1, u) - 1).full().max() < 1e-9
 
 
 def test_it_is_the_same_after_a_file(tmp_path):

@@ -1,0 +1,110 @@
+"""C of a field is the field: values, steps and their Jacobians, in both precisions, and without a warning."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from choices import slow
+from compiled import Library, needs_compiler
+from fields import FIELDS, KEY, body, double, field_of, samples
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.export import export_c
+from hybrid_jax.integrate import rk4_step
+from hybrid_jax.networks import make_residual, smoothed
+
+pytestmark = needs_compiler
+DT = 0.02
+TOLERANCE = {True: 1e-12, False: 1e-5}  # of the largest entry
+FEW = ("residual from all to all", "residual from body to motion")
+SLOW = [name for name in FIELDS if name.startswith("residual") and name not in FEW]
+
+
+def close(found, expected, precise):
+    expected = np.asarray(expected)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=TOLERANCE[precise] * abs(expected).max())
+
+
+def check(field, folder, precisions=(True, False), steps=True, sizes=(13, 4), points=None):
+    """Compare with JAX in double precision, in slopes along a random direction: a wrong entry of a Jacobian shows."""
+    points = samples(2) if points is None else points
+    points = [np.asarray(part, np.float32) for part in points]  # the same in both precisions
+    rng = np.random.default_rng(2)
+    dx, du = (rng.normal(size=size) for size in sizes)
+    with jax.enable_x64(True):
+        exact = double(field)
+        functions = {"derivative": exact} | ({"step": lambda x, u: rk4_step(exact, x, u, DT)} if steps else {})
+        expected = {}
+        for name, function in functions.items():
+            pushed = jax.jit(lambda x, u, function=function: jax.jvp(function, (x, u), (dx, du)))
+            expected[name] = [pushed(*map(jnp.float64, point)) for point in zip(*points, strict=True)]
+    for precise in precisions:
+        name = f"model_{'d' if precise else 'f'}"
+        options = {"state_size": sizes[0], "input_size": sizes[1], "double": precise}
+        library = Library(export_c(folder, field, DT, name=name, **options)[1], sizes, precise)
+        for function, results in expected.items():
+            for (value, slope), x, u in zip(results, *points, strict=True):
+                close(library(function, x, u), value, precise)
+                again, by_x, by_u = library(f"{function}_jacobian", x, u)
+                close(again, value, precise)
+                close(by_x.astype(float) @ dx + by_u.astype(float) @ du, slope, precise)
+
+
+@pytest.mark.parametrize("name", [pytest.param(name, marks=[pytest.mark.slow] * (name in SLOW)) for name in FIELDS])
+def test_it_is_the_field(name, tmp_path):
+    """In steps, which are the same code for all, only those that follow."""
+    check(field_of(name), tmp_path, precisions=(True,), steps=False)
+
+
+def wide(norm="batch", **options):
+    """A network of the paper's size, whose layers are loops."""
+    return Hybrid(body(), make_residual(KEY, hidden=64, norm=norm, **options))
+
+
+WIDE = {
+    "paper": wide,
+    "layer norm": lambda: wide("layer"),
+    "invariant": lambda: wide("none", inputs="no_xy_yaw", outputs="accelerations"),
+    "smooth": lambda: smoothed(wide(), 30.0),
+    **{name: lambda name=name: wide(activation=name) for name in ("softplus", "tanh", "silu")},
+    "least squares": lambda: hj.with_disturbance(wide()),
+}
+
+
+@pytest.mark.parametrize(
+    "name", ["paper", "layer norm", "invariant", "silu", *slow("softplus", "tanh", "smooth", "least squares")]
+)
+def test_layers_that_are_loops_are_the_network(name, tmp_path):
+    check(WIDE[name](), tmp_path)
+
+
+def turned(x, u):
+    """A system of another size, of which the library knows nothing."""
+    return jnp.stack([x[1], u[0] * jnp.where(x[0] > 0, 2.0, jnp.exp(x[0])) - x[1] ** 3 + jnp.maximum(x[0], -0.5)])
+
+
+def test_a_function_of_one_s_own_of_any_size_may_be_one(tmp_path):
+    rng = np.random.default_rng(0)
+    check(turned, tmp_path, sizes=(2, 1), points=(rng.normal(size=(4, 2)), rng.normal(size=(4, 1))))
+
+
+def test_what_is_not_a_number_is_not_hidden(tmp_path):
+    library = Library(export_c(tmp_path, wide(), DT)[1], (13, 4), double=False)
+    x, u = (part[0] for part in samples())
+    assert np.isfinite(library("step", x, u)).all()
+    x[10] = np.nan
+    assert np.isnan(library("step", x, u)).all()
+
+
+def test_what_makes_no_c_is_refused(tmp_path):
+    for name in ("1f", "Model", "a-b", "", None, "math"):
+        with pytest.raises(ValueError, match="name must be a lower-case C identifier"):
+            export_c(tmp_path, body(), DT, name=name)
+    with pytest.raises(ValueError, match="dt must be a positive"):
+        export_c(tmp_path, body(), 0.0)
+    with pytest.raises(ValueError, match="smooth must be"):
+        export_c(tmp_path, body(), DT, smooth=-1.0)
+    with pytest.raises(ValueError, match=r"operation 'scan' has no counterpart in C$"):
+        export_c(tmp_path, lambda x, u: jax.lax.fori_loop(0, 3, lambda _, y: y / 2, x), DT, state_size=2, input_size=1)
+    assert not list(tmp_path.iterdir())
