@@ -6,7 +6,8 @@
 
 The packages from the bottom up: `dynamics` (vector fields, physics), `networks` (residuals), `io` (models and data as
 files), `training` (`fit`), `adaptation` (`adapt`), `sweep` (many runs as one program), `sim` (a MuJoCo quadrotor),
-`flights` (recorded logs), `control` (closed-loop flight), `export` (StableHLO, CasADi).
+`flights` (recorded logs), `control` (closed-loop flight), `export` (StableHLO, CasADi, C), `identification` (a vehicle
+from commands and measurements).
 """
 
 from importlib.metadata import PackageNotFoundError, version
@@ -29,10 +30,12 @@ from hybrid_jax.adaptation import (
 )
 from hybrid_jax.dynamics import (
     AbstractVectorField,
+    Actuator,
     Frozen,
     Hybrid,
     Multirotor,
     RigidBody,
+    actuated,
     multirotor,
     rigid_body,
     with_disturbance,
@@ -54,6 +57,7 @@ except PackageNotFoundError:  # a checkout that is not installed
 __all__ = ["Trajectories", "__version__", "runtime"]
 __all__ += ["AbstractVectorField", "Frozen", "Hybrid", "with_disturbance"]
 __all__ += ["IRIS", "Multirotor", "RigidBody", "Vehicle", "load_vehicle", "multirotor", "rigid_body"]
+__all__ += ["Actuator", "actuated"]
 __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "with_scaling"]
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]

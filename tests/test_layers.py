@@ -11,7 +11,7 @@ ROOT = Path(__file__).parents[1]
 ORDER = (
     *("state", "rotation", "runtime", "checks", "vehicle", "trajectories", "extrapolation"),
     *("dynamics", "integrate", "networks", "metrics", "io", "training", "adaptation", "sweep"),
-    *("sim", "flights", "control", "export"),
+    *("sim", "flights", "control", "export", "identification"),
 )
 # These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.
 SERVICES = {"sim", "flights", "control", "export"}

@@ -149,6 +149,11 @@ def normal_equations(
     return jax.lax.map(one, windows, batch_size=min(chunk, len(windows)))
 
 
+def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:
+    """H⁻¹ M H⁻¹ of `covariance_of`, of normal equations in which all but `fitted` parameters are `masked`."""
+    return _covariance(equations, "sandwich", 1, fitted, cluster)
+
+
 def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
     """The normal equations of the free parameters; of the others, such that they stay as they are."""
     gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))

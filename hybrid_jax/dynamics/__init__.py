@@ -1,10 +1,11 @@
 """Vector fields ẋ = f(x, u) and the physics of a multirotor.
 
 `base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` and
-`multirotor` (with `terms`) the equations of motion, `disturbance` a constant disturbance, `baselines` reference models,
-and `vehicle_file` reads all of them from a TOML file.
+`multirotor` (with `terms`) the equations of motion, `actuators` what is between command and rotor, `disturbance` a
+constant disturbance, `baselines` reference models, and `vehicle_file` reads all of them from a TOML file.
 """
 
+from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid, trainable, unfreeze
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
@@ -14,6 +15,7 @@ from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
 __all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState", "Hybrid", "trainable", "unfreeze"]
+__all__ += ["Actuated", "Actuator", "actuated", "rotor_speeds"]
 __all__ += ["ConstantDisturbance", "disturbed", "with_disturbance"]
 __all__ += ["ForcedBody", "Multirotor", "RigidBody", "Terms", "VehicleModel"]
 __all__ += ["load_vehicle_model", "multirotor", "perturbed", "rigid_body", "with_vehicle"]

@@ -59,6 +59,8 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
         return field
     physics = physics_of(field)
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
+    if indices is None and getattr(physics, "rotor_states", 0):
+        indices = tuple(range(VELOCITY.start, STATE_SIZE))
     shape = (ACCELERATIONS,) if moves_a_rigid_body(physics) else ()
     zero = jnp.zeros(shape if indices is None else (len(indices),), jnp.result_type(*dtypes, jnp.float32))
     return with_physics(field, disturbed(physics, zero, indices))

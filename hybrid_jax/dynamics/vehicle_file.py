@@ -1,8 +1,9 @@
 """A whole vehicle file: constants of the vehicle, nominal values of further terms, and what is to be learned.
 
 Above all tables `learn = ["Ix", "drag", …]`, names of `terms.SHAPES`; then `[vehicle]` with the constants of `Vehicle`,
-`[vehicle.NAME]` with those that differ in a variant, and `[terms]` with nominal values of `Terms`. Above the tables
-may also stand what a term is for, as in `purpose = { cable_pull = "the load hangs on a cable" }`.
+`[vehicle.NAME]` with those that differ in a variant, `[terms]` with nominal values of `Terms`, and, for logs of
+commands instead of rotor speeds, `[actuator]` with those of `Actuator`, whose names `learn` may hold, too. Above the
+tables may also stand what a term is for, as in `purpose = { cable_pull = "the load hangs on a cable" }`.
 """
 
 from collections.abc import Mapping
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hybrid_jax import checks
+from hybrid_jax.dynamics.actuators import NAMES, Actuated, Actuator, actuated, check_actuator_names
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import Terms, check_names
@@ -18,7 +20,7 @@ from hybrid_jax.vehicle import Vehicle, from_table, read_tables, require_known, 
 
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.cleaning`
 NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, they would absorb other effects
-TABLES = ("vehicle", "learn", "terms", "purpose")
+TABLES = ("vehicle", "learn", "terms", "actuator", "purpose")
 
 
 @dataclass(frozen=True)
@@ -27,25 +29,34 @@ class VehicleModel:
 
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
+    actuator: Actuator | None = None
     learn: tuple[str, ...] = LEARNED  # names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs
     purpose: tuple[str, ...] = ()  # names of terms of which the file says what they are for
 
     def __post_init__(self):
-        check_learned(self.learn)
+        check_learned(self.learn, self.actuator)
 
     def physics(self) -> Multirotor:
-        """The field at its nominal values."""
+        """The field at its nominal values that is told rotor speeds."""
         return multirotor(self.vehicle, learned_by_field(self.learn), self.terms)
 
+    def commanded(self) -> Actuated:
+        """The field at its nominal values that is told commands; ValueError without `[actuator]`."""
+        if self.actuator is None:
+            raise ValueError("the vehicle file has no table [actuator], which a log of commands needs")
+        return actuated(self.physics(), self.actuator, tuple(name for name in self.learn if name in NAMES))
 
-def check_learned(learn: tuple[str, ...]) -> None:
+
+def check_learned(learn: tuple[str, ...], actuator: Actuator | None = None) -> None:
     """Raise ValueError for names that are unknown or exclude each other."""
-    check_names(learn, also=(LAG,))
+    check_names(learn, also=(LAG, *(NAMES if actuator else ())))
+    if actuator:
+        check_actuator_names(tuple(name for name in learn if name in NAMES), actuator, learn)
 
 
 def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
-    """The names that a field learns: all but the rotors' time constant."""
-    return tuple(name for name in learn if name != LAG)
+    """The names that a field learns: all but those of the actuators."""
+    return tuple(name for name in learn if name != LAG and name not in NAMES)
 
 
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
@@ -68,6 +79,10 @@ def vehicle_model_of(tables: Mapping[str, Any], path: str | Path, variant: str |
         "vehicle": vehicle_of(tables, path, variant),
         "terms": from_table(Terms, terms, f"{path}: [terms]"),
     }
+    if (actuator := tables.get("actuator")) is not None:
+        if not isinstance(actuator, dict):
+            raise ValueError(f"{path}: actuator must be a table [actuator], got {checks.short_repr(actuator)}")
+        parts["actuator"] = from_table(Actuator, actuator, f"{path}: [actuator]")
     parts |= {"purpose": purpose_of(tables, path), "learn": tables.get("learn", LEARNED)}
     return from_table(VehicleModel, parts, str(path))
 

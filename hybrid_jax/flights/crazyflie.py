@@ -189,6 +189,13 @@ def _derived(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
     elif {*EULER} <= {*columns}:
         angles = _stacked(columns, EULER) * DEGREES * [1, -1, 1]
         yield "attitude", Samples(columns[EULER[0]][0], from_euler(angles), WXYZ, " ".join(EULER))
+    elif {EULER[0], EULER[2], *ACCELERATION} <= {*columns}:
+        roll, yaw = (columns[name][1] * DEGREES for name in (EULER[0], EULER[2]))
+        x, y, z = (_stacked(columns, ACCELERATION) + np.array([0, 0, 1])).T
+        pitch = np.arctan2(np.cos(yaw) * x + np.sin(yaw) * y, z)
+        notes.append("pitch is not logged: the one with which stateEstimate.a* and gravity are along the body's z")
+        values = from_euler(np.stack([roll, pitch, yaw], axis=1))
+        yield "attitude", Samples(columns[EULER[0]][0], values, WXYZ, f"{EULER[0]} {EULER[2]} {' '.join(ACCELERATION)}")
     force = [name for name in ("acc.x", "controller.accelz") if name in columns]
     if force == ["controller.accelz"]:
         values = _stacked(columns, force) * GRAVITY

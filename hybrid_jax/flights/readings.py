@@ -27,6 +27,8 @@ LONGEST_LAG = 0.1  # s, either way
 # and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s
 YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
+# Of more than four motors the pilot mixes four numbers: several orders explain roll and pitch. One that does is kept.
+AMBIGUOUS = 0.1  # of the sum of two correlations
 PERMUTED = 6  # rotors at most of which all orders are tried: 720; of more, those with two exchanged
 
 Vectors = Float[np.ndarray, "n 3"]
@@ -140,6 +142,8 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     table = np.stack([correlations(torque, squares, mix, lag) for lag in range(-reach, reach + 1)])
     # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
     score = table[..., 0] + table[..., 1]
+    if len(arms) > 4 and score[:, 0].max() > score.max() - AMBIGUOUS:
+        score = score[:, :1]
     at, best = np.unravel_index(score.argmax(), score.shape)
     near = round(YAW_LEAD / log.dt)
     around = table[max(0, at - near) : at + near + 1, best, 2]
@@ -170,7 +174,8 @@ def correlations(
     order = orders(mix.shape[1])
     shared = np.einsum("aj,aoj->oa", mix, cross[:, order])
     variance = np.einsum("ai,oij,aj->oa", mix, spread[order[:, :, None], order[:, None, :]], mix)
-    return shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300))
+    least = 1e-9 * variance.max(axis=0)  # some orders of six rotors predict nothing
+    return np.where(variance > least, shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300)), 0.0)
 
 
 def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n rotors"]]:

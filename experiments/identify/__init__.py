@@ -1,0 +1,1 @@
+"""Identify a vehicle from logs of commands; see docs/howto/identify.md."""

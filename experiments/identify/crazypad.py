@@ -1,0 +1,168 @@
+"""Which rotor is damaged, and by how much: python -m experiments.identify.crazypad FOLDER
+
+FOLDER is `motor_data` of the data set CrazyPAD: a vehicle whose propeller M3 was cut in steps. The effectiveness of
+each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust and trim.
+"""
+
+import re
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+from experiments.reporting.tables import Table, print_tables
+from experiments.runner import command
+from hybrid_jax import runtime
+from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
+from hybrid_jax.dynamics.corrected_body import CorrectedBody
+from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.flights.log import IDLE, RESTING, runs_of
+from hybrid_jax.flights.reading import read_recording
+from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification.measured import Layout
+from hybrid_jax.vehicle import Vehicle
+
+WHOLE, SECONDS, MARGIN = 47.0, 3.0, 0.5  # mm of a propeller; s that are learned from; s left out beside the ground
+MEASURED = ("attitude", "specific_force")
+VEHICLE = Vehicle(
+    mass=0.036,
+    inertia=(1.7e-5, 1.7e-5, 2.9e-5),
+    thrust_coefficient=2e-8,
+    torque_coefficient=9e-11,
+    rotor_positions=((0.0325, -0.0325), (-0.0325, -0.0325), (-0.0325, 0.0325), (0.0325, 0.0325)),
+    spin=(-1.0, 1.0, -1.0, 1.0),
+    max_rotor_speed=3000.0,
+    name="crazyflie",
+)
+# The firmware's own thrust [N] of a rotor at 3.5 V, as a polynomial in the PWM's share: grams of four by the voltage.
+FULL = 3.5
+_GRAMS = np.linspace(5, 50, 50)
+_CURVE = np.polynomial.polynomial.polyfit((0.088 * _GRAMS - 0.0006239 * _GRAMS**2) / FULL, _GRAMS * 9.81e-3 / 4, 2)
+ACTUATOR = Actuator(tuple(map(float, _CURVE)), "thrust", (0.06, 0.06), FULL, 1.0)
+LAYOUT = Layout(dt=0.01, steps=20, span=0.1, disturbance=(0.0,) * 3 + (0.5,) * 3)
+
+
+class Flight(NamedTuple):
+    """A flight, and the length [mm] that is left of its propeller M3."""
+
+    recording: Recording
+    length: float
+
+
+def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Flight]]:
+    """Normal flights, and those with a cut propeller from long to short."""
+    normal = [Flight(read_recording(path), WHOLE) for path in sorted((folder / "normal_flight").glob(f"{vehicle}_*"))]
+    found = sorted(folder.glob(f"cut_propeller_M3_*/{vehicle}_*"))
+    cut = [Flight(read_recording(path), float(re.findall(r"([\d.]+)mm", path.parent.name)[-1])) for path in found]
+    if not normal or not cut:
+        raise ValueError(f"{folder}: no flights normal_flight/{vehicle}_* and cut_propeller_M3_*/{vehicle}_*")
+    return normal, sorted(cut, key=lambda each: -each.length)
+
+
+def in_flight(recording: Recording) -> list[tuple[float, float]]:
+    """Start and end [s] of each time in the air."""
+    command = recording.signals["command"]
+    power = (np.asarray(command.values) ** 2).sum(axis=1)
+    found = [command.t[part] for part in runs_of(power > IDLE * np.quantile(power, 0.9))]
+    return [(t[0] + MARGIN, t[-1] - MARGIN) for t in found if t[-1] - t[0] > 2 * MARGIN + RESTING]
+
+
+def cut_out(recording: Recording, begin: float, end: float) -> Recording:
+    """The part of a recording between two times."""
+
+    def part(signal: Signal) -> Signal:
+        inside = (signal.t >= begin) & (signal.t <= end)
+        return replace(signal, t=signal.t[inside], values=np.asarray(signal.values)[inside])
+
+    return replace(recording, signals={name: part(signal) for name, signal in recording.signals.items()})
+
+
+def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.ndarray:
+    """Specific force along the thrust less that predicted of commands and voltage [m/s²], in flight, from a time on."""
+    command, voltage, force = (recording.signals[name] for name in ("command", "voltage", "specific_force"))
+    inputs = np.asarray(command.values)
+    if field.reads_voltage:
+        inputs = np.column_stack([inputs, np.interp(command.t, voltage.t, np.asarray(voltage.values)[:, 0])])
+    edges = np.arange(command.t[0], command.t[-1], 0.01)
+    speeds = rotor_speeds(field, command.t, inputs, edges)
+    theta = field.body.theta()
+    k = np.asarray(theta.get("k_rotors", VEHICLE.thrust_coefficient) * theta.get("efficiency", 1.0))
+    t = (edges[1:] + edges[:-1]) / 2
+    error = np.interp(t, force.t, np.asarray(force.values)[:, -1]) - (k * speeds**2).sum(axis=1) / VEHICLE.mass
+    inside = np.any([(t >= begin) & (t <= end) for begin, end in in_flight(recording)], axis=0)
+    return error[inside & (t >= after)]
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(errors**2)))
+
+
+def source(normal: list[Flight]):
+    """What normal flights tell: effectiveness of each rotor, and lag."""
+    learn = multirotor(VEHICLE, ("k_rotors",))
+    field = actuated(learn, ACTUATOR, ("time_constant",))
+    return identify(field, [each.recording for each in normal], LAYOUT, MEASURED)
+
+
+def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, float]:
+    """The first seconds in the air, with the take-off before them, and when they end."""
+    begin, _ = in_flight(flight.recording)[0]
+    return cut_out(flight.recording, begin - MARGIN, begin + seconds), begin + seconds
+
+
+def damage(field: Any, flight: Flight) -> tuple[np.ndarray, Any, float]:
+    """Thrust that each rotor has lost, as a share, with intervals, by the first seconds; the field; when they end.
+
+    All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
+    """
+    part, end = first_seconds(flight)
+    short = replace(LAYOUT, steps=15, most=16, margin=0.0)
+    body = CorrectedBody(field.body, jnp.zeros(VEHICLE.rotors), jnp.zeros(3))
+    start = replace(field, body=body)
+    found = identify(start, [part], short, MEASURED, free=("log_efficiency",))
+    efficiencies = [found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)]
+    lost = [[1 - float(each[j]) for j in (0, 2, 1)] for each in efficiencies]
+    worst = int(np.argmax(np.array(lost)[:, 0]))
+    alone = identify(start, [part], short, ("specific_force",), free=(f"log_efficiency[{worst}]",))
+    return np.array(lost), alone.field, end
+
+
+def main(folder: Path) -> None:
+    console = Console(width=120)
+    normal, cut = flights(folder)
+    here: Any = source(normal[:3]).field
+    console.print("normal:", {name: np.asarray(value).tolist() for name, value in here.theta().items()})
+    lines, shares, found = [], {}, []
+    for flight in cut:
+        lost, field, end = damage(here, flight)
+        worst = int(lost[:, 0].argmax())
+        alone = 1 - float(np.exp(field.body.log_efficiency[worst]))
+        shares.setdefault(flight.length, []).append(alone)
+        found.append([rms(force_errors(each, flight.recording, end)) for each in (here, field)])
+        value, low, high = lost[worst]
+        cells = f"M{worst + 1}", f"{value:.3f}", f"{low:.3f} … {high:.3f}", f"{alone:.3f}"
+        lines.append((f"{WHOLE - flight.length:g}", *cells, *(f"{each:.2f}" for each in found[-1])))
+    for row, flight in zip(found, cut, strict=True):
+        others = {length: float(np.mean(part)) for length, part in shares.items() if length != flight.length}
+        lengths = sorted({WHOLE, *others})
+        lost = np.interp(flight.length, lengths, [others.get(length, 0.0) for length in lengths])
+        efficiency = jnp.zeros(VEHICLE.rotors).at[2].set(np.log1p(-lost))
+        changed = replace(here, body=CorrectedBody(here.body, efficiency, jnp.zeros(3)))
+        row.append(rms(force_errors(changed, flight.recording, first_seconds(flight)[1])))
+    lines = [(*line, f"{row[2]:.2f}") for line, row in zip(lines, found, strict=True)]
+    pooled = np.sqrt(np.mean(np.square(found), axis=0))
+    lines.append(("all", "", "", "", "", *(f"{each:.3f}" for each in pooled)))
+    header = ("cut [mm]", "rotor", "thrust lost, by thrust and trim", "95 %", "by thrust alone")
+    title = f"Damage by {SECONDS:g} s; specific force along the thrust after them, RMSE [m/s²]"
+    print_tables(console, [Table(title, (*header, "from normal", "those seconds", "interpolated"), lines)])
+
+
+if __name__ == "__main__":
+    runtime.configure(Path("runs/cache"))
+    with command._exit_codes("identify.crazypad", "interrupted"):
+        main(Path(sys.argv[1]))

@@ -1,0 +1,129 @@
+"""From one airframe to another: python -m experiments.identify.nanobench FOLDER
+
+FOLDER is the data set NanoBench: flights of an airframe A, and of B, which replaced it. Each flight of B is left out in
+turn; the others, or ten seconds of one, are learned from.
+"""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import jax.numpy as jnp
+import numpy as np
+from rich.console import Console
+
+import hybrid_jax as hj
+from experiments.identify.crazypad import ACTUATOR, VEHICLE, cut_out, force_errors, in_flight, rms
+from experiments.reporting.tables import Table, print_tables
+from experiments.runner import command
+from hybrid_jax import runtime
+from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
+from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
+from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.flights.column_map import load_column_map
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.reading import read_recording
+from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.windows import cut_windows
+from hybrid_jax.identification.fitting import identify
+from hybrid_jax.identification.measured import Layout
+
+OF_A = """B2_circle_slow_rep1 B2_circle_medium_rep1 B2_circle_fast_rep1 B3_figure8_slow_rep1 B3_figure8_fast_rep1
+    B7_oval_fast_rep2 B8_star_medium_rep1 B10_lissajous_fast_rep1"""
+OF_B = "B7_oval_slow_rep3 B2_circle_fast_rep3 B5_helix_fast_rep2 B8_star_fast_rep3"
+SECONDS, DT, STEPS, STRIDE = 10.0, 0.01, 50, 10
+FIT_STEPS = 12  # of Levenberg–Marquardt, of which the first few count
+FORCE = Layout(dt=DT, steps=50, most=200, disturbance=(0.0,) * 6)
+LEARN = ("Ix", "Iy", "Iz", "k_rotors", "centre_of_mass", "torque_gain", "drag", "aerodynamic_moment", "rate_damping")
+SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of the errors of p, q, v and ω
+
+
+def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated | None = None, free=None) -> Actuated:
+    """The actuators that explain the accelerometer of some flights; without the voltage, of a constant gain."""
+    own = ACTUATOR if voltage else replace(ACTUATOR, nominal_voltage=0.0, voltage_exponent=0.0)
+    learn = ("curve", "time_constant", "voltage_exponent") if voltage else ("curve", "time_constant")
+    field = start if start is not None else actuated(multirotor(VEHICLE, ()), own, learn)
+    return identify(field, recordings, FORCE, ("specific_force",), free=free).field  # pyright: ignore[reportReturnType]
+
+
+def flight_of(recording: Recording, field: Actuated) -> FlightLog:
+    """The flight with rotor speeds that follow from commands and voltage, every 10 ms in the air."""
+    command, voltage = recording.signals["command"], recording.signals["voltage"]
+    begin, end = in_flight(recording)[0][0], in_flight(recording)[-1][1]
+    t = np.arange(begin, end, DT)
+    u = np.asarray(command.values)
+    if field.reads_voltage:
+        u = np.column_stack([u, np.interp(command.t, voltage.t, np.asarray(voltage.values)[:, 0])])
+    lead = round(0.5 / DT)
+    speeds = rotor_speeds(field, command.t, u, t[0] + DT * np.arange(-lead, len(t) + 1))[lead:]
+
+    def at(name: str) -> np.ndarray:
+        signal = recording.signals[name]
+        return np.stack([np.interp(t, signal.t, column) for column in np.asarray(signal.values).T], axis=1)
+
+    x = np.concatenate([at("position"), at("attitude"), at("velocity"), at("rates")], axis=1)
+    x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
+    return FlightLog(t, x, speeds, recording.name)
+
+
+def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajectories:
+    return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride).windows
+
+
+def errors(field, windows) -> list[float]:
+    """RMS of position, velocity, rotation and rates after 0.1 and 0.5 s."""
+    found = flight_errors(field, windows)
+    return [float(np.sqrt(np.mean(np.asarray(part)[:, at] ** 2))) for at in (9, 49) for part in found]
+
+
+def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int = 50):
+    """The physics of a field, fitted to windows of flights by least squares."""
+    return fit_least_squares(start, windows_of(recordings, field, stride), None, FIT_STEPS, jnp.asarray(SCALE)).field
+
+
+def main(folder: Path) -> None:
+    console, columns = Console(width=150), load_column_map(Path(__file__).with_suffix(".toml"))
+    a, b = ([read_recording(folder / f"{name}.csv.gz", columns) for name in part.split()] for part in (OF_A, OF_B))
+    aware, constant = thrust_of(a), thrust_of(a, voltage=False)
+    console.print("A:", {name: np.asarray(value).round(4).tolist() for name, value in aware.theta().items()})
+    of_a = fitted_to(multirotor(VEHICLE, LEARN, Terms()), a, aware, 100)
+    forces, scores = [], {}
+    for i, left in enumerate(b):
+        others = b[:i] + b[i + 1 :]
+        fitted, gain = thrust_of(others, start=aware), thrust_of(others, voltage=False, start=constant)
+        begin = in_flight(others[0])[0][0]
+        few = thrust_of([cut_out(others[0], begin - 0.5, begin + SECONDS)], start=aware, free=("curve",))
+        forces.append([rms(force_errors(each, left)) for each in (aware, fitted, few)])
+        console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
+        test, plain = windows_of([left], fitted), windows_of([left], gain)
+        simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
+        ten = [cut_out(others[0], begin - 0.5, begin + SECONDS)]
+        models = {
+            "hold the state": (HoldState(), test),
+            "frozen rates": (FrozenRates(simple[1]), test),
+            "physics, constant gain": (simple[0], plain),
+            "physics, voltage": (simple[1], test),
+            "adapted from A": (fitted_to(of_a, others, fitted), test),
+            "adapted from A, ten seconds": (fitted_to(of_a, ten, few, 5), windows_of([left], few)),
+        }
+        for name, (model, windows) in models.items():
+            scores.setdefault(name, []).append(errors(model, windows))
+            console.print(name, [f"{each:.3f}" for each in scores[name][-1]])
+
+    def pooled(part) -> tuple[str, ...]:
+        return tuple(f"{each:.3f}" for each in np.sqrt(np.mean(np.square(part), axis=0)))
+
+    title = "Specific force along the thrust, RMSE [m/s²]"
+    shown = [Table(title, ("from A alone", "fitted to B", "ten seconds of B"), [pooled(forces)])]
+    names = [f"{name} {at} s" for at in (0.1, 0.5) for name in ("p [m]", "v [m/s]", "R [rad]", "ω [rad/s]")]
+    lines = [(name, *pooled(part)) for name, part in scores.items()]
+    print_tables(console, [*shown, Table("Flights of B left out, RMSE", ("model", *names), lines)])
+
+
+if __name__ == "__main__":
+    runtime.configure(Path("runs/cache"))
+    with command._exit_codes("identify.nanobench", "interrupted"):
+        main(Path(sys.argv[1]))

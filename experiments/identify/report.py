@@ -1,0 +1,85 @@
+"""Tables and figure of an identification."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.reporting.plots import STYLE, save_figure
+from experiments.reporting.tables import Table
+from hybrid_jax.adaptation.adapting import UNITS
+from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
+from hybrid_jax.identification.fitting import Identified, prediction_errors
+from hybrid_jax.identification.measured import Layout
+
+ACTUATOR_UNITS = {"curve": "N or rad/s", "time_constant": "s", "time_constants": "s", "delay": "s"}
+
+
+def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Recording], layout: Layout, names):
+    """Rows of the result, its tables and its notes."""
+    units = UNITS | ACTUATOR_UNITS | {"centre_of_mass": "m"}
+    rows: list[dict[str, Any]] = []
+    for name, interval in found.intervals.items():
+        value, low, high = (float(each) for each in interval)
+        rows.append({"parameter": name, "value": value, "low": low, "high": high})
+    lines = [
+        (row["parameter"], *(f"{row[key]:.4g}" for key in ("value", "low", "high")), units.get(_plain(row), ""))
+        for row in rows
+    ]
+    shown = [Table("Parameters, with 95 % intervals", ("parameter", "estimate", "from", "to", "unit"), lines)]
+    shown.append(Table("RMS of the errors over the windows fitted", ("quantity", "unit", "x, y, z …"), _fitted(found)))
+    shown += [_predicted(found, each, layout, names) for each in left_out]
+    unseen = [row["parameter"] for row in rows if not np.isfinite(row["high"])]
+    notes = [f"{found.windows} windows, {found.seconds:.4g} s of flight, of {len(logs)} logs"]
+    if unseen:
+        notes.append(f"not told by these logs, left as they were: {', '.join(unseen)}")
+    shares = ", ".join(f"{axis} {share:.2f}" for axis, share in zip("xyz", found.explained, strict=True))
+    notes.append(
+        f"share of the body rates within a window, less their trend, that commands explain: {shares}; inertia and "
+        "torque have intervals that hold both regressions, of torque on acceleration and the other way round"
+    )
+    if not found.converged:
+        notes.append("the fit stopped before it converged: start nearer, or learn less")
+    return rows, shown, notes
+
+
+def _plain(row) -> str:
+    return row["parameter"].partition("[")[0]
+
+
+def _unit(name: str) -> str:
+    return "rad" if name == "attitude" else AXES[name][1] if name in AXES else ROTOR_UNITS[name]
+
+
+def _fitted(found: Identified):
+    return [(name, _unit(name), "  ".join(f"{e:.3g}" for e in errors)) for name, errors in found.errors.items()]
+
+
+def _predicted(found: Identified, recording: Recording, layout: Layout, names) -> Table:
+    errors = prediction_errors(found.field, [recording], layout, names)
+    lines = []
+    for name, part in errors.items():
+        at = [max(1, part.shape[1] // 4), part.shape[1]]
+        cells = ["  ".join(f"{e:.3g}" for e in np.sqrt(np.nanmean(part[:, k - 1] ** 2, axis=0))) for k in at]
+        lines.append((name, _unit(name), *cells))
+    ends = [f"after {layout.dt * max(1, layout.steps // 4):.3g} s", f"after {layout.dt * layout.steps:.3g} s"]
+    return Table(f"RMS of what was predicted of {Path(recording.name).name}", ("quantity", "unit", *ends), lines)
+
+
+def figure(out: Path, found: Identified, logs, left_out, layout: Layout, names) -> dict[str, str]:
+    """Errors of predictions against time, of logs left out where there are any; path → caption."""
+    errors = prediction_errors(found.field, left_out or logs, layout, names)
+    with mpl.rc_context(STYLE):
+        picture = Figure(figsize=(3.2 * len(errors), 2.8), layout="constrained")
+        for panel, (name, part) in zip(np.atleast_1d(picture.subplots(1, len(errors))), errors.items(), strict=True):
+            t = layout.dt * np.arange(1, part.shape[1] + 1)
+            axes = logs[0].signals[name].axes if name != "attitude" else ("x", "y", "z")
+            panel.plot(t, np.sqrt(np.nanmean(part**2, axis=0)), label=axes)
+            panel.set(xlabel="time from the start [s]", ylabel=f"RMS error [{_unit(name)}]", title=name)
+            panel.legend()
+        save_figure(picture, out / "errors")
+    which = "logs left out" if left_out else "the logs fitted"
+    return {"errors.png": f"Errors of predictions from the state that earlier samples tell: {which}."}

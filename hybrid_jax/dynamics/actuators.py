@@ -1,0 +1,230 @@
+"""From a motor's command to its rotor's speed: a static curve with the battery's voltage, and a first-order lag.
+
+    w∞ = W(c (V / V₀)^γ),   τ ẇ = w∞ − w,   τ = τ_up where the rotor speeds up, τ_down where it slows down
+
+c is the command as a share of the largest, V the voltage [V]. W is a polynomial that gives the speed [rad/s], or the
+root of one that gives the thrust [N] of a rotor: W = √(f / k) with the nominal k of the vehicle. The voltage's exponent
+γ is 0 of a vehicle that corrects for its battery, and near 1 of one that does not.
+"""
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual
+from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.state import STATE_SIZE
+from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
+
+NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay")  # of learnable parameters
+GIVES = ("speed", "thrust")
+EXCLUSIVE = {"curve": ("k", "k_rotors"), "time_constants": ("time_constant",)}
+SLOWEST_SHARE = 1e-3  # of the speed of hover: below, the root of a thrust has no slope
+Numbers = Array | np.ndarray
+QUICKEST = 1e-3  # s, least time constant that is learned
+
+
+@dataclass(frozen=True)
+class Actuator:
+    """What stands between command and rotor: the table `[actuator]` of a vehicle file. ValueError as the fields say."""
+
+    curve: tuple[float, ...]  # c0, c1, …: the sum of ci command^i
+    gives: str = "speed"  # of a rotor [rad/s], or "thrust" [N]
+    time_constants: tuple[float, float] = (0.0, 0.0)  # speeding up and slowing down [s]; one number stands for both
+    nominal_voltage: float = 0.0  # V₀ [V]; 0 if the voltage does not matter
+    voltage_exponent: float = 0.0  # γ
+    delay: float = 0.0  # by which commands act later than the log says [s], one for a log
+
+    def __post_init__(self):
+        if not isinstance(self.curve, tuple) or not 2 <= len(self.curve) <= 6:
+            raise ValueError(f"curve must be two to six coefficients c0, c1, …, got {checks.short_repr(self.curve)}")
+        require_numbers("curve", self.curve, (len(self.curve),), "finite coefficients c0, c1, …")
+        if not any(self.curve):
+            raise ValueError("curve must have a coefficient that is not zero")
+        if self.gives not in GIVES:
+            raise ValueError(f"gives must be one of {', '.join(GIVES)}, got {checks.short_repr(self.gives)}")
+        if isinstance(self.time_constants, int | float):
+            object.__setattr__(self, "time_constants", (float(self.time_constants),) * 2)
+        require_numbers("time_constants", self.time_constants, (2,), "one or two numbers of seconds, up and down")
+        if min(self.time_constants) < 0 or min(self.time_constants) == 0 < max(self.time_constants):
+            raise ValueError(f"time_constants must both be positive, or both 0, got {self.time_constants}")
+        checks.not_negative("nominal_voltage", self.nominal_voltage)
+        for name in ("voltage_exponent", "delay"):
+            require_numbers(name, getattr(self, name), (), "a finite number")
+        if self.voltage_exponent and not self.nominal_voltage:
+            raise ValueError("nominal_voltage must be given, as voltage_exponent is not zero")
+        object.__setattr__(self, "curve", as_tuple(np.asarray(self.curve, float).tolist()))
+
+
+class Actuated(AbstractVectorField):
+    """A multirotor that is told commands: x = [state, rotor speeds] (13 + n), or (13) if nothing lags, u = [c, V].
+
+    u is one command for each rotor, and after them the battery's voltage where `nominal_voltage` is given.
+
+    Parameters are deviations from the nominal actuator that start at zero: of `curve` in units of its value at full
+    command, of time constants as logarithms, of the others as they are. `delay` shifts a log (`delayed`); the equations
+    do not know it.
+
+    Attributes:
+        body: the field that is told rotor speeds.
+        deviations: of each learned parameter, by name.
+
+    Raises:
+        ValueError: unknown names, or a voltage exponent without a nominal voltage.
+    """
+
+    accepts_batch: ClassVar[bool] = True
+
+    body: AbstractRigidBody
+    deviations: dict[str, Float[Array, "..."]]
+    actuator: Actuator = eqx.field(static=True)
+
+    def __check_init__(self):
+        check_actuator_names(tuple(self.deviations), self.actuator)
+
+    @property
+    def rotor_states(self) -> int:
+        """How many states follow the 13 of the body."""
+        lags = {"time_constant", "time_constants"} & self.deviations.keys() or self.actuator.time_constants[0]
+        return self._vehicle.rotors if lags else 0
+
+    @property
+    def state_size(self) -> int:
+        return STATE_SIZE + self.rotor_states
+
+    @property
+    def input_size(self) -> int:
+        return self._vehicle.rotors + self.reads_voltage
+
+    @property
+    def reads_voltage(self) -> bool:
+        return self.actuator.nominal_voltage > 0
+
+    @property
+    def _vehicle(self) -> Vehicle:
+        return self.body.vehicle  # pyright: ignore[reportAttributeAccessIssue]
+
+    def theta(self) -> dict[str, Array]:
+        """The learned parameters of the body and of the actuator, in SI units."""
+        return self.body.theta() | {name: self._value(name) for name in self.deviations}
+
+    def _value(self, name: str) -> Array:
+        """A parameter of the actuator, learned or known."""
+        at, known = self.deviations.get(name, 0.0), self.actuator
+        if name == "curve":
+            return jnp.asarray(known.curve) + abs(sum(known.curve) or 1.0) * jnp.asarray(at)
+        if name == "time_constant":
+            return max(known.time_constants[0], QUICKEST) * jnp.exp(at)
+        if name == "time_constants":
+            return jnp.maximum(jnp.asarray(known.time_constants), QUICKEST) * jnp.exp(jnp.asarray(at))
+        return getattr(known, name) + jnp.asarray(at)
+
+    @property
+    def delay(self) -> Array:
+        """By how much commands act later than the log says [s]."""
+        return self._value("delay")
+
+    def time_constants(self) -> Float[Array, "2"]:
+        """τ_up and τ_down [s]."""
+        if "time_constant" in self.deviations:
+            nominal = np.maximum(self.actuator.time_constants, QUICKEST)
+            return jnp.asarray(nominal) * jnp.exp(self.deviations["time_constant"])
+        return self._value("time_constants")
+
+    def steady_speeds(self, u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
+        """w∞ [rad/s]: the speeds at which the rotors settle under commands and voltage."""
+        vehicle = self._vehicle
+        commands = u[: vehicle.rotors]
+        if self.reads_voltage:
+            commands = commands * (u[vehicle.rotors] / self.actuator.nominal_voltage) ** self._value("voltage_exponent")
+        value = jnp.polyval(self._value("curve")[::-1], commands)
+        if self.actuator.gives == "speed":
+            return value
+        least = SLOWEST_SHARE * vehicle.hover_speed
+        return jnp.sqrt(jnp.maximum(value / vehicle.thrust_coefficient, least**2))
+
+    def speeds(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
+        """w [rad/s]: of the state, or at once those of the commands."""
+        return x[STATE_SIZE:] if self.rotor_states else self.steady_speeds(u)
+
+    def accelerations(self, w: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
+        """ẇ [rad/s²]."""
+        missing, (up, down) = self.steady_speeds(u) - w, self.time_constants()
+        return missing / jnp.where(missing > 0, up, down)
+
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        moved = self.body(x[:STATE_SIZE], self.speeds(x, u))
+        return jnp.concatenate([moved, self.accelerations(x[STATE_SIZE:], u)]) if self.rotor_states else moved
+
+    def apply_residual(self, x, residual):
+        changed = apply_residual(self.body, x[:STATE_SIZE], residual[:STATE_SIZE])
+        return jnp.concatenate([changed, residual[STATE_SIZE:]])
+
+    def settled(self, u: Float[Array, "t m"], dt: float) -> Float[Array, " n"]:
+        """The rotor speeds [rad/s] after the inputs u, each held for dt [s], that began in equilibrium with the first.
+
+        Exact for inputs that are held.
+        """
+        targets, (up, down) = self.steady_speeds(u.T).T, self.time_constants()
+        kept = jnp.exp(-dt / up), jnp.exp(-dt / down)
+
+        def interval(w, target):
+            return target + (w - target) * jnp.where(target > w, *kept), None
+
+        return jax.lax.scan(interval, targets[0], targets)[0]
+
+
+def actuated(body: AbstractRigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
+    """The body behind its actuators, which learn the parameters named in `learn`; see `check_actuator_names`."""
+    check_actuator_names(learn, actuator, tuple(getattr(body, "deviations", ())))
+    shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
+    return Actuated(body, {name: jnp.zeros(shapes.get(name, ())) for name in learn}, actuator)
+
+
+def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tuple[str, ...] = ()) -> None:
+    """Raise ValueError for names not in `NAMES`, or that cannot be told apart or from those of the body."""
+    for name in learn:
+        if name not in NAMES:
+            raise ValueError(f"learn must be names of {', '.join(NAMES)}, got {checks.short_repr(name)}")
+        for other in EXCLUSIVE.get(name, ()):
+            if other in (*learn, *of_body):
+                raise ValueError(f"learn must not name both {name} and {other}: a common factor is in both")
+    if "voltage_exponent" in learn and not actuator.nominal_voltage:
+        raise ValueError("nominal_voltage must be given in [actuator], as voltage_exponent is to be learned")
+
+
+def rotor_speeds(
+    field: Actuated, t: Float[np.ndarray, " n"], commands: Float[np.ndarray, "n m"], edges: Float[np.ndarray, " k"]
+) -> Float[np.ndarray, "k-1 r"]:
+    """The mean rotor speed [rad/s] of each interval between `edges` [s], of inputs (commands, voltage) held from t on.
+
+    This turns a log of commands into one of rotor speeds.
+    """
+    u = np.asarray(held_means(jnp.asarray(t), jnp.asarray(commands), jnp.asarray(edges), field.delay))
+    targets = np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)
+    if not field.rotor_states:
+        return targets
+    w, found = targets[0], np.empty_like(targets)
+    for i, (target, span) in enumerate(zip(targets, np.diff(edges), strict=True)):
+        tau = np.where(target > w, *np.asarray(field.time_constants()))
+        end = target + (w - target) * np.exp(-span / tau)
+        found[i], w = target + (w - end) * tau / span, end
+    return found
+
+
+def held_means(t: Numbers, values: Numbers, edges: Numbers, delay: Array | float = 0.0) -> Float[Array, "k-1 m"]:
+    """The mean over each interval between `edges` (k) [s] of values (n, m) held from times t (n), `delay` [s] later.
+
+    Before the first time the first value holds. The derivative by the delay is right between jumps.
+    """
+    area = jnp.concatenate([jnp.zeros((1, values.shape[1])), jnp.cumsum(values[:-1] * jnp.diff(t)[:, None], axis=0)])
+    at = edges - delay
+    i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 1)
+    total = area[i] + values[i] * (at - t[i])[:, None]
+    return jnp.diff(total, axis=0) / jnp.diff(edges)[:, None]

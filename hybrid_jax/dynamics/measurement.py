@@ -1,0 +1,45 @@
+"""What sensors measure of a multirotor: y = h(x, u), of states that need not be measured themselves."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import rotation
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+
+STATES = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
+MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")
+TANGENT = STATE_SIZE - 1  # numbers of a small change of the body's state: p, rotation vector, v, ω
+
+
+def measure(
+    quantity: str, field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], gravity: float = 9.81
+) -> Float[Array, " k"]:
+    """h(x, u) of one of `MEASURED`, as `flights.recording.AXES` has it.
+
+    The specific force [m/s², body] is what an accelerometer in the centre of mass measures: Rᵀ (v̇ + g e_z), with v̇ of
+    the field.
+    """
+    if quantity in STATES:
+        return x[STATES[quantity]]
+    if quantity == "rotor_speed":
+        return field.speeds(x, u)  # pyright: ignore[reportAttributeAccessIssue]
+    vector = x[VELOCITY] if quantity == "body_velocity" else field(x, u)[VELOCITY].at[2].add(gravity)
+    return rotation.rotate(rotation.conjugate(rotation.normalise(x[QUATERNION])), vector)
+
+
+def difference(quantity: str, y: Float[Array | np.ndarray, " k"], predicted: Float[Array, " k"]) -> Float[Array, " e"]:
+    """y less what was predicted; of attitudes the rotation vector between them in the body [rad] (3)."""
+    if quantity != "attitude":
+        return jnp.asarray(y) - predicted
+    w, *vector = rotation.multiply(rotation.conjugate(predicted), jnp.asarray(y))
+    return 2 * jnp.where(w < 0, -1.0, 1.0) * jnp.stack(vector)
+
+
+def moved(x: Float[Array, "13"], change: Float[Array, "12"]) -> Float[Array, "13"]:
+    """The state after a small change: of position, a rotation vector in the body [rad], velocity and body rates."""
+    half = change[3:6] / 2
+    turn = rotation.normalise(jnp.concatenate([jnp.ones(1, half.dtype), half]))
+    parts = x[POSITION] + change[:3], rotation.multiply(x[QUATERNION], turn), x[VELOCITY.start :] + change[6:]
+    return jnp.concatenate(parts)

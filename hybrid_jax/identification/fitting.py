@@ -1,0 +1,256 @@
+"""Identify a vehicle from recordings of commands and of whatever was measured, through the ODE solver.
+
+The measurements of each window are compared with those that the field predicts from the window's initial state, which
+is unknown, too: it enters with the estimate of `measured.initial_states` as a prior (an arrival cost; Rao, Rawlings and
+Mayne 2003). So does a force and a torque that is constant over a window: wind, a battery that sags, and other slow
+errors that a pilot corrects, which would pass for effects of the commands. Both are eliminated window by window from
+the normal equations of the parameters (multiple shooting; Bock 1983). Levenberg–Marquardt takes the steps. In rounds
+each channel is weighted by its own errors, and the disturbances get the variance that they turn out to have (empirical
+Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
+"""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.adaptation import uncertainty
+from hybrid_jax.adaptation.least_squares import ravel_parameters
+from hybrid_jax.adaptation.uncertainty import Interval, NormalEquations
+from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.measurement import TANGENT
+from hybrid_jax.flights.recording import Recording
+from hybrid_jax.identification.measured import Layout, Windows, cut
+from hybrid_jax.identification.prediction import Problem, all_errors, normal_equations, rms
+
+ROUNDS = 3  # of weights
+CLUSTER = 2.0  # s of windows that are taken as one observation,
+FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many windows
+OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "k", "k_rotors", "drag"}
+FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
+AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
+NO_EFFECT = 0.1  # a parameter that moves all errors by less, in their standard deviations, per unit is not seen
+
+
+class Identified(NamedTuple):
+    """The result of `identify`."""
+
+    field: AbstractVectorField
+    intervals: dict[str, Interval]  # of each parameter, number by number: 95 %
+    errors: dict[str, np.ndarray]  # RMS of each quantity's channels over the windows, from the estimated initial states
+    windows: int
+    seconds: float
+    converged: bool
+    covariance: Float[np.ndarray, "p p"]  # in the parametrisation of `ravel_parameters`
+    explained: Float[np.ndarray, "3"]  # share of the change of body rates in a window that is told; 1 if not measured
+
+
+def identify(
+    field: AbstractVectorField,
+    recordings: Sequence[Recording],
+    layout: Layout | None = None,
+    measured: Sequence[str] = (),
+    *,
+    free: Sequence[str] | None = None,
+    known: Float[np.ndarray, "p p"] | None = None,
+    rounds: int = ROUNDS,
+    max_steps: int = 20,
+    level: float = 0.95,
+) -> Identified:
+    """Fit the learned parameters of the field's physics to recordings.
+
+    Args:
+        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
+        measured: quantities that are compared, by default all that every recording has.
+        free: names of parameters that are fitted, such as k or log_efficiency[2], by default all; the others stay.
+        known: the covariance of those that stay, to which the fitted ones owe a part of theirs; by default zero.
+        rounds: fits, each with channels weighted by the errors of the one before.
+
+    Returns:
+        A parameter that the windows do not tell has an infinite interval and stays as it was.
+
+    Raises:
+        ValueError: of a recording that lacks something, or too few windows: name and what was expected.
+    """
+    layout = Layout() if layout is None else layout
+    told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
+    checks.count("rounds", rounds)
+    windows, inputs, columns = cut(recordings, layout, told, measured)
+    moves = _free(field, free)
+    if len(windows.start) <= moves.sum():
+        raise ValueError(
+            f"{recordings[0].name}: {len(windows.start)} windows for {moves.sum()} parameters; record more"
+        )
+    with jax.enable_x64(True):
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
+        theta, unravel = ravel_parameters(field)
+        spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
+        problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
+        changes, converged = jnp.zeros_like(spread), False
+        for _ in range(rounds):
+            theta, changes, converged = _fit(field, theta, changes, problem, layout, max_steps, moves)
+            errors = {name: np.asarray(size) for name, size in rms(field, theta, changes, problem, layout).items()}
+            variance = normal_equations(field, theta, changes, problem, layout)[3]
+            size = jnp.sqrt(jnp.mean((changes**2 + variance)[:, TANGENT:], axis=0))
+            spread = spread.at[:, TANGENT:].set(jnp.where(spread[:, TANGENT:] > 0, size, 0.0))
+            scale = {name: jnp.maximum(errors[name], 1e-9) for name in columns}
+            problem = problem._replace(scale=scale, spread=spread)
+        equations = normal_equations(field, theta, changes, problem, layout)[0]
+        cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(windows.start) // FEWEST_CLUSTERS))
+        covariance = _covariance(equations, cluster, moves, known)
+        degrees = max(1, -(-len(windows.start) // cluster) - 1)
+        found = unravel(theta)
+        intervals = uncertainty.intervals(found, covariance, level, degrees)
+        shares = _explained(field, theta, changes, problem, layout) if "rates" in columns else np.ones(3)
+        intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
+    span = layout.dt * layout.steps * len(windows.start)
+    return Identified(found, intervals, errors, len(windows.start), span, converged, np.asarray(covariance), shares)
+
+
+def identify_in_turn(
+    field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None
+) -> Identified:
+    """First what makes the thrust, from the accelerometer; then, given that, what turns the vehicle, from the gyro.
+
+    An error of the torques, such as the delay of a filtered gyro, then cannot bend the thrust curve and the lag.
+    Windows of forces are `FORCE_STEPS` times as long. The result has the intervals of both; the second ones hold the
+    uncertainty of the first. For arguments and errors see `identify`.
+    """
+    layout = Layout() if layout is None else layout
+    theta = {*_names(field)}
+    force, torque = tuple(theta & OF_FORCE), tuple(theta - OF_FORCE)
+    signals = [each.signals.keys() for each in recordings]
+    if not force or not torque or not all({"specific_force", "rates"} <= each for each in signals):
+        return identify(field, recordings, layout)
+    long = replace(layout, steps=layout.steps * FORCE_STEPS, most=max(layout.most // 2, 1), disturbance=(0.0,) * 6)
+    first = identify(field, recordings, long, ("specific_force",), free=force)
+    second = identify(first.field, recordings, layout, ("rates",), free=torque, known=first.covariance)
+    own = {name: value for name, value in first.intervals.items() if name.partition("[")[0] in force}
+    return second._replace(
+        intervals=second.intervals | own,
+        errors=first.errors | second.errors,
+        converged=first.converged & second.converged,
+    )
+
+
+def prediction_errors(
+    field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None, measured=()
+) -> dict[str, Float[np.ndarray, "n t k"]]:
+    """y − ŷ of every window, predicted from the state that the samples before it tell; NaN where there is no y."""
+    layout = Layout() if layout is None else layout
+    told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
+    windows, inputs, columns = cut(recordings, layout, told, measured)
+    with jax.enable_x64(True):
+        field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
+        problem = Problem(windows, inputs, columns, {name: jnp.ones(1) for name in columns}, jnp.zeros(()))
+        zero = jnp.zeros((len(windows.start), TANGENT + 6))
+        found = all_errors(field, ravel_parameters(field)[0], zero, problem, layout)
+    return {name: np.where(windows.there[name][..., None], np.asarray(part), np.nan) for name, part in found.items()}
+
+
+def _explained(field, theta, changes, problem: Problem, layout: Layout) -> np.ndarray:
+    """R² of each body rate over a window, of what is neither its start nor a constant acceleration."""
+    there = problem.windows.there["rates"][..., None]
+    error = np.asarray(all_errors(field, theta, changes, problem, layout)["rates"])
+    basis, _ = np.linalg.qr(np.arange(layout.steps)[:, None] ** np.arange(2.0))
+    both = error, np.where(there, problem.windows.y["rates"], 0.0)
+    parts = [((part - basis @ (basis.T @ part)) ** 2).sum(axis=(0, 1)) for part in both]
+    shares = np.ones(3)
+    shares[list(problem.columns["rates"])] = 1 - parts[0] / np.maximum(parts[1], 1e-300)
+    return np.clip(shares, 0.0, 1.0)
+
+
+def _widened(name: str, interval: Interval, shares) -> Interval:
+    """An interval that holds both regressions, of torque on acceleration and the other way round.
+
+    Noise in the one that explains shrinks a coefficient, to R² of the other at most (Frisch 1934; Klepper and Leamer
+    1984). Which of the two is right a log does not say, as commands follow from what was measured.
+    """
+    axis = AXES_OF.get(name)
+    if axis is None:
+        return interval
+    value, low, high = (float(each) for each in interval)
+    share = float(shares[axis])
+    return Interval(*map(jnp.asarray, (value, low * share, high / share if share > 0 else np.inf)))
+
+
+def _first_scale(windows: Windows, name: str) -> Array:
+    """The spread of each channel in time, before anything is fitted."""
+    if name == "attitude":
+        return jnp.full(3, 0.1)
+    spread = np.nanstd(np.where(windows.there[name][..., None], windows.y[name], np.nan), axis=(0, 1))
+    return jnp.asarray(np.maximum(spread, 1e-9))
+
+
+def _fit(field, theta, changes, problem: Problem, layout: Layout, max_steps: int, moves):
+    """Levenberg–Marquardt with the damping relative to the diagonal (Marquardt 1963)."""
+    damping, at = 1e-3, normal_equations(field, theta, changes, problem, layout)
+    for _ in range(max_steps):
+        equations, offset, slope, _ = at
+        gram, score = np.asarray(equations.gram.sum(axis=0)), np.asarray(equations.score.sum(axis=0))
+        seen = (np.diagonal(gram) > NO_EFFECT**2) & moves
+        size = np.where(seen, np.sqrt(np.maximum(np.diagonal(gram), 1e-300)), 1.0)
+        scaled = np.where(seen[:, None] & seen, gram / np.outer(size, size), 0.0) + np.diag(
+            np.where(seen, damping, 1.0)
+        )
+        step = -np.linalg.solve(scaled, np.where(seen, score / size, 0.0)) / size
+        tried = jnp.asarray(np.asarray(theta) + step), changes - offset - jnp.einsum("nsp,p->ns", slope, step)
+        new = normal_equations(field, *tried, problem, layout)
+        total, before = float(new[0].square.sum()), float(equations.square.sum())
+        if not total < before:
+            damping *= 10
+            if damping > 1e6:
+                return theta, changes, True
+            continue
+        (theta, changes), at, damping = tried, new, max(damping / 10, 1e-9)
+        if before - total < 1e-5 * before:
+            return theta, changes, True
+    return theta, changes, False
+
+
+def _names(field) -> list[str]:
+    physics = physics_of(field)
+    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
+    return [jax.tree_util.keystr(path[-1:], simple=True) for path, _ in leaves]
+
+
+def _free(field, names: Sequence[str] | None) -> np.ndarray:
+    """Which numbers of θ belong to the named parameters; ValueError for a name that the field does not learn."""
+    physics = physics_of(field)
+    leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
+    own = _names(field)
+    for name in names or ():
+        if name.partition("[")[0] not in own:
+            raise ValueError(f"free must be of {', '.join(own)}, got {name!r}")
+    parts = []
+    for name, (_, leaf) in zip(own, leaves, strict=True):
+        single = {i for i in range(leaf.size) if names is not None and f"{name}[{i}]" in names}
+        parts.append([names is None or name in names or i in single for i in range(leaf.size)])
+    return np.concatenate(parts).astype(bool)
+
+
+def _covariance(equations: NormalEquations, cluster: int, moves, known) -> Array:
+    """The sandwich of `uncertainty`, with windows clustered; infinite for what has no effect.
+
+    To it comes what follows from the uncertainty of known parameters: S C Sᵀ with S = −H⁻¹ ∂g/∂known (delta method).
+    """
+    gram = np.asarray(equations.gram.sum(axis=0))
+    seen = (np.diagonal(gram) > NO_EFFECT**2) & moves
+    found = np.zeros_like(gram)
+    both = np.ix_(seen, seen)
+    masked = uncertainty.masked(equations, seen)
+    found[both] = np.asarray(uncertainty.sandwich(masked, int(seen.sum()), cluster))[both]
+    if known is not None:
+        fixed = ~moves & np.isfinite(np.diagonal(known))
+        slope = np.linalg.lstsq(gram[both], gram[np.ix_(seen, fixed)], rcond=1e-12)[0]
+        found[both] += slope @ known[np.ix_(fixed, fixed)] @ slope.T
+        found += np.where(moves[:, None] | moves, 0.0, known)
+    return jnp.asarray(found + np.diag(np.where(~seen & moves, np.inf, 0.0)))

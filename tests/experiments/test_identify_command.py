@@ -1,0 +1,77 @@
+"""The command that identifies a vehicle: bad input ends in one line, a small log in a report and a model."""
+
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from experiments.identify.__main__ import main
+from hybrid_jax.vehicle import IRIS
+
+VEHICLE = f"""
+learn = ["k", "time_constant"]
+[vehicle]
+mass = {IRIS.mass}
+inertia = {list(IRIS.inertia)}
+thrust_coefficient = {IRIS.thrust_coefficient}
+torque_coefficient = {IRIS.torque_coefficient}
+rotor_positions = {[list(each) for each in IRIS.rotor_positions]}
+spin = {list(IRIS.spin)}
+max_rotor_speed = 1100.0
+[actuator]
+curve = [100.0, 900.0]
+time_constants = 0.05
+"""
+COLUMNS = """
+frames = { world = "ENU", body = "FLU", velocity = "world" }
+time = { columns = ["t"], unit = "s" }
+specific_force = { columns = ["ax", "ay", "az"], unit = "m/s²" }
+motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
+"""
+
+
+@pytest.fixture
+def files(tmp_path):
+    """A rig that shakes its thrust: k is a tenth more than nominal, the lag 0.08 s."""
+    rng, dt = np.random.default_rng(0), 0.01
+    t = dt * np.arange(1600)
+    c = np.repeat(rng.uniform(0.45, 0.75, 100), 16)
+    w = np.empty_like(c)
+    speed = 100 + 900 * c[0]
+    for i, told in enumerate(c):
+        w[i] = speed
+        speed += (100 + 900 * told - speed) * (1 - np.exp(-dt / 0.08))
+    force = 4 * 1.1 * IRIS.thrust_coefficient * w**2 / IRIS.mass + rng.normal(0, 0.1, len(t))
+    table = np.column_stack([t, rng.normal(0, 0.1, (len(t), 2)), force, *[c] * 4])
+    for name in ("one", "two"):
+        path = tmp_path / "logs" / f"{name}.csv"
+        path.parent.mkdir(exist_ok=True)
+        np.savetxt(path, table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
+    (tmp_path / "vehicle.toml").write_text(VEHICLE)
+    (tmp_path / "columns.toml").write_text(COLUMNS)
+    options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "out": "out", "cache": "cache"}
+    return tmp_path, [str(tmp_path / "logs"), *(f"--{key}={tmp_path / value}" for key, value in options.items())]
+
+
+def test_a_folder_of_commands_becomes_a_report_and_a_model(files):
+    folder, arguments = files
+    test, model = folder / "logs" / "two.csv", folder / "model.npz"
+    main([*arguments, "--dt", "0.01", "--steps", "40", "--windows", "20", "--test", str(test), "--model", str(model)])
+    theta = hj.load(model).field.theta()
+    np.testing.assert_allclose(theta["k"], 1.1 * IRIS.thrust_coefficient, rtol=0.01)
+    np.testing.assert_allclose(theta["time_constant"], 0.08, rtol=0.05)
+    page = (folder / "out" / "report.md").read_text()
+    assert "time_constant" in page
+    assert "two.csv" in page
+    assert (folder / "out" / "errors.png").stat().st_size > 0
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [(["--learn", "gain"], "'gain'"), (["--measured", "speed"], "--measured must be of"), (["--steps", "0"], "steps")],
+)
+def test_bad_options_end_in_one_line(files, capsys, more, said):
+    with pytest.raises(SystemExit) as stop:
+        main([*files[1], *more])
+    assert stop.value.code == 2
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert said in lines[-1]
