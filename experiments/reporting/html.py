@@ -6,14 +6,11 @@ import json
 import re
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
 
+from experiments.reporting.contents import Report
 from experiments.reporting.results import leaves
 from experiments.reporting.tables import Table, best_cells, number_in
 from hybrid_jax.io.files import json_text
-
-if TYPE_CHECKING:
-    from experiments.reporting.report import Report
 
 LARGEST_SVG = 1_000_000  # bytes; a larger drawing is shown as its PNG
 TYPES = {".svg": "image/svg+xml", ".png": "image/png"}
@@ -56,7 +53,7 @@ document.addEventListener("keydown", event => {
 """
 
 
-def document(report: "Report", out: Path) -> str:
+def document(report: Report, out: Path) -> str:
     """The page; figures are read from `out`, and shown as an SVG where there is one."""
     title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
     name = html.escape(title.lstrip("# "))

@@ -1,7 +1,5 @@
 """What an experiment leaves in its folder, report.html, report.md, report.json and rows.csv, and in a terminal."""
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -9,44 +7,14 @@ from rich.console import Console
 from rich.text import Text
 
 from experiments.reporting import claims, html, latex
-from experiments.reporting.claims import Verdict
-from experiments.reporting.results import Results, leaves
+from experiments.reporting.contents import Report
+from experiments.reporting.results import leaves
 from experiments.reporting.tables import Table, markdown, plain, print_tables
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
 FORMAT = 2  # of report.json; 1 had no key "format", and rows of some experiments without all their tags
 JSON_NAME, CSV_NAME, PAGE_NAME, HTML_NAME = "report.json", "rows.csv", "report.md", "report.html"
 PAPER = "paper"  # the subfolder of LaTeX tables
-MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
-
-
-@dataclass(frozen=True)
-class Report:
-    experiment: str
-    config: Mapping[str, Any]
-    environment: Mapping[str, Any]
-    rows: Results
-    claims: Sequence[Verdict] = ()
-    figures: Mapping[str, str] = field(default_factory=dict)  # path relative to the report → caption
-    notes: Sequence[str] = ()  # sentences for the end of the page
-    extra: Mapping[str, Any] = field(default_factory=dict)  # further keys of report.json
-    head: str = ""  # title and introduction of the page, Markdown
-    tables: Sequence[Table] = ()  # of the page and the terminal
-    more_rows: Results = field(default_factory=Results)  # of rows.csv; report.json holds them in `extra`
-    conclusion: Sequence[str] = ()  # sentences before that on hypotheses
-    warnings: Sequence[str] = ()  # what a reader must know before any number
-
-    @property
-    def meaningless(self) -> bool:
-        return self.config.get("preset") == "smoke"
-
-    def conclusions(self) -> list[str]:
-        """What the page begins with."""
-        return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
-
-    def shown(self) -> list[Table]:
-        """The tables of the page; numbers that mean nothing have no verdicts."""
-        return [table for table in self.tables if not (self.meaningless and table.verdicts)]
 
 
 def write_report(out: str | Path, report: Report, console: Console | None = None, paper: bool = False) -> None:

@@ -10,7 +10,8 @@ from rich.cells import cell_len
 from rich.console import Console
 from smoke import ROOT
 
-from experiments.reporting.report import MEANINGLESS, write_report
+from experiments.reporting.contents import MEANINGLESS
+from experiments.reporting.report import write_report
 from experiments.reporting.tables import Table, columns_of_parts, print_tables
 from experiments.runner.progress import Line
 
