@@ -30,3 +30,8 @@ class SmoothRelu:
 
     def __call__(self, z: Float[Array, " h *b"]) -> Float[Array, " h *b"]:
         return (z + jnp.sqrt(jnp.square(z) + self.beta**-2)) / 2
+
+
+def function_of(activation: str | SmoothRelu) -> Activation:
+    """The activation of a network, which holds its name: a function could not be sent to another process."""
+    return ACTIVATIONS[activation] if isinstance(activation, str) else activation

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns
 from hybrid_jax.dynamics.batching import RunningStats, expand_trailing
-from hybrid_jax.networks.activations import ACTIVATIONS, Activation, SmoothRelu
+from hybrid_jax.networks.activations import ACTIVATIONS, SmoothRelu, function_of
 from hybrid_jax.networks.normalisation import (
     UNROLLED_INPUTS,
     AbstractAffineNorm,
@@ -41,11 +41,11 @@ class FusedNetwork(AbstractVectorField):
     bias: Float[Array, " h+d"]  # [c; b]
     weight_out: Float[Array, "h d"]  # W₂ᵀ
     scaling: AbstractScaling
-    activation: Activation = eqx.field(static=True, default=jax.nn.relu)
+    activation: str | SmoothRelu = eqx.field(static=True, default="relu")
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         hidden, linear = self.layer(self.scaling.concatenate(x, u))
-        return (self.activation(hidden).T @ self.weight_out).T + linear
+        return (function_of(self.activation)(hidden).T @ self.weight_out).T + linear
 
     def layer(self, z: Float[Array, " m *b"]) -> tuple[Float[Array, " h *b"], Float[Array, " d *b"]]:
         """W₁ z + c and A z + b."""
@@ -58,7 +58,7 @@ class FusedNetwork(AbstractVectorField):
         z, dz = jvp_columns(self.scaling.concatenate, (x, u), (dx, du))
         hidden, linear = self.layer(z)
         weight, skip = self.weight_in[:, : len(hidden)], self.weight_in[:, len(hidden) :]
-        active, slope = jax.jvp(self.activation, (hidden,), (jnp.ones_like(hidden),))
+        active, slope = jax.jvp(function_of(self.activation), (hidden,), (jnp.ones_like(hidden),))
         jacobian = (slope * self.weight_out.T) @ weight.T + skip.T
         return active @ self.weight_out + linear, jacobian @ dz
 
@@ -76,7 +76,7 @@ class ResidualNetwork(AbstractVectorField):
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
-    activation: Activation = eqx.field(static=True, default=jax.nn.relu)  # σ
+    activation: str | SmoothRelu = eqx.field(static=True, default="relu")  # σ
 
     # d and m, where the network is a field by itself.
     state_size = property(lambda self: len(self.bias_out))
@@ -87,7 +87,7 @@ class ResidualNetwork(AbstractVectorField):
 
     def activations(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
         """The hidden units in inference mode, in which the output layer is linear."""
-        return self.activation(self.norm.infer(self.weight_in, self.inputs(x, u)))
+        return function_of(self.activation)(self.norm.infer(self.weight_in, self.inputs(x, u)))
 
     def inputs(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:
         """z = [x, scaled u]."""
@@ -95,7 +95,7 @@ class ResidualNetwork(AbstractVectorField):
 
     def train_batch(self, x, u):
         layers = self.weight_in, self.weight_out, self.bias_out
-        y = self.norm.train_layers(self.activation, *layers, self.inputs(x, u))
+        y = self.norm.train_layers(function_of(self.activation), *layers, self.inputs(x, u))
         return self.scaling.outputs(y)
 
     def update_running_stats(self, x, u):
@@ -190,7 +190,7 @@ def residual_network(
         weight_out=_uniform(key_out, (outputs, hidden), hidden),
         bias_out=_uniform(key_bias, (outputs,), hidden),
         scaling=ChannelScaling() if scaling is None else scaling,
-        activation=ACTIVATIONS[activation],
+        activation=activation,
     )
 
 
@@ -242,7 +242,7 @@ def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
 
     def changed(node):
         if is_network(node):
-            return replace(node, activation=smooth) if node.activation is jax.nn.relu else node
+            return replace(node, activation=smooth) if node.activation == "relu" else node
         return smooth if node is jax.nn.relu else node
 
     return jax.tree.map(changed, field, is_leaf=is_network)

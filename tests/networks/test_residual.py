@@ -1,5 +1,6 @@
 """Laws of the network f_d and its normalisations."""
 
+import pickle
 from functools import partial
 
 import equinox as eqx
@@ -56,6 +57,12 @@ PLAIN = {
     "tanh": jnp.tanh,
     "silu": lambda h: h / (1 + jnp.exp(-h)),
 }
+
+
+def test_a_network_can_be_sent_to_another_process():
+    sent = pickle.loads(pickle.dumps(jax.device_get(network(activation="softplus"))))
+    x, u = batch()
+    np.testing.assert_array_equal(sent(x, u), network(activation="softplus")(x, u))
 
 
 @pytest.mark.parametrize("activation", PLAIN)
