@@ -136,7 +136,6 @@ def run(config: Config) -> None:
         head=f"# What {', '.join(Path(log.name).name for log in logs)} tell of the vehicle",
     )
     write_report(config.out, report, console)
-    console.print(f"report: {config.out / 'report.md'}", highlight=False)
 
 
 main = partial(command.call, NAME, Config, run)
