@@ -37,7 +37,7 @@ FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many 
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "k", "k_rotors", "drag"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
-NO_EFFECT = 0.1  # a parameter that moves all errors by less, in their standard deviations, per unit is not seen
+NO_EFFECT = 1.0  # information of a parameter that is not told: its standard error is its own size, or a factor of e
 
 
 class Identified(NamedTuple):
@@ -196,7 +196,7 @@ def _fit(field, theta, changes, problem: Problem, layout: Layout, max_steps: int
     for _ in range(max_steps):
         equations, offset, slope, _ = at
         gram, score = np.asarray(equations.gram.sum(axis=0)), np.asarray(equations.score.sum(axis=0))
-        seen = (np.diagonal(gram) > NO_EFFECT**2) & moves
+        seen = (np.diagonal(gram) > NO_EFFECT) & moves
         size = np.where(seen, np.sqrt(np.maximum(np.diagonal(gram), 1e-300)), 1.0)
         scaled = np.where(seen[:, None] & seen, gram / np.outer(size, size), 0.0) + np.diag(
             np.where(seen, damping, 1.0)
@@ -243,7 +243,7 @@ def _covariance(equations: NormalEquations, cluster: int, moves, known) -> Array
     To it comes what follows from the uncertainty of known parameters: S C Sᵀ with S = −H⁻¹ ∂g/∂known (delta method).
     """
     gram = np.asarray(equations.gram.sum(axis=0))
-    seen = (np.diagonal(gram) > NO_EFFECT**2) & moves
+    seen = (np.diagonal(gram) > NO_EFFECT) & moves
     found = np.zeros_like(gram)
     both = np.ix_(seen, seen)
     masked = uncertainty.masked(equations, seen)

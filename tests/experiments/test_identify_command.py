@@ -30,8 +30,9 @@ motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
 
 
 @pytest.fixture
-def files(tmp_path):
+def files(tmp_path, monkeypatch):
     """A rig that shakes its thrust: k is a tenth more than nominal, the lag 0.08 s."""
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda cache: None)  # JAX has begun in this process
     rng, dt = np.random.default_rng(0), 0.01
     t = dt * np.arange(1600)
     c = np.repeat(rng.uniform(0.45, 0.75, 100), 16)
