@@ -40,7 +40,7 @@ from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.training.fitting import make_run_config, start
-progress.FIRST = 0.0
+progress.SECOND = 0.0
 states = stack([start(pendulum(length, DAMPING), jax.random.key(i)) for i, length in enumerate((0.8, 0.7, 0.6))])
 plans = stack([make_run_config(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) for rate, epochs in
                ((0.03, 6000), (0.01, 4000), (0.02, 5000))])
@@ -153,7 +153,7 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     folder = tmp_path / "killed"
     folder.mkdir()
     both = pair(programs, folder)
-    assert any("runs active" in line for line in both[0].stderr)
+    assert any("3 runs, epoch" in line for line in both[0].stderr)
     killed, other = both[victim], both[1 - victim]
     killed.send_signal(signal.SIGKILL)
     since = time.monotonic()
