@@ -6,7 +6,7 @@ import numpy as np
 
 import hybrid_jax
 from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.logs import csv_of
+from experiments.real_flight.simulated import csv_of
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.integrate import rollout_batch

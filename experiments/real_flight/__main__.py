@@ -10,10 +10,12 @@ from rich.console import Console
 
 from experiments.real_flight import logs
 from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
+from experiments.real_flight.log_tables import failed_checks
 from experiments.real_flight.logs import LogSet
 from experiments.real_flight.models import thrust_baseline
-from experiments.real_flight.report import failed_checks, write_report
+from experiments.real_flight.report import write_report
 from experiments.real_flight.scoring import INTERVAL_STEPS, relative_error
+from experiments.real_flight.simulated import write_logs
 from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment
 from experiments.runner import command
@@ -69,7 +71,7 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
     path, named = config.vehicle, {name: getattr(config, name) for name in ("source", "target", "test")}
     folders = {name: folder for name, folder in named.items() if folder is not None}
     if config.simulated:
-        path, folders = logs.write_logs(config.out / NAME / "logs", config.data_seed)
+        path, folders = write_logs(config.out / NAME / "logs", config.data_seed)
     if path is None or "source" not in folders:
         raise ValueError("--vehicle FILE and --source FOLDER are needed, or --simulated; see --help")
     before, after, chooses_lag, not_learned = load_vehicle_models(path, config)

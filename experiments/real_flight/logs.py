@@ -1,14 +1,10 @@
 """Folders of logs: read or simulated, checked against the vehicle, cleaned, recorded, and assigned to folds."""
 
-import gzip
-import io
-import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-import jax
 import numpy as np
 from jaxtyping import Int
 
@@ -19,18 +15,13 @@ from hybrid_jax.extrapolation import Motion, motion
 from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.consistency import FAILS, Check, check_log
 from hybrid_jax.flights.loading import asked_interval, read_folder
-from hybrid_jax.flights.log import COLUMNS, FlightLog, gaps, repeats, segments
+from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.suitability import check_recording, failures
 from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.io.archive import digest
-from hybrid_jax.io.files import write_atomic
-from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.flight import DT, fly, gone_wrong
 from hybrid_jax.trajectories import Trajectories
-from hybrid_jax.vehicle import IRIS, Vehicle
+from hybrid_jax.vehicle import Vehicle
 
-FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}  # of --simulated: domains, numbers of flights
-SECONDS = 8.0
 MEND = "nothing was trained; mend the logs as the lines above say, or go on with --anyway"
 FOLDS, VALIDATION_SHARE = 3, 0.2
 LEFT_OUT = 5  # most parts of a fold's flights that are left out of training in turn, which bounds the cost
@@ -142,33 +133,6 @@ def _record(
         "fails": sum(check.verdict == FAILS for check in checks),
         "checks": [asdict(check) for check in checks],
     }
-
-
-def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
-    """Simulate flights before and after a change of the inertia; return the vehicle file, and the folders by name."""
-    vehicle = folder / "vehicle.toml"
-    write_atomic(vehicle, vehicle_toml(IRIS))
-    for name, (domain, count) in FLIGHTS.items():
-        # Flights that fail are left out, so more are simulated; a chunk of them is simulated in any case.
-        found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
-        times = DT * np.arange(found.states.shape[1])
-        held = [*range(len(times) - 1), -1]  # a sample holds the inputs of the interval after it; the last are repeated
-        for index, i in enumerate(np.flatnonzero(~gone_wrong(found.states))[:count]):
-            content = csv_of(times, np.asarray(found.states[i]), np.asarray(found.inputs[i])[held])
-            write_atomic(folder / name / f"flight_{index:02d}.csv.gz", content)
-    return vehicle, {name: folder / name for name in FLIGHTS}
-
-
-def vehicle_toml(vehicle: Vehicle) -> str:
-    """The text of a vehicle file; the numbers, names and lists of JSON are those of TOML as well."""
-    return "[vehicle]\n" + "".join(f"{name} = {json.dumps(value)}\n" for name, value in asdict(vehicle).items())
-
-
-def csv_of(t: np.ndarray, x: np.ndarray, u: np.ndarray) -> bytes:
-    """A log as CSV in gzip; the same numbers give the same bytes."""
-    text = io.StringIO()
-    np.savetxt(text, np.column_stack([t, x, u]), "%.9g", ",", header=",".join(COLUMNS), comments="")
-    return gzip.compress(text.getvalue().encode(), mtime=0)
 
 
 @dataclass(frozen=True)

@@ -13,6 +13,7 @@ from rich.console import Console
 import hybrid_jax
 from experiments.real_flight import scoring
 from experiments.real_flight.figures import make_figures
+from experiments.real_flight.log_tables import log_tables
 from experiments.real_flight.logs import Fold, motion_of_logs
 from experiments.real_flight.models import RECIPES
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, pooled, score_labels
@@ -28,7 +29,6 @@ from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_ta
 from experiments.runner.run_record import environment
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.extrapolation import WARN, shares_outside
-from hybrid_jax.flights.consistency import FAILS, WARNS
 from hybrid_jax.flights.windows import flight_of
 
 NOTES = (
@@ -36,18 +36,6 @@ NOTES = (
     "An interval of θ_p takes the network as given and comes from windows of 10 steps that share no sample; it does "
     "not account for errors of the model.",
 )
-VERDICTS = {"ok": "ok", "warns": "warns", "fails": "FAILS", "cannot tell": "?"}
-CHECKED = "Checks: of each log as recorded, then of the cleaned flight (? cannot tell; the value is beside the verdict)"
-SHORT = {
-    "repeated samples": "repeats",
-    "dp/dt against v": "dp/dt, v",
-    "q̇ against ω": "q̇, ω",
-    "v̇ against thrust along body z": "v̇, thrust",
-    "specific force over thrust per mass": "force / thrust",
-    "motor order against roll and pitch": "motor order",
-    "spin against yaw": "spin",
-    "lag of the gyro behind the motors": "gyro lag",
-}
 
 
 def write_report(name: str, experiment: Experiment, outputs: Outputs, console: Console) -> None:
@@ -259,29 +247,6 @@ def choice_table(selections: Sequence[Selection]) -> Table:
     return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines, labels=3)
 
 
-def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
-    """Make tables of the logs: length, gaps, changes, every check, and what would repair the failed ones."""
-    lines, verdicts = [], []
-    for record in records:
-        name = f"{record['folder']}/{record['flight']}"
-        counts = (str(record[key]) for key in ("gaps", "repeated_samples", "used_samples"))
-        length = (str(record["samples"]), f"{record['seconds']:.1f}", f"{record['dt']:g}")
-        lines.append((name, *length, *counts, "; ".join(record["done"]) or "none"))
-        verdicts.append((name, *(f"{VERDICTS[c['verdict']]} {_value(c)}".strip() for c in record["checks"])))
-    failed = [(flight, c["name"], _value(c), c["suggestion"]) for flight, c in failed_checks(records)]
-    header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
-    names = [str(SHORT.get(check["name"], check["name"])) for check in records[0]["checks"]]
-    tables = [Table("Logs", header, lines), Table(CHECKED, ("flight", *names), verdicts)]
-    advice = Table("Checks that failed or warn, and what to do", ("flight", "check", "value", "suggestion"), failed)
-    return [*([advice] if failed else []), *tables]
-
-
-def failed_checks(records: Sequence[Mapping[str, Any]]) -> list[tuple[str, Mapping[str, Any]]]:
-    """The checks that failed or warn, each with its flight."""
-    named = [(f"{record['folder']}/{record['flight']}", check) for record in records for check in record["checks"]]
-    return [(flight, check) for flight, check in named if check["verdict"] in (FAILS, WARNS)]
-
-
 def _errors(label: str) -> dict[str, Callable[[Results], str]]:
 
     def text(quantity: str, rows: Results) -> str:
@@ -301,7 +266,3 @@ def _parameter(rows: Results, name: str) -> str:
     text += f" [{known[:, 0].mean():.3g}, {known[:, 1].mean():.3g}]" if len(known) else ""
     folds, all_folds = (len(group.unique("fold")) for group in (having, rows))
     return text if folds == all_folds else f"{text} ({folds} of {all_folds} folds)"
-
-
-def _value(check: Mapping[str, Any]) -> str:
-    return f"{check['value']:.2g}{' ms' * (check['unit'] == 'ms')}" if math.isfinite(check["value"]) else ""

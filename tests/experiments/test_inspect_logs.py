@@ -10,7 +10,7 @@ from scipy.signal import lfilter
 from experiments.inspect_logs.__main__ import main
 from experiments.inspect_logs.estimates import estimate
 from experiments.inspect_logs.vehicle import vehicle_text
-from experiments.real_flight.logs import vehicle_toml
+from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.vehicle import IRIS, load_vehicle
 

@@ -12,8 +12,9 @@ from smoke import command, experiments, refused, script
 
 from experiments.real_flight.__main__ import LISTS, load_vehicle_models, main, prepare
 from experiments.real_flight.config import PRESETS, Cleaning, RealFlightConfig
-from experiments.real_flight.logs import clean, load_logs, make_folds, require_distinct, vehicle_toml
+from experiments.real_flight.logs import clean, load_logs, make_folds, require_distinct
 from experiments.real_flight.scoring import QUANTITIES
+from experiments.real_flight.simulated import vehicle_toml
 from experiments.runner.command import FAILED_CHECKS, ChecksFailed, read, split_lists
 from hybrid_jax.dynamics.vehicle_file import LAG
 from hybrid_jax.flights.windows import cut_windows, require_common_interval
