@@ -83,6 +83,8 @@ def inspect(options: Options) -> None:
         raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
     vehicle = None if options.vehicle is None else load_vehicle(options.vehicle)
     folder = options.folder
+    if not folder.exists():
+        raise ValueError(f"{folder}: no such file or folder")
     paths, left = find_logs(folder) if folder.is_dir() else ([folder], {})
     if not paths:
         raise ValueError(f"{folder}: holds no logs, only {', '.join(path.name for path in left) or 'nothing'}")

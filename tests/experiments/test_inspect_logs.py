@@ -72,6 +72,13 @@ def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
         assert "PLACEHOLDER" in line
 
 
+def test_a_folder_that_is_not_there_ends_in_one_line(tmp_path, capsys):
+    with pytest.raises(SystemExit) as stop:
+        main([str(tmp_path / "none"), "--out", str(tmp_path)])
+    assert stop.value.code == 2
+    assert capsys.readouterr().err == f"inspect_logs: {tmp_path / 'none'}: no such file or folder\n"
+
+
 def test_a_folder_is_described_whatever_is_in_it(tmp_path, capsys):
     folder = write(tmp_path / "flights", LOGS[:2])
     (folder / "broken.csv").write_text("t,px\n0,0\n")
