@@ -10,7 +10,7 @@ from rich.console import Console
 from experiments.external_force import sine_floor
 from experiments.paper.claims import COMPARISON
 from experiments.paper.conditions import augmentation, settings
-from experiments.paper.config import QUICK, SMOKE, Config, Encoding, Stopping, preset_like
+from experiments.paper.config import QUICK, SMOKE, TABLE_SIZES, Config, Encoding, Stopping, preset_like
 from experiments.paper.figures import ranking
 from experiments.paper.lanes import Fit, fit_of, rows_of, save_models, source_of
 from experiments.paper.methods import PAST, Case, Method, adapted, source_only
@@ -46,11 +46,15 @@ class ComparisonConfig(Config):
 
     sizes: tuple[int, ...] = (100,)
     """N, target trajectories to adapt to; rates and patience are those of the nearest size in the paper's table."""
-    pool: int | None = 1000
-    """Target trajectories from which a seed draws its N."""
     methods: tuple[Method, ...] = get_args(Method)
     """Which methods to compare."""
     encoding: Encoding = field(default_factory=Encoding)
+
+    def pooled(self) -> int:
+        """By default those of the experiments' largest N, so that a seed draws the same N as there."""
+        if self.draw == "random" and self.pool is None:
+            return max(*TABLE_SIZES, *self.sizes)
+        return Config.pooled(self)
 
     def __post_init__(self):
         Config.__post_init__(self)
