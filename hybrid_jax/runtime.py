@@ -26,6 +26,7 @@ if version("jaxlib").split(".")[:2] == ["0", "10"]:
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
 # level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
+_kept: list[Path] = []  # the folder that `configure` was given last
 
 
 def configure(cache: Path) -> None:
@@ -54,6 +55,19 @@ def configure(cache: Path) -> None:
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
     # A GPU's default rounds the factors of a product to 10 bits, an error of 0.6 % in a gradient. No effect on a CPU.
     jax.config.update("jax_default_matmul_precision", "float32")
+    _kept[:] = [programs]
+
+
+def kept_programs() -> Path | None:
+    """The folder in which compiled programs are kept (see programs.py); None before `configure`."""
+    return _kept[0] if _kept else None
+
+
+def machine() -> tuple[str, ...]:
+    """What a compiled program is bound to: XLA's options, the devices, and the instructions of the processor."""
+    lines = CPUS.read_text().splitlines() if CPUS.exists() else []
+    flags = next((line for line in lines if line.startswith(("flags", "Features"))), platform.processor())
+    return os.environ.get(FLAGS, ""), str(jax.devices()), platform.machine(), flags
 
 
 def cores() -> int:

@@ -28,6 +28,7 @@ from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
@@ -195,7 +196,7 @@ def adapt(
     choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
     exact = exact and int(solution.status) != DIVERGED and choice.get("chosen") not in NETWORKS
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
-    found, mse = disturbance_of(adapted), eqx.filter_jit(partial(rollout_mse, solver=compact(settings.solver)))
+    found, mse = disturbance_of(adapted), partial(_mse, solver=compact(settings.solver))
     return Adaptation(
         field=adapted,
         method=name,
@@ -210,6 +211,9 @@ def adapt(
         **choice,
         **_parameters(adapted, train, settings, level, exact, free),
     )
+
+
+_mse = kept_jit(rollout_mse)
 
 
 def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.corrected_body import corrected
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
@@ -100,8 +100,7 @@ class Auto:
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
 
-# Equinox passes the options to jax.jit, but does not declare them.
-_compiled = eqx.filter_jit(Auto._solution, compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+_compiled = kept_jit(Auto._solution, compiler_options=FAST_COMPILE)
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:

@@ -19,6 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
@@ -84,7 +85,7 @@ def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
     return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
 
 
-@eqx.filter_jit
+@kept_jit
 def fit_free(
     field: AbstractVectorField,
     windows: Trajectories,

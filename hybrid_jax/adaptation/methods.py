@@ -4,7 +4,6 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,6 +15,7 @@ from hybrid_jax.adaptation.least_squares import Scale, check_determined, fit_lea
 from hybrid_jax.adaptation.uncertainty import select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, CAPPED, DIVERGED, STOPPED, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings
@@ -109,10 +109,14 @@ class FineTune:
         config = make_run_config(rates, jnp.arange(n), n, *rule)
         settings = replace(settings, batch_size=min(settings.batch_size, n))
         data, held_out = (settings.objective.prepare(windows, "windows") for windows in (train, validation))
-        optimiser = held_at_start(self.l2_sp) if self.l2_sp else ADAM
-        state = start(marked, jax.random.key(self.seed), optimiser)
-        state, _ = eqx.filter_jit(run)(state, config, data, held_out, settings, config.max_epochs, optimiser)
+        # The default is not an argument: an optimiser holds closures, with which a program is not kept.
+        optimiser: dict[str, Any] = {"optimiser": held_at_start(self.l2_sp)} if self.l2_sp else {}
+        state = start(marked, jax.random.key(self.seed), **optimiser)
+        state, _ = _run(state, config, data, held_out, settings, config.max_epochs, **optimiser)
         return Solution(replace(state.best, **kept), state.epoch, state.status)
+
+
+_run, _fit_ridge = kept_jit(run), kept_jit(ridge.fit_ridge)
 
 
 @cache  # the same object for the same weight, so that its program is compiled once
@@ -133,8 +137,7 @@ class Ridge:
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        fit = eqx.filter_jit(ridge.fit_ridge)
-        return Solution(fit(self.update, field, train, validation, self.penalties, settings).field)
+        return Solution(_fit_ridge(self.update, field, train, validation, self.penalties, settings).field)
 
 
 @dataclass(frozen=True)

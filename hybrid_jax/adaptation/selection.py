@@ -9,7 +9,6 @@ good for 0.1 s can be bad after 1 s.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_free, ravel_p
 from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverse, masked, normal_equations
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 BLOCKS = 10
@@ -42,7 +42,7 @@ class Fits(NamedTuple):
     converged: Bool[Array, " c"]
 
 
-@eqx.filter_jit
+@kept_jit
 def fit_candidates(
     field: AbstractVectorField,
     windows: Trajectories,

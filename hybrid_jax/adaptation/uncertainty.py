@@ -27,6 +27,7 @@ from hybrid_jax.dynamics.disturbance import (
     without_disturbance,
 )
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
 
@@ -105,7 +106,7 @@ def covariance_of(
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
-@eqx.filter_jit
+@kept_jit
 def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
     gram, score, square = equations
     n = len(score)
@@ -126,7 +127,7 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
 
 
 # A program of its own: selecting a disturbance and the covariance share it.
-@eqx.filter_jit
+@kept_jit
 def normal_equations(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
 ) -> NormalEquations:
@@ -268,7 +269,7 @@ def select_disturbance(
     return _selection(fits, equations, windows.horizon)
 
 
-@eqx.filter_jit
+@kept_jit
 def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
     disturbed, plain = fits
     gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)

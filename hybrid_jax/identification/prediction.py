@@ -6,7 +6,6 @@ Each window's initial state and constant disturbance are eliminated from the equ
 from functools import partial
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +19,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT, difference, measure, moved
 from hybrid_jax.identification.measured import Inputs, Layout, Windows
 from hybrid_jax.integrate import RK4, integrate
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 CHUNK = 64  # windows at a time
@@ -72,7 +72,7 @@ def errors_of(field, theta, change, window: Windows, inputs: Inputs, columns, la
     return found
 
 
-@eqx.filter_jit
+@kept_jit
 def all_errors(field, theta, changes, problem: Problem, layout: Layout):
     def one(each):
         window, change = each
@@ -81,14 +81,14 @@ def all_errors(field, theta, changes, problem: Problem, layout: Layout):
     return jax.lax.map(one, (problem.windows, changes), batch_size=CHUNK)
 
 
-@eqx.filter_jit
+@kept_jit
 def rms(field, theta, changes, problem: Problem, layout: Layout) -> dict[str, Array]:
     found = all_errors(field, theta, changes, problem, layout)
     counts = {name: jnp.sum(there) for name, there in problem.windows.there.items()}
     return {name: jnp.sqrt(jnp.sum(part**2, axis=(0, 1)) / counts[name]) for name, part in found.items()}
 
 
-@eqx.filter_jit
+@kept_jit
 def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
     """The normal equations of θ with each initial state eliminated, and what gives its step: −(a + B Δθ); the cost."""
 

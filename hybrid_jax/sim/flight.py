@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.io.datasets import Dataset, versions
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
@@ -69,7 +70,7 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(jax.jit, static_argnames=("steps", "vehicle"), compiler_options=FASTEST_COMPILE)
+@partial(kept_jit, compiler_options=FASTEST_COMPILE)
 def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle) -> Flights:
     scale = pilot.scale_of(vehicle)
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int, PyTree
 
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.sweep import hosts
 
 Numbers = Sequence[Any] | np.ndarray
@@ -82,20 +83,9 @@ class LaneMap:
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width
         self._min_capacity = min_capacity
-        mesh, split, whole = Mesh(np.array(self.devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
-        self._split, self._whole = NamedSharding(mesh, split), NamedSharding(mesh, whole)
-
-        def run(static, lanes, chunks, shared):
-            width, leaves, structure = static
-
-            def share(lanes, chunks, shared):
-                lanes, shared = eqx.combine((lanes, shared), jax.tree.unflatten(structure, leaves))
-                return _loop(function, width, lanes, chunks[0], shared)
-
-            mapped = jax.shard_map(share, mesh=mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False)
-            return mapped(lanes, chunks, shared)
-
-        self._run = jax.jit(run, static_argnums=0, compiler_options=compiler)
+        mesh = Mesh(np.array(self.devices), (AXIS,))
+        self._split, self._whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
+        self._function, self._run = function, kept_jit(_on_mesh, compiler_options=compiler)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""
@@ -104,10 +94,9 @@ class LaneMap:
         chunks = np.array([-(-len(shard) // width) for shard in shards])
         own = [d for d, device in enumerate(self.devices) if device.process_index == jax.process_index()]
         arrays, rest = eqx.partition((lane(lanes, places[own].ravel()), shared), eqx.is_array)
-        leaves, structure = jax.tree.flatten(rest)
         put_lanes, put_shared = hosts.put(arrays[0], self._split), hosts.put(arrays[1], self._whole)
-        static = width, tuple(leaves), structure
-        results = hosts.collect(self._run(static, put_lanes, hosts.put(chunks[own], self._split), put_shared))
+        put = put_lanes, hosts.put(chunks[own], self._split), put_shared
+        results = hosts.collect(self._run(self._function, width, tuple(self.devices), rest, *put))
         where = {i: capacity * width * d + j for d, shard in enumerate(shards) for j, i in enumerate(shard)}
         return lane(results, np.array([where[i] for i in active], int))
 
@@ -119,6 +108,18 @@ class LaneMap:
         # Twice the even share is enough to balance costs.
         capacity = min(-(-lanes // width), 2 * -(-lanes // (width * devices)))
         return schedule(costs, active, devices, width, capacity), width, capacity
+
+
+def _on_mesh(function: Callable, width: int, devices: tuple, rest: PyTree, lanes, chunks, shared) -> PyTree:
+    """Each device's lanes on this device; `rest` holds what is no array of the lanes and of what they share."""
+    mesh, split, whole = Mesh(np.array(devices), (AXIS,)), PartitionSpec(AXIS), PartitionSpec()
+
+    def share(lanes, chunks, shared):
+        lanes, shared = eqx.combine((lanes, shared), rest)
+        return _loop(function, width, lanes, chunks[0], shared)
+
+    mapped = jax.shard_map(share, mesh=mesh, in_specs=(split, split, whole), out_specs=split, check_vma=False)
+    return mapped(lanes, chunks, shared)
 
 
 def _loop(function, width: int, lanes: PyTree, chunks: Int[jax.Array, ""], shared: tuple) -> PyTree:

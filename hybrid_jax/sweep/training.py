@@ -6,7 +6,7 @@ A host loop trains the lanes in blocks of epochs. Between blocks it drops those 
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import lru_cache
+from functools import lru_cache, partial
 
 import equinox as eqx
 import jax
@@ -128,20 +128,24 @@ def _shapes(*trees: PyTree) -> tuple:
 # A later sweep of the same shapes compiles nothing. One map per shape, so that unused programs are freed.
 @lru_cache(PROGRAMS)
 def _block(settings: Settings, width: int | None, lanes: int, shapes: tuple) -> LaneMap:
-    def block(lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:
-        state, plan, epochs = lane
-        return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)[0]
+    return LaneMap(partial(_trained, settings), width, min_capacity=lanes)
 
-    return LaneMap(block, width, min_capacity=lanes)
+
+def _trained(settings: Settings, lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:
+    state, plan, epochs = lane
+    return fitting.run(state, plan, train, validation, settings, state.epoch + epochs)[0]
 
 
 @lru_cache(PROGRAMS)
 def _evaluation(settings: Settings, every: int, lanes: int, shapes: tuple) -> LaneMap:
-    def errors(field: AbstractVectorField, windows: Trajectories) -> tuple[Float[Array, ""], Float[Array, " n"]]:
-        each = window_mse(field, windows, every, settings.solver)
-        return jnp.mean(each), each
+    return LaneMap(partial(_errors, settings, every), min_capacity=lanes, compiler=FAST_COMPILE)
 
-    return LaneMap(errors, min_capacity=lanes, compiler=FAST_COMPILE)
+
+def _errors(
+    settings: Settings, every: int, field: AbstractVectorField, windows: Trajectories
+) -> tuple[Float[Array, ""], Float[Array, " n"]]:
+    each = window_mse(field, windows, every, settings.solver)
+    return jnp.mean(each), each
 
 
 def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:

@@ -22,6 +22,7 @@ from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch
@@ -171,13 +172,14 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
-    train = eqx.filter_jit(fitting.run)
+    # The default is not an argument: an optimiser holds closures, with which a program is not kept.
+    chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}
     with _reporting(progress, int(plan.max_epochs)) as report:
         try:
             while int(state.status) == RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
                 until = jnp.asarray(first + most, jnp.int32)  # an array, so that one program serves all blocks
-                after, rows = train(state, plan, data, validated_on, settings, until, optimiser, empty)
+                after, rows = _train(state, plan, data, validated_on, settings, until, losses=empty, **chosen)
                 state, losses = after, [*losses, np.asarray(rows)[: int(after.epoch) - first]]
                 report(int(state.epoch), state)
                 most = int(np.clip(most * BLOCK_SECONDS / (time.perf_counter() - began), 1, min(BLOCK, 4 * most)))
@@ -189,6 +191,9 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     if interrupt is not None:
         raise FitInterrupted(result) from interrupt
     return result
+
+
+_train = kept_jit(fitting.run)
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once

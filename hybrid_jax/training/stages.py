@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
 from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start
 from hybrid_jax.training.objective import Learner, Settings
@@ -76,6 +77,9 @@ def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
 
 
+_judged = kept_jit(judged)
+
+
 def fit_in_stages(
     field: Learner,
     train: Trajectories,
@@ -102,7 +106,7 @@ def fit_in_stages(
     steps = [(rates_by_group(field, stage.rates), cut(data, stage.steps), stage) for stage in stages]
     for (rates, windows, stage), stage_key in zip(steps, jax.random.split(key, len(stages)), strict=True):
         plan = make_run_config(rates, jnp.arange(len(data)), len(data), 0, stage.patience, stage.epochs, weight)
-        state = eqx.filter_jit(judged)(start(field, stage_key, shared[-1]), *shared[:2])
+        state = _judged(start(field, stage_key, shared[-1]), *shared[:2])
         results.append(drive(state, plan, windows, shared, progress))
         field = results[-1].best
     return results

@@ -1,0 +1,262 @@
+"""Compiled programs that are kept on disk, so that the next process neither traces nor compiles them.
+
+JAX's own cache keeps what XLA compiled, but finds it by the traced program, and tracing takes most of the time. Here a
+program is found by what it is made of: the function, the structure and shapes of its arguments, the source of our
+packages, the versions of the libraries, the devices and the options.
+
+A program is kept only if these tell all about it. One that calls a class or function of another package is not, since
+its source may change unseen; nor is a closure. It is traced as ever, and JAX's cache still serves it.
+"""
+
+import functools
+import hashlib
+import inspect
+import io
+import os
+import pickle
+import sys
+import threading
+import types
+from collections.abc import Callable, Hashable, Sequence
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, ParamSpec, TypeVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.experimental import serialize_executable
+from jaxlib import lapack
+
+import hybrid_jax
+from hybrid_jax import checks, runtime
+
+OWN = ("hybrid_jax", "experiments", "benchmarks")  # known by their source
+LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "mujoco", "mujoco-mjx")
+STANDARD = ("builtins", "collections", "copyreg", "functools", "ml_dtypes", "operator", "types")
+KNOWN = frozenset((*OWN, *LIBRARIES, *STANDARD))  # packages whose code the key describes
+IN_MEMORY = 64  # programs of one function
+SUFFIX = ".executable"
+HIT = "/jax/compilation_cache/cache_hits"
+
+
+P = ParamSpec("P")
+R = TypeVar("R")
+
+
+class _Compiler(threading.local):
+    """How often JAX's cache had a program that this thread asked for."""
+
+    hits = 0
+
+
+_compiler = _Compiler()
+
+
+def _count(event: str, **_) -> None:
+    _compiler.hits += event == HIT
+
+
+jax.monitoring.register_event_listener(_count)
+
+
+def kept_jit(function: Callable[P, R], **options: Any) -> Callable[P, R]:
+    """`equinox.filter_jit` whose programs are kept in the folder of `runtime.configure`, if that was called.
+
+    It is `filter_jit` itself under another transformation, in a run of several processes, and for a program that cannot
+    be kept. A file that is damaged, or of other code, versions, options or devices, is not read but made anew.
+
+    Args:
+        options: of `jax.jit`, such as `compiler_options`.
+    """
+    return functools.update_wrapper(_Kept(function, options), function)  # pyright: ignore[reportReturnType]
+
+
+class _Kept:
+    """See `kept_jit`."""
+
+    def __init__(self, function: Callable, options: dict[str, Any]):
+        self._name = function.__name__.strip("_")
+        self._function, self._options = function, options
+        self._jit = eqx.filter_jit(function, **options)
+        self._programs: dict[Hashable, Callable] = {}  # by what a call has in common with another one
+
+    def __call__(self, *args, **kwargs):
+        leaves, structure = jax.tree.flatten((args, kwargs))
+        if runtime.kept_programs() is None or jax.process_count() > 1 or any(map(checks.is_traced, leaves)):
+            return self._jit(*args, **kwargs)
+        fixed = tuple(None if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        key = structure, fixed, tuple(map(_kind, arrays)), _context()
+        if key not in self._programs:
+            if len(self._programs) == IN_MEMORY:
+                self._programs.pop(next(iter(self._programs)))
+            self._programs[key] = self._program(leaves, structure)
+        return self._programs[key](args, kwargs, arrays)
+
+    def _program(self, leaves: list, structure) -> Callable:
+        """A function of (args, kwargs, arrays): the program from its file, or compiled now."""
+        try:
+            path = self._path(leaves, structure)
+        except (pickle.PicklingError, AttributeError, TypeError):  # all that pickle raises
+            return lambda args, kwargs, arrays: self._jit(*args, **kwargs)
+        program = _read(path) or self._compile(leaves, structure, path)
+        return lambda args, kwargs, arrays: program(arrays)
+
+    def _path(self, leaves: list, structure) -> Path:
+        shapes = jax.tree.unflatten(structure, [_kind(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves])
+        described, packages = _described((self._function, shapes, self._options))
+        digest = hashlib.sha256(described)
+        for part in (_context(), _environment(), *(source_digest(package) for package in sorted(packages))):
+            digest.update(repr(part).encode())
+        folder = runtime.kept_programs()
+        assert folder is not None  # asked by the caller
+        return folder / f"{self._name}-{digest.hexdigest()}{SUFFIX}"
+
+    def _compile(self, leaves: list, structure, path: Path) -> Callable:
+        """The program for these arguments; kept in a file if its result can be described."""
+        arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
+        fixed = [None if eqx.is_array(leaf) else leaf for leaf in leaves]
+        results = []
+
+        def flat(arrays):
+            left = iter(arrays)
+            args, kwargs = jax.tree.unflatten(structure, [next(left) if leaf is None else leaf for leaf in fixed])
+            found = jax.tree.flatten(self._function(*args, **kwargs))
+            results[:] = [found]
+            return [leaf for leaf in found[0] if eqx.is_array(leaf)]
+
+        # In the next release JAX's cache has no program of this name, so that the new one can be kept.
+        flat.__name__ = f"{self._name}_{hybrid_jax.__version__}"
+        if path.exists():  # it is damaged
+            for twin in path.parent.glob(f"jit_{flat.__name__}-*-cache"):
+                twin.unlink(missing_ok=True)
+        _compiler.hits = 0
+        compiled = jax.jit(flat, **self._options).lower(arrays).compile()
+        (found, shape), *_ = results
+        rest = [None if eqx.is_array(leaf) else (leaf,) for leaf in found]
+        skeleton = jax.tree.unflatten(shape, range(len(rest)))
+        if not _compiler.hits:  # jaxlib loses the kernels of a program from JAX's cache when it is serialised again
+            _keep(path, compiled, len(arrays), skeleton, rest)
+        return functools.partial(_call, compiled, skeleton, rest)
+
+
+def _keep(path: Path, compiled, inputs: int, skeleton, rest: Sequence) -> None:
+    try:
+        executable = serialize_executable.serialize(compiled)[0]
+        content = pickle.dumps((executable, _devices(compiled), inputs, skeleton, rest))
+        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+        temporary.write_bytes(hashlib.sha256(content).digest() + content)
+        os.replace(temporary, path)
+    except (pickle.PicklingError, AttributeError, TypeError, ValueError, NotImplementedError, OSError):
+        pass  # it serves this process
+
+
+@functools.cache
+def source_digest(package: str) -> str:
+    """The digest of all Python files of a package."""
+    spec = find_spec(package)
+    digest = hashlib.sha256()
+    for root in sorted(spec.submodule_search_locations or ()) if spec else ():
+        for path in sorted(Path(root).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
+
+
+def _read(path: Path) -> Callable | None:
+    """The program in a file; None if there is none, or it is damaged."""
+    try:
+        data = path.read_bytes()
+        digest, content = data[:32], data[32:]
+        if hashlib.sha256(content).digest() != digest:
+            return None
+        executable, devices, inputs, skeleton, rest = pickle.loads(content)
+        # A program calls LAPACK through pointers, which JAX sets when it lowers a first call.
+        lapack.prepare_lapack_call("potrf_ffi", jnp.dtype("float32"))
+        by_id = {device.id: device for device in jax.devices(devices[0])}
+        chosen = [by_id[i] for i in devices[1]]
+        before = jax.tree.structure((([0] * inputs,), {}))
+        after = jax.tree.structure([0] * sum(leaf is None for leaf in rest))
+        compiled = serialize_executable.deserialize_and_load(executable, before, after, devices[0], chosen)
+    except Exception:  # whatever a file of another making raises: the program is compiled anew
+        return None
+    path.touch()  # see runtime: programs long unused are deleted
+    return functools.partial(_call, compiled, skeleton, rest)
+
+
+def _call(compiled, skeleton, rest: Sequence, arrays: list) -> Any:
+    found = iter(compiled(arrays))
+    leaves = [next(found) if leaf is None else leaf[0] for leaf in rest]
+    return jax.tree.unflatten(jax.tree.structure(skeleton), leaves)
+
+
+def _devices(compiled) -> tuple[str, list[int]]:
+    """Platform and ids of the devices that a compiled program runs on, in its order."""
+    shardings = jax.tree.leaves((compiled.input_shardings, compiled.output_shardings))
+    meshes = (sharding.mesh for sharding in shardings if isinstance(sharding, jax.sharding.NamedSharding))
+    devices = next((list(mesh.devices.flat) for mesh in meshes if mesh.devices is not None), [*shardings[0].device_set])
+    return devices[0].platform, [device.id for device in devices]
+
+
+def _kind(array) -> tuple:
+    """What a program is compiled for: shape, type, and where the array lies if that is fixed."""
+    if not isinstance(array, jax.Array):
+        return array.shape, str(jnp.result_type(array)), False, None
+    placed = repr(array.sharding) if array.committed else None
+    return array.shape, str(array.dtype), array.aval.weak_type, placed
+
+
+def _context() -> tuple:
+    """JAX's settings that change a program and may change within a process."""
+    names = ("default_matmul_precision", "default_device", "default_prng_impl", "threefry_partitionable")
+    return str(jnp.result_type(float)), *(str(getattr(jax.config, f"jax_{name}")) for name in names)
+
+
+@functools.cache
+def _environment() -> tuple:
+    return tuple((name, version(name)) for name in LIBRARIES), runtime.machine()
+
+
+class _Description(pickle.Pickler):
+    """Pickles by name only what belongs to KNOWN packages; notes which of OWN."""
+
+    def __init__(self, file):
+        super().__init__(file, protocol=5)
+        self.packages = {"hybrid_jax"}
+
+    def persistent_id(self, obj: Any):
+        return ("device", obj.platform, obj.id) if isinstance(obj, jax.Device) else None
+
+    def reducer_override(self, obj: Any):
+        name, module = getattr(obj, "__qualname__", None), getattr(obj, "__module__", None)
+        if not callable(obj) or not isinstance(name, str) or not isinstance(module, str):
+            return NotImplemented
+        package, found = module.partition(".")[0], _by_name(module, name)
+        if package in KNOWN and (found is obj or inspect.unwrap(found) is obj):
+            self.packages.update({package} & set(OWN))
+            # Pickle names classes and plain functions itself, but not what a decorator returned or was given.
+            plain = found is obj and isinstance(obj, type | types.FunctionType)
+            return NotImplemented if plain else (_by_name, (module, name))
+        if isinstance(obj, type) or hasattr(obj, "__code__"):
+            raise pickle.PicklingError(f"{module}.{name} is not described by its name")
+        return NotImplemented
+
+
+def _by_name(module: str, name: str) -> Any:
+    try:
+        return functools.reduce(getattr, name.split("."), sys.modules[module])
+    except (AttributeError, KeyError):
+        return None
+
+
+def _described(value: Any) -> tuple[bytes, set[str]]:
+    """The value as bytes that are the same in every process, and which packages of OWN it is made with.
+
+    Raises:
+        PicklingError, AttributeError, TypeError: it holds what its bytes would not describe.
+    """
+    file = io.BytesIO()
+    pickler = _Description(file)
+    pickler.dump(value)
+    return file.getvalue(), pickler.packages

@@ -1,0 +1,157 @@
+"""Programs that are kept on disk are found again without tracing, and only where nothing differs."""
+
+from uuid import uuid4
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import script
+
+import hybrid_jax
+from hybrid_jax import programs, runtime
+from hybrid_jax.programs import kept_jit
+
+TRACED = []
+
+
+def scaled(factor: float, x):
+    """What the array becomes, and a number that is not traced."""
+    TRACED.append(factor)
+    return {"x": factor * x, "factor": factor}
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    """Where programs are kept; this module counts as a package whose source is known."""
+    monkeypatch.setattr(runtime, "_kept", [tmp_path])
+    monkeypatch.setattr(hybrid_jax, "__version__", uuid4().hex)  # JAX's own cache must not have the program
+    monkeypatch.setattr(programs, "KNOWN", programs.KNOWN | {__name__})
+    TRACED.clear()
+    return tmp_path
+
+
+def kept(folder):
+    return sorted(folder.glob(f"*{programs.SUFFIX}"))
+
+
+def called(*arguments):
+    """The result in what might be a new process, and whether it was traced there."""
+    before = len(TRACED)
+    found = kept_jit(scaled)(*arguments)
+    return found, len(TRACED) > before
+
+
+def test_a_kept_program_gives_the_same_result_without_tracing(folder):
+    x = np.arange(3.0, dtype=np.float32)
+    first, traced = called(2.0, x)
+    again, traced_again = called(2.0, x)
+    assert traced
+    assert not traced_again
+    assert again["factor"] == first["factor"] == 2.0
+    np.testing.assert_array_equal(again["x"], first["x"])
+    np.testing.assert_array_equal(again["x"], 2 * x)
+
+
+@pytest.mark.parametrize("other", [(3.0, np.ones(3, "f4")), (2.0, np.ones(4, "f4")), (2.0, np.ones(3, "i4"))])
+def test_other_arguments_ask_for_another_program(folder, other):
+    called(2.0, np.ones(3, "f4"))
+    found, traced = called(*other)
+    assert traced
+    np.testing.assert_array_equal(found["x"], other[0] * other[1])
+    assert len(kept(folder)) == 2
+
+
+@pytest.mark.parametrize("part", ["source_digest", "_environment", "_context"])
+def test_other_code_machines_and_settings_ask_for_another_program(folder, monkeypatch, part):
+    called(2.0, np.ones(3))
+    monkeypatch.setattr(programs, part, lambda *_: ("another",))
+    assert called(2.0, np.ones(3))[1]
+
+
+def test_precision_asks_for_another_program(folder):
+    called(2.0, np.ones(3))
+    with jax.enable_x64(jnp.result_type(float) == jnp.float32):
+        found, traced = called(2.0, np.ones(3))
+        assert traced
+        assert found["x"].dtype == jnp.result_type(float)
+
+
+DAMAGES = {"cut": lambda data: data[:-9], "empty": lambda data: b"", "changed": lambda data: data[:-9] + bytes(9)}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_program_is_compiled_anew(folder, monkeypatch, damage):
+    called(2.0, np.ones(3))
+    (path,) = kept(folder)
+    path.write_bytes(damage(whole := path.read_bytes()))
+    monkeypatch.setattr(hybrid_jax, "__version__", uuid4().hex)
+    found, traced = called(2.0, np.ones(3))
+    assert traced
+    np.testing.assert_array_equal(found["x"], 2 * np.ones(3))
+    assert len(path.read_bytes()) > len(whole) / 2
+    assert not called(2.0, np.ones(3))[1]
+
+
+def test_what_names_do_not_describe_is_not_kept(folder):
+    class Local(eqx.Module):
+        gain: jax.Array
+
+    shift = 1.0
+    np.testing.assert_array_equal(kept_jit(lambda x: x + shift)(np.ones(3)), 2 * np.ones(3))
+    assert called(2.0, np.ones(3))[1]
+    assert len(kept(folder)) == 1
+    np.testing.assert_array_equal(kept_jit(identity)(Local(jnp.ones(3))).gain, jnp.ones(3))
+    assert len(kept(folder)) == 1
+
+
+def identity(x):
+    return x
+
+
+def test_it_transforms_as_filter_jit_does(folder):
+    double = kept_jit(twice)
+    np.testing.assert_allclose(jax.grad(lambda x: double(x).sum())(jnp.ones(3)), 2 * np.ones(3))
+    np.testing.assert_allclose(jax.vmap(double)(jnp.ones((2, 3))), 2 * np.ones((2, 3)))
+    assert not kept(folder)
+
+
+def twice(x):
+    return 2 * x
+
+
+def test_nothing_is_kept_before_a_folder_is_configured(folder, monkeypatch):
+    monkeypatch.setattr(runtime, "_kept", [])
+    called(2.0, np.ones(3))
+    assert not kept(folder)
+
+
+ADAPT = """
+import sys
+from pathlib import Path
+import jax
+import numpy as np
+import hybrid_jax as hj
+hj.runtime.configure(Path(sys.argv[1]))
+draw = np.random.default_rng(0).normal
+x0 = np.zeros((20, 13), "f4")
+x0[:, :3], x0[:, 6] = draw(size=(20, 3)), 1
+u = (600 + 50 * draw(size=(20, 10, 4))).astype("f4")
+body = hj.rigid_body(hj.IRIS)
+windows = hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(body, x0, u, 0.01)), 0.01)
+traced = []
+jax.monitoring.register_event_duration_secs_listener(
+    lambda name, _, **about: traced.append(about.get("fun_name")) if name.endswith("trace_duration") else None
+)
+result = hj.adapt(body, windows)
+print(result.report())
+print([name for name in traced if name and "solution" in name])
+"""
+
+
+@pytest.mark.slow
+def test_a_new_process_adapts_as_the_first_one_did(tmp_path):
+    # It calls LAPACK, which a process that lowered nothing has not set up.
+    first, again = (script("-c", ADAPT, tmp_path).rpartition("\n[") for _ in range(2))
+    assert again[0] == first[0]
