@@ -4,7 +4,6 @@ from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -30,6 +29,7 @@ from hybrid_jax.adaptation.selection import BLOCKS, blocks_of
 from hybrid_jax.adaptation.uncertainty import covariance_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
@@ -138,8 +138,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
     return [row for rows in stages.parts(name, [partial(of_draw, d) for d in range(config.draws)]) for row in rows]
 
 
-# Equinox passes the options to jax.jit, but does not declare them.
-@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+@partial(kept_jit, compiler_options=FAST_COMPILE)
 def _fits(fields: Any, windows: Trajectories, shared: Settings):
     """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
     cluster = blocks_of(windows.x0.shape[1], BLOCKS)[0].shape[1]  # windows of one flight are correlated

@@ -1,8 +1,9 @@
 """Conditions of a sweep's runs: models by seed, hyper-parameters by size (paper, App. A), and measurement noise."""
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -21,6 +22,7 @@ from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
@@ -42,34 +44,38 @@ def settings(config: Config) -> Settings:
 
 def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVectorField:
     """The untrained models of all seeds, stacked. A seed gives all models the same physics and network."""
-    return jax.device_get(_fresh_fields(model, vehicle, config, np.arange(config.seeds)))
-
-
-# Equinox passes the options to jax.jit, but does not declare them.
-@eqx.filter_jit(compiler_options=FASTEST_COMPILE)  # pyright: ignore[reportCallIssue]
-def _fresh_fields(model: str, vehicle: Vehicle, config: Config, seeds: Int[np.ndarray, " n"]) -> AbstractVectorField:
-    forced = config.residual_outputs in FORCED
     # In tenths of the hover speed, from hover: of the magnitude of the other inputs.
     hover = InputScaling(vehicle.hover_speed, vehicle.hover_speed / 10)
+    network = {
+        "inputs": config.residual_inputs,
+        "outputs": FORCED.get(config.residual_outputs, config.residual_outputs),
+        "hidden": config.hidden,
+        "norm": config.norm,
+        "activation": config.activation,
+        "scaling": hover if config.inputs == "hover" else InputScaling(),
+        "linear": config.residual_linear,
+    }
+    guess = config.guess if config.perturbed_by is None else config.perturbed_by
+    forced = config.residual_outputs in FORCED
+    return jax.device_get(_fresh_fields(model, vehicle, guess, forced, network, np.arange(config.seeds)))
 
+
+@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+def _fresh_fields(
+    model: str,
+    vehicle: Vehicle,
+    guess: tuple[float, float] | float,
+    forced: bool,
+    options: Mapping[str, Any],
+    seeds: Int[np.ndarray, " n"],
+) -> AbstractVectorField:
     def build(seed):
-        if config.perturbed_by is None:
-            low, high = config.guess
-            physics = perturbed(vehicle, _key(seed, PHYSICS), low=low, high=high)
+        if isinstance(guess, tuple):
+            physics = perturbed(vehicle, _key(seed, PHYSICS), low=guess[0], high=guess[1])
         else:
-            physics = perturbed_by(vehicle, _key(seed, PHYSICS), config.perturbed_by)
+            physics = perturbed_by(vehicle, _key(seed, PHYSICS), guess)
         physics = ForcedBody(physics.log_ratios, vehicle) if forced else physics
-        network = make_residual(
-            _key(seed, NETWORK),
-            inputs=config.residual_inputs,
-            outputs=FORCED.get(config.residual_outputs, config.residual_outputs),
-            hidden=config.hidden,
-            norm=config.norm,
-            activation=config.activation,
-            scaling=hover if config.inputs == "hover" else InputScaling(),
-            linear=config.residual_linear,
-            vehicle=vehicle,
-        )
+        network = make_residual(_key(seed, NETWORK), vehicle=vehicle, **options)
         return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
 
     return eqx.filter_vmap(build)(seeds)
@@ -179,7 +185,7 @@ def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> Fit
     return jax.device_get(_begun(fields, seeds, purpose))
 
 
-@eqx.filter_jit
+@kept_jit
 def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: int) -> FitState:
     return eqx.filter_vmap(lambda field, seed: fitting.start(field, _key(seed, purpose)))(fields, seeds)
 

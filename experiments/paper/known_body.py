@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Literal
 
 import jax
@@ -22,6 +21,7 @@ from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
 from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -106,7 +106,9 @@ def coverage(config: KnownBody, console: Console) -> Results:
         for case, noise_on in cases:
             pieces = []
             for keys in parts:
-                pieces.append(jax.device_get(_repeats(config, noise_on == "all", drags[case], keys)))
+                pieces.append(
+                    jax.device_get(_repeats(config, jnp.array(noise_on == "all"), jnp.asarray(drags[case]), keys))
+                )
                 line.show_parts(next(done), len(cases) * len(parts))
             repeats = jax.tree.map(lambda *pieces: np.concatenate(pieces)[: config.repeats], *pieces)
             share = repeats["inside"].mean(axis=0)
@@ -164,7 +166,7 @@ def _parts(config: KnownBody) -> list[PRNGKeyArray]:
     return [keys[np.arange(begin, begin + size) % config.repeats] for begin in range(0, config.repeats, size)]
 
 
-@partial(jax.jit, static_argnums=0)
+@kept_jit
 def _repeats(
     config: KnownBody, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray
 ) -> dict[str, Array]:

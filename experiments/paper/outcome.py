@@ -3,7 +3,6 @@
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import numpy as np
 from matplotlib.figure import Figure
@@ -26,6 +25,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.tables import over_seeds
 from experiments.runner.run_record import environment
 from hybrid_jax.dynamics.rigid_body import nominal
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 from hybrid_jax.sweep import hosts
@@ -163,7 +163,7 @@ def paths(title: str, found: Study) -> Figure:
     sizes = {row["n_train"] for row in tuned[0].rows}
     shown = {100, 500, 1000} & sizes or set(sorted(sizes)[:3])
     # Not `Model.predict`, which raises if a prediction diverges.
-    predict, start = eqx.filter_jit(hybrid_jax.rollout_batch), np.asarray(test.x0)[:, None]
+    predict, start = kept_jit(hybrid_jax.rollout_batch), np.asarray(test.x0)[:, None]
     predicted: dict[int, dict[str, np.ndarray]] = {n: {} for n in sorted(shown)}
     for lanes in tuned:
         for i, row in enumerate(lanes.rows):

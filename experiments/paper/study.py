@@ -8,7 +8,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +26,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FAST_COMPILE, cores
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
@@ -140,8 +140,7 @@ def solved(
 
 
 # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
-# Equinox passes the options to jax.jit, but does not declare them.
-@eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+@partial(kept_jit, compiler_options=FAST_COMPILE)
 def _solved(method: Method, shared: Settings, lanes: Any, splits: Mapping[str, Trajectories]) -> Fit:
     def one(run) -> Fit:
         field, subset, own = run
