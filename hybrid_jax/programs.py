@@ -132,8 +132,9 @@ class _Kept:
         if path.exists():  # it is damaged
             for twin in path.parent.glob(f"jit_{flat.__name__}-*-cache"):
                 twin.unlink(missing_ok=True)
-        _compiler.hits = 0
-        compiled = jax.jit(flat, **self._options).lower(arrays).compile()
+        lowered = jax.jit(flat, **self._options).lower(arrays)
+        _compiler.hits = 0  # not of small programs that ran while this one was traced
+        compiled = lowered.compile()
         (found, shape), *_ = results
         rest = [None if eqx.is_array(leaf) else (leaf,) for leaf in found]
         skeleton = jax.tree.unflatten(shape, range(len(rest)))
