@@ -6,8 +6,8 @@ World NED (north-east-down) becomes ENU, body FRD (forward-right-down) becomes F
 from dataclasses import dataclass
 
 import numpy as np
+import scipy  # not scipy.spatial, which takes a quarter of a second: it is imported where it is first used
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation, Slerp
 
 Vectors = Float[np.ndarray, "n 3"]
 Quaternions = Float[np.ndarray, "n 4"]
@@ -31,25 +31,30 @@ class Frames:
                 raise ValueError(f"{name} must be one of {', '.join(known)}, got {getattr(self, name)!r}")
 
 
-def rotation_of(q: Quaternions) -> Rotation:
+def rotation_of(q: Quaternions) -> "scipy.spatial.transform.Rotation":
     """Convert to SciPy, which puts the scalar last."""
-    return Rotation.from_quat(np.roll(q, -1, axis=-1))
+    return scipy.spatial.transform.Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
-def quaternion_of(rotation: Rotation) -> Quaternions:
+def quaternion_of(rotation: "scipy.spatial.transform.Rotation") -> Quaternions:
     """(w, x, y, z)."""
     return np.roll(rotation.as_quat(), 1, axis=-1)
 
 
+def quaternion_from_matrix(matrix: Float[np.ndarray, "n 3 3"]) -> Quaternions:
+    """Of rotation matrices body → world."""
+    return quaternion_of(scipy.spatial.transform.Rotation.from_matrix(matrix))
+
+
 def from_euler(angles: Vectors) -> Quaternions:
     """Body → world from (roll, pitch, yaw) [rad], turned about z by yaw, then y by pitch, then x by roll."""
-    return quaternion_of(Rotation.from_euler("ZYX", angles[:, ::-1]))
+    return quaternion_of(scipy.spatial.transform.Rotation.from_euler("ZYX", angles[:, ::-1]))
 
 
 def to_library(p: Vectors, q: Quaternions, v: Vectors, omega: Vectors, frames: Frames) -> Float[np.ndarray, "n 13"]:
     """States in the library's frames from position, attitude body → world, velocity and body rates in `frames`."""
     world, body = WORLDS[frames.world], BODIES[frames.body]
-    attitude = Rotation.from_matrix(world @ rotation_of(q).as_matrix() @ body.T)
+    attitude = scipy.spatial.transform.Rotation.from_matrix(world @ rotation_of(q).as_matrix() @ body.T)
     velocity = attitude.apply(v @ body.T) if frames.velocity == "body" else v @ world.T
     return np.concatenate([p @ world.T, quaternion_of(attitude), velocity, omega @ body.T], axis=1)
 
@@ -62,7 +67,7 @@ def rates_between(t: Float[np.ndarray, " n"], q: Quaternions) -> Float[np.ndarra
 
 def interpolate_attitude(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], q: Quaternions) -> Quaternions:
     """Spherical linear interpolation of q, known at times `at`, to times t within them."""
-    return quaternion_of(Slerp(at, rotation_of(q))(t))
+    return quaternion_of(scipy.spatial.transform.Slerp(at, rotation_of(q))(t))
 
 
 def interpolate(t: Float[np.ndarray, " m"], at: Float[np.ndarray, " n"], values: Float[np.ndarray, "n d"]):

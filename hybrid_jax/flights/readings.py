@@ -9,9 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial.transform import Rotation
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rates_between, rotation_of
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rates_between, rotation_of
 from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -82,14 +81,14 @@ def accelerations(log: FlightLog) -> Readings:
     q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
     attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
     frd = attitude.as_matrix() @ BODIES["FRD"].T
-    ned = quaternion_of(Rotation.from_matrix(WORLDS["NED"] @ frd))
+    ned = quaternion_from_matrix(WORLDS["NED"] @ frd)
     stated = {
         NOTHING: (q, v),
         'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
         "attitude alone is NED and FRD: convert it": (ned, v),
         'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
-        'the body is FRD in a world with z up: set body = "FRD"': (quaternion_of(Rotation.from_matrix(frd)), v),
+        'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
         'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
     }
     # Other readings of attitudes rotate thrust about z only, which wind or a load may do as well.

@@ -6,9 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
-from scipy.spatial.transform import Rotation
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
 from hybrid_jax.flights.log import wrong_norms
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
@@ -105,5 +104,5 @@ def attitude(q: Float[np.ndarray, "n 4"], world: str, body: str) -> Float[np.nda
         matrices = WORLDS[world] @ rotation_of(q[sound]).as_matrix() @ BODIES[body].T
         # Not of length 1: a wrong norm must still be seen.
         norms = np.linalg.norm(q[sound], axis=1, keepdims=True)
-        turned[sound] = quaternion_of(Rotation.from_matrix(matrices)) * norms
+        turned[sound] = quaternion_from_matrix(matrices) * norms
     return turned

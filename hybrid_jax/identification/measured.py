@@ -6,8 +6,8 @@ from typing import Literal, NamedTuple
 
 import jax
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float
-from scipy.spatial.transform import Rotation
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.measurement import MEASURED, TANGENT
@@ -216,8 +216,8 @@ def _fill(x, spread, place: slice, at: int, value, error) -> None:
     x[:, place], spread[:, at : at + 3] = value, error
 
 
-def _rotation(q) -> Rotation:
-    return Rotation.from_quat(np.roll(q, -1, axis=-1))
+def _rotation(q) -> "scipy.spatial.transform.Rotation":
+    return scipy.spatial.transform.Rotation.from_quat(np.roll(q, -1, axis=-1))
 
 
 def _attitudes(signal: Signal, starts, layout: Layout):
@@ -230,7 +230,7 @@ def _attitudes(signal: Signal, starts, layout: Layout):
     ]
     value, slope, variance = (np.array(part) for part in zip(*found, strict=True)) if found else np.zeros((3, 0, 3))
     noise = np.sqrt(np.median(variance[:, :3], axis=0)) if len(found) else np.zeros(3)
-    q = np.roll((every[at] * Rotation.from_rotvec(value.reshape(-1, 3))).as_quat(), 1, axis=1)
+    q = np.roll((every[at] * scipy.spatial.transform.Rotation.from_rotvec(value.reshape(-1, 3))).as_quat(), 1, axis=1)
     here, slopes = (np.median([_gains(signal, t, layout)[i] for t in starts] or [0.0]) for i in (0, 1))
     return q, 0 * noise if layout.initial == "sample" else noise * here, slope.reshape(-1, 3), noise * slopes
 

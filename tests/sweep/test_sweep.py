@@ -97,7 +97,7 @@ def test_every_lane_comes_to_its_own_end(final):
 def compilations(caplog):
     """How many programs of sweeps were compiled under jax.log_compiles."""
     messages = [record.getMessage() for record in caplog.records]
-    return sum("Finished XLA compilation" in message and "jit(run)" in message for message in messages)
+    return sum("Finished XLA compilation" in message and "jit(_on_mesh)" in message for message in messages)
 
 
 def test_one_compilation_serves_all_sizes_rates_and_blocks(caplog):
