@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
@@ -10,6 +10,7 @@ from typing import Any, Literal, get_args
 import tyro
 from rich.console import Console
 
+from benchmarks import history
 from benchmarks.timing import BAD_INPUT, Ratio, check_file, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 
@@ -27,6 +28,9 @@ class Options:
     """full: the reported numbers. smoke: a functional check; its numbers mean nothing."""
     out: Path | None = None
     """Also write the numbers of all benchmarks to this file as JSON, and figures beside it."""
+    history: Path | None = None
+    """Also append the ratios to this file, one JSON object a line with the machine and the commit, and draw all of its
+    entries beside it."""
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
@@ -52,6 +56,9 @@ def main() -> None:
     options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
     try:
         check_file("--out", options.out)
+        check_file("--history", options.history)
+        if options.history is not None and options.history.exists():
+            history.read(options.history)  # refused before hours of work, not after
         names = options.only + (PEERS if options.peers else ())
         reports = [measured(name, options.preset, options.out) for name in names]
     except (ValueError, RuntimeError) as error:
@@ -68,6 +75,10 @@ def main() -> None:
         for row in report["rows"]:
             if "skipped" in row:
                 console.print(f"{report['benchmark']}: {row['rival']}: {row['skipped']}", markup=False)
+    if options.history is not None:
+        drawn = history.figure(history.append(options.history, {ratio.what: asdict(ratio) for ratio in ratios}))
+        for suffix in (".png", ".svg"):
+            drawn.savefig(options.history.with_suffix(suffix), dpi=150)
     if options.out is not None:
         write_atomic(options.out, json_text({"benchmarks": reports}))
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from smoke import benchmarks
 
-from benchmarks import compilation, growth, timing
+from benchmarks import compilation, growth, history, timing
 from benchmarks.__main__ import PEERS, Benchmark
 from benchmarks.operations import count_operations
 from benchmarks.timing import Disagreement, Ratio, Times, agree
@@ -193,3 +193,16 @@ def test_operations_are_counted_in_loops_and_calls():
 def test_the_preset_that_is_reported_times_each_call_ten_times():
     for name in {*get_args(Benchmark), PEERS[0]} - {"compilation"}:
         assert import_module(f"benchmarks.{name}").PRESETS["full"].turns >= 10
+
+
+def test_history_appends_and_refuses_what_is_none(tmp_path):
+    file = tmp_path / "history.jsonl"
+    for value in (2.0, 1.0):
+        entries = history.append(file, {"a ratio": {"value": value, "at_most": 1.5, "at_least": None}})
+    assert [entry["ratios"]["a ratio"]["value"] for entry in history.read(file)] == [2.0, 1.0]
+    assert all(entry["commit"] and entry["hardware"]["cores"] for entry in entries)
+    (drawn, *_) = history.figure(entries).axes[0].lines
+    np.testing.assert_array_equal(drawn.get_ydata(), [2.0, 1.0])
+    file.write_text(file.read_text() + "1\n")
+    with pytest.raises(ValueError, match="line 3: expected an entry that --history wrote, got '1'"):
+        history.read(file)

@@ -29,7 +29,7 @@ SETTINGS = Settings(batch_size=BATCH)
 TRAIN, VALIDATION = swings(60), swings(40, seed=1)
 KEY = jax.random.key(0)
 NETWORK = residual_network(2, 1, KEY, hidden=4)
-_run = eqx.filter_jit(_on_mesh)
+_run = eqx.filter_jit(run)
 
 
 def trained(field, rates=0.03, key=KEY, train=TRAIN, validation=VALIDATION, settings=SETTINGS, **rules):
