@@ -129,7 +129,9 @@ class FlatOutputs(eqx.Module):
         place, q, velocity, rates = self._moving(coefficients, times)[:4]
         states = jnp.concatenate([place[:, :3], q, velocity[:, :3], rates], axis=1)
         _, _, _, rates, lift, turning = self._moving(coefficients, times[:-1] + self.dt / 2)
-        return states, jnp.sqrt(jnp.maximum(self._squares(rates, lift, turning), 1.0))  # no slope at a speed of 0
+        squares = self._squares(rates, lift, turning)
+        # Negative beyond the limits, so that a search finds back; and no infinite slope.
+        return states, jnp.where(squares < 0, -1.0, 1.0) * jnp.sqrt(jnp.maximum(jnp.abs(squares), 1.0))
 
     def _moving(self, coefficients: Coefficients, times: Float[np.ndarray, " n"]) -> list[Array]:
         """Flat outputs, attitude, their slope, body rates, specific force, and the slope of the body rates."""
@@ -178,7 +180,7 @@ class FlatOutputs(eqx.Module):
         tilt = (1 - upright) / (1 - math.cos(bounds.tilt))
         yaw = jnp.abs(heading(x[:, QUATERNION])) / bounds.yaw
         least, most = (share * self.vehicle.max_rotor_speed for share in bounds.rotor_speed)
-        rotors = jnp.abs(2 * (jnp.square(u) - least**2) / (most**2 - least**2) - 1).max(axis=1)
+        rotors = jnp.abs(2 * (u * jnp.abs(u) - least**2) / (most**2 - least**2) - 1).max(axis=1)
         return jnp.column_stack([place, speed, tilt, yaw, rotors])
 
 
