@@ -202,7 +202,7 @@ def fitted(
     return [
         {
             "flight": name, "parameter": parameter, "seed": seed, "draw": None,
-            "half_width": 50 * math.log(high / low) if 0 < low and math.isfinite(high) else math.inf,
+            "half_width": 50 * math.log(high / low) if low > 0 and math.isfinite(high) else math.inf,
             "predicted": 100 * 1.96 * float(std),
             "error": 100 * float(value / truth[parameter] - 1),
             "inside": bool(low <= truth[parameter] <= high),
