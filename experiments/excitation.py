@@ -197,7 +197,9 @@ def fitted(
     """A row for each parameter: the interval after a flight, what was predicted, and the truth."""
     states, inputs = flights[name, seed]
     key = jax.random.fold_in(jax.random.key(2 + seed), FLIGHTS.index(name))
-    found = jax.device_get(_fit(config.parameters, config.noise, jnp.float32(states), jnp.float32(inputs), key))
+    found = jax.device_get(
+        _fit(config.parameters, jnp.float32(config.noise), jnp.float32(states), jnp.float32(inputs), key)
+    )
     truth = nominal(domain.vehicle)
     return [
         {
@@ -240,7 +242,7 @@ def margins(bounds: FlightBounds, states: Float[np.ndarray, "n 13"]) -> dict[str
     found = {f"{axis} [m]": (np.abs(place[:, i]).max(), half[i]) for i, axis in enumerate("xyz")}
     found["speed [m/s]"] = np.linalg.norm(states[:, VELOCITY], axis=1).max(), bounds.speed
     found["tilt [rad]"] = np.arccos(np.clip(upright, -1, 1)).max(), bounds.tilt
-    found["yaw [rad]"] = np.abs(heading(states[:, QUATERNION])).max(), bounds.yaw
+    found["yaw [rad]"] = np.abs(heading(jnp.asarray(states[:, QUATERNION]))).max(), bounds.yaw
     return {name: (float(used), float(limit)) for name, (used, limit) in found.items()}
 
 

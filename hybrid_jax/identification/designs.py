@@ -6,6 +6,7 @@ inputs, squashed into their limits, and the states follow from the model.
 """
 
 import math
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -118,7 +119,7 @@ class FlatOutputs(eqx.Module):
 
         def path(t: Scalar) -> tuple[Float[Array, "3"], Scalar]:
             ramp = _smooth(jnp.minimum(t, self.seconds - t) / RAMP)
-            flat = centre + ramp * _series(amplitudes, t, self.seconds)
+            flat = jnp.asarray(centre, amplitudes.dtype) + ramp * _series(amplitudes, t, self.seconds)
             return flat[:3], flat[3]
 
         return path
@@ -201,12 +202,12 @@ class InputSeries(eqx.Module):
     def shape(self) -> tuple[int, int, int]:
         return len(self.bounds.low), self.harmonics + 1, 2  # the first for a constant
 
-    def path(self, coefficients: Coefficients):
+    def path(self, coefficients: Coefficients) -> Callable[[Scalar], Float[Array, " m"]]:
         low, high = np.array(self.bounds.low), np.array(self.bounds.high)
 
         def inputs(t: Scalar) -> Float[Array, " m"]:
             series = _series(coefficients[:, 1:], t, self.seconds) + coefficients[:, 0, 1]
-            return (low + high) / 2 + (high - low) / 2 * jnp.tanh(series)
+            return jnp.asarray((low + high) / 2 + (high - low) / 2 * jnp.tanh(series))
 
         return inputs
 
@@ -246,9 +247,10 @@ def _derivatives(times: Float[np.ndarray, " n"], seconds: float, harmonics: int)
         phases = np.outer(times, rates) + i * np.pi / 2
         return np.stack([rates**i * np.sin(phases), rates**i * np.cos(phases)], axis=-1).reshape(len(times), -1)
 
-    return [
-        sum(math.comb(order, i) * ramps[i][:, None] * wave(order - i) for i in range(order + 1)) for order in range(5)
-    ]
+    def term(order: int, i: int) -> np.ndarray:
+        return math.comb(order, i) * ramps[i][:, None] * wave(order - i)
+
+    return [np.sum([term(order, i) for i in range(order + 1)], axis=0) for order in range(5)]
 
 
 def _smooth(s: Scalar) -> Scalar:

@@ -35,6 +35,7 @@ from hybrid_jax.identification.designs import (
     Trajectory,
 )
 from hybrid_jax.identification.information import Information, information_of, told_apart
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import windows_of
 
@@ -43,6 +44,7 @@ SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that 
 PENALTY = 100.0  # on the mean squared excess over a limit
 TOLD_APART = 1e-5  # least eigenvalue of the scaled information, ten times its rounding in float32
 RATE = 0.05  # of Adam, in units of the coefficients
+Starts = Float[Array, "s outputs harmonics 2"]
 # Of motion capture and a gyroscope: m, quaternion, m/s, rad/s.
 NOISE = ((POSITION, 0.001), (QUATERNION, 0.002), (VELOCITY, 0.02), (BODY_RATES, 0.02))
 
@@ -154,7 +156,7 @@ class _Search(eqx.Module):
         return jnp.where(inside.any(), jnp.asarray(SHRUNK)[jnp.argmax(inside)], 0.0) * coefficients
 
     @eqx.filter_jit
-    def values(self, found: Float[Array, "s outputs harmonics 2"], asked, seen) -> Float[Array, " s"]:
+    def values(self, found: Starts, asked, seen) -> Float[Array, " s"]:
         """What each series tells once it keeps the limits, −∞ if nothing finite."""
 
         def one(coefficients):
@@ -163,8 +165,9 @@ class _Search(eqx.Module):
 
         return jax.lax.map(one, found)
 
-    @eqx.filter_jit
-    def improved(self, begun: Float[Array, "s outputs harmonics 2"], asked, seen, steps: int):
+    # Equinox passes the options to jax.jit, but does not declare them.
+    @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+    def improved(self, begun: Starts, asked, seen, steps: int) -> Starts:
         """The series after some steps of Adam."""
 
         def loss(coefficients):
@@ -178,7 +181,7 @@ class _Search(eqx.Module):
             coefficients, state = carry
             slopes = jax.vmap(jax.grad(loss))(coefficients)
             changes, state = adam.update(slopes, state)
-            return (optax.apply_updates(coefficients, changes), state), None
+            return (coefficients + changes, state), None
 
         return jax.lax.scan(step, (begun, adam.init(begun)), length=steps)[0][0]
 
@@ -234,7 +237,7 @@ def _wanted(model: AbstractVectorField, parameters: Sequence[str] | None) -> tup
     return tuple(dict.fromkeys(parameters))
 
 
-def _begun(search: _Search, starts: int, seed: int) -> Float[Array, "s outputs harmonics 2"]:
+def _begun(search: _Search, starts: int, seed: int) -> Starts:
     rest = jnp.zeros(search.design.shape)
     uses = np.asarray(search.design.uses(*search.planned(rest))).max(axis=0, initial=0.0)
     for name, use in zip(search.design.names, uses, strict=True):
