@@ -87,7 +87,7 @@ class ExcitationConfig(Run):
     """Highest frequency of the design [Hz]."""
     starts: Count = 4
     """Random series that the design starts from."""
-    steps: Count = 300
+    steps: Count = 200
     """Steps of the search."""
 
     def __post_init__(self):

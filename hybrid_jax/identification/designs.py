@@ -106,12 +106,19 @@ class FlatOutputs(eqx.Module):
         return 4, self.harmonics, 2
 
     def unit(self) -> Float[np.ndarray, "4 harmonics 1"]:
-        """The amplitude that alone would use up the box, the tilt's acceleration, or the yaw."""
-        half = (np.array(self.bounds.high) - np.array(self.bounds.low)) / 2
+        """The amplitude that alone would use up the box, the tilt, or the thrust that the rotors' range leaves."""
+        vehicle, bounds = self.vehicle, self.bounds
+        least, most = (share * vehicle.max_rotor_speed for share in bounds.rotor_speed)
+        thrust = vehicle.thrust_coefficient * (most**2 - least**2) / 2  # of each rotor, either way [N]
+        arms = np.abs(np.array(vehicle.rotor_positions)).sum(axis=0)
+        roll, pitch = thrust * arms[::-1] / np.array(vehicle.inertia[:2])
+        turn = vehicle.torque_coefficient / vehicle.thrust_coefficient * thrust * vehicle.rotors / vehicle.inertia[2]
         rates = 2 * np.pi * np.arange(1, self.harmonics + 1) / self.seconds
-        hardest = np.array([*[self.vehicle.gravity * math.tan(self.bounds.tilt)] * 3, 10.0])
-        widest = np.append(half, self.bounds.yaw)
-        return np.minimum(widest[:, None], hardest[:, None] / rates**2)[..., None]
+        tilts = [np.minimum(np.tan(bounds.tilt), each / rates**2) for each in (pitch, roll)]  # along x, along y
+        lift = np.full(self.harmonics, thrust * vehicle.rotors / vehicle.mass)
+        accelerations = np.stack([vehicle.gravity * tilts[0], vehicle.gravity * tilts[1], lift, 0 * lift + turn])
+        half = (np.array(bounds.high) - np.array(bounds.low)) / 2
+        return np.minimum(np.append(half, bounds.yaw)[:, None], accelerations / rates**2)[..., None]
 
     def path(self, coefficients: Coefficients) -> Path:
         centre = np.append((np.array(self.bounds.high) + np.array(self.bounds.low)) / 2, 0.0)

@@ -41,7 +41,7 @@ from hybrid_jax.trajectories import windows_of
 
 SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
 SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that keeps the limits is taken
-PENALTY = 100.0  # on the mean squared excess over a limit
+PENALTY = 30.0, 3000.0  # on the mean squared excess over a limit, at the first and at the last step
 TOLD_APART = 1e-5  # least eigenvalue of the scaled information, ten times its rounding in float32
 RATE = 0.05  # of Adam, in units of the coefficients
 Starts = Float[Array, "s outputs harmonics 2"]
@@ -170,20 +170,20 @@ class _Search(eqx.Module):
     def improved(self, begun: Starts, asked, seen, steps: int) -> Starts:
         """The series after some steps of Adam."""
 
-        def loss(coefficients):
+        def loss(coefficients, penalty):
             x, u = self.planned(coefficients)
             excess = jnp.maximum(self.design.uses(x, u) - SPARE, 0.0)
-            return PENALTY * jnp.sum(jnp.mean(jnp.square(excess), axis=0)) - self.value(x, u, asked, seen)
+            return penalty * jnp.sum(jnp.mean(jnp.square(excess), axis=0)) - self.value(x, u, asked, seen)
 
         adam = optax.chain(optax.zero_nans(), optax.adam(optax.cosine_decay_schedule(RATE, max(steps, 1))))
 
-        def step(carry, _):
+        def step(carry, penalty):
             coefficients, state = carry
-            slopes = jax.vmap(jax.grad(loss))(coefficients)
+            slopes = jax.vmap(jax.grad(loss), in_axes=(0, None))(coefficients, penalty)
             changes, state = adam.update(slopes, state)
             return (coefficients + changes, state), None
 
-        return jax.lax.scan(step, (begun, adam.init(begun)), length=steps)[0][0]
+        return jax.lax.scan(step, (begun, adam.init(begun)), jnp.geomspace(*PENALTY, steps))[0][0]
 
 
 def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: float) -> Design:

@@ -55,7 +55,7 @@ def test_margins_are_measured_from_the_middle_of_the_box():
 
 
 def test_an_interval_that_says_nothing_is_shown_as_wide():
-    wide = Results([row | {"half_width": math.inf} for row in rows(0.3, 1)], ("flight", "parameter", "seed"))
+    wide = Results([{**row, "half_width": math.inf} for row in rows(0.3, 1)], ("flight", "parameter", "seed"))
     assert all("> 1000" in line[1:] for line in tables(wide)[0].lines)
 
 
