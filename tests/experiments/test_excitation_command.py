@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from smoke import experiments, refused, unbegun
 
-from experiments.excitation import CLAIMS, DESIGNED, FLIGHTS, RANDOM, Evidence, margins, ratio, tables
+from experiments.excitation import CLAIMS, DESIGNED, FLIGHTS, RANDOM, Evidence, conclusion, margins, ratio, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.identification import FlightBounds
@@ -57,6 +57,12 @@ def test_margins_are_measured_from_the_middle_of_the_box():
 def test_an_interval_that_says_nothing_is_shown_as_wide():
     wide = Results([{**row, "half_width": math.inf} for row in rows(0.3, 1)], ("flight", "parameter", "seed"))
     assert all("> 1000" in line[1:] for line in tables(wide)[0].lines)
+
+
+def test_beside_an_unbounded_interval_any_other_is_nothing():
+    given = Results([{**row, "half_width": math.inf if row["flight"] == "hover" else 1.0} for row in rows(0.3)])
+    assert ratio(given, "hover").value == 0
+    assert "after hover it is unbounded" in conclusion(given)[0]
 
 
 @pytest.mark.parametrize(
