@@ -292,8 +292,8 @@ def conclusion(rows: Results) -> list[str]:
     others = ", ".join(f"{times(name)} narrower than after {name}" for name in FLIGHTS[::-1] if name != DESIGNED)
     return [
         f"After the designed flight the widest interval is ±{wide:.2g} %, {others}.",
-        f"Of that, noise alone accounts for {times(RANDOM, 'predicted')} against random flight; the rest is drag and "
-        "ground effect, which the model lacks and fast and low flight meets.",
+        f"If the model were exact, it would be {times(RANDOM, 'predicted')} narrower than after random; the rest comes "
+        "with drag and ground effect, which the model lacks.",
         f"{np.mean(own['inside']):.0%} of the designed flight's 95 % intervals hold the truth.",
     ]
 

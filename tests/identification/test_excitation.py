@@ -78,7 +78,8 @@ def test_predicted_errors_are_those_of_least_squares():
     def fit(key):
         log = found.states + NOISE * jax.random.normal(key, found.states.shape)
         windows = hj.Trajectories(log[:-1:5], u.reshape(-1, 5, 1), log[1:].reshape(-1, 5, 1), DT)
-        return jnp.stack(jax.tree.leaves(hj.fit_least_squares(model, windows, scale=jnp.array([NOISE])).field))
+        field = hj.fit_least_squares(model, windows, scale=jnp.array([NOISE])).field
+        return jnp.stack(jax.tree.leaves(field)[:2])
 
     spread = np.std(jax.vmap(fit)(jax.random.split(jax.random.key(0), 300)), axis=0)
     assert spread == pytest.approx([found.standard_errors[name] for name in "ab"], rel=0.12)
@@ -136,7 +137,7 @@ def flights():
     """A flight after no step of the search, the best of its starts, and after a few."""
     model = hj.with_disturbance(hj.rigid_body(hj.IRIS))
     given = {"seconds": 3.0, "bandwidth": 1.0, "starts": 2, "dt": DT}
-    return [hj.excitation(model, ("Ix", "k"), hj.FlightBounds(), **given, steps=steps) for steps in (0, 10)]
+    return [hj.excitation(model, ("Ix", "k"), hj.FlightBounds(), **given, steps=steps) for steps in (0, 40)]
 
 
 def test_a_flight_tells_more_than_any_start_and_keeps_its_limits(flights):
