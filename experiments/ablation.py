@@ -2,8 +2,9 @@
 
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
+import numpy as np
 from rich.console import Console
 
 from experiments.external_force import FLOOR
@@ -12,10 +13,11 @@ from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, prese
 from experiments.paper.lanes import rows_of
 from experiments.paper.study import adapted, flown, pretrained, source_splits, target_splits, tested
 from experiments.paper.tables import ablation_tables
-from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY
+from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval, mean_interval
 from experiments.reporting.tables import print_tables
 from experiments.runner import command
 from experiments.runner.run_record import environment
@@ -41,6 +43,7 @@ NOTES = [
     "Seconds are those that the stages of a value took when they ran; a stage shared by several values counts in each.",
     "Off: mean of the recovered parameter over the true one, less 1.",
 ]
+LITTLE = 0.05  # change of an error that counts as none
 Choice = Literal["residual", "weight", "form", "norm", "start", "source", "noise", "solver"]
 
 
@@ -141,9 +144,67 @@ def write(config: AblationConfig, rows: Results, seconds: dict[str, float]) -> N
         figures=save_figures(out, drawn, config.paper),
         notes=NOTES,
         head=HEAD,
+        conclusion=conclusion(rows),
         tables=ablation_tables(rows, TRUTH),
     )
     write_report(out, report, paper=config.paper)
+
+
+class Effect(NamedTuple):
+    """What a value does to the test error after fine-tuning, over that of the default, paired by seed."""
+
+    choice: str
+    value: str
+    ratios: dict[str, Interval]  # by domain, with a 95 % interval: of geometric means over seeds
+
+
+def effects(rows: Results) -> list[Effect]:
+    """Of every value that is not the default, at the smallest N; seeds that diverged leave no interval."""
+    found = []
+    tuned = rows.where(mode=FINE_TUNED)
+    tuned = tuned.where(n_train=min(tuned["n_train"], default=0))
+    for choice, group in tuned.group("choice").items():
+        default = group.where(default=True).group("domain")
+        for value, own in group.where(default=False).group("value").items():
+            ratios = {}
+            for domain, ours in own.group("domain").items():
+                if domain in default:
+                    errors, others = ours.paired(default[domain], "test_mse")
+                    with np.errstate(all="ignore"):
+                        logs = mean_interval(np.log(errors) - np.log(others), ours["seed"])
+                        ratios[domain] = Interval(*map(float, np.exp(logs)))
+            found += [Effect(choice, value, ratios)] * bool(ratios)
+    return found
+
+
+def conclusion(rows: Results) -> list[str]:
+    """Which choices help in every domain, which do nothing, which harm, and by how much."""
+    found = effects(rows)
+    better = [each for each in found if all(ratio.below(1) for ratio in each.ratios.values())]
+    worst = max(found, key=lambda each: max(ratio.value for ratio in each.ratios.values()), default=None)
+    by_choice = {choice: [e for e in found if e.choice == choice] for choice in dict.fromkeys(e.choice for e in found)}
+    idle = [
+        choice
+        for choice, own in by_choice.items()
+        if all(abs(ratio.value - 1) <= LITTLE for each in own for ratio in each.ratios.values())
+    ]
+    sentences = []
+    if better:
+        best = min(better, key=lambda each: max(ratio.value for ratio in each.ratios.values()))
+        others = len(better) - 1
+        more = f"; {others} other value{'s are' if others > 1 else ' is'} better everywhere, too" if others else ""
+        sentences.append(f"Best of all is {best.choice} = {best.value}: {_times(best)} the default's error{more}.")
+    elif found:
+        sentences.append("No value is better than the default in every domain.")
+    if worst and max(ratio.value for ratio in worst.ratios.values()) > 1:
+        sentences.append(f"What harms most is {worst.choice} = {worst.value}: {_times(worst)}.")
+    if idle:
+        sentences.append(f"Changes nothing by more than {LITTLE:.0%}: {', '.join(idle)}.")
+    return sentences
+
+
+def _times(effect: Effect) -> str:
+    return ", ".join(f"{ratio.value:.2f} times ({label(domain)})" for domain, ratio in effect.ratios.items())
 
 
 ABOUT = "Which choices of the method matter, and where it breaks."

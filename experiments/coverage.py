@@ -113,6 +113,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
         claims=verdicts,
         notes=stages.notes(),
         head=HEAD.strip(),
+        conclusion=conclusion(rows),
         tables=tables,
         extra={"known_body": known.rows},
     )
@@ -188,6 +189,28 @@ def pooled_table(rows: Results) -> Table:
     }
     title = f"Do pooled 95 % intervals of {SOURCES} sources or more contain the truth?"
     return tabulate(title, rows.group("domain", "noise", "parameter"), columns, ("change", "noise", "θ_p"))
+
+
+def conclusion(rows: Results) -> list[str]:
+    """What share of all intervals holds the truth, where it is smallest, and what pooling is worth."""
+    fitted = rows.where(lambda row: row["inside"] is not None)
+    if not len(fitted):
+        return ["No parameter was fitted, so there are no intervals."]
+    shares = {
+        " ".join(key): np.mean(own["inside"]) for key, own in fitted.group("domain", "noise", "parameter").items()
+    }
+    worst = min(shares, key=shares.__getitem__)
+    trust = (
+        "So they can be taken at their word, after changes of these kinds."
+        if shares[worst] >= ASKED
+        else "Where it is below that, something acts that no parameter stands for, and the interval does not show it."
+    )
+    return [
+        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} hold the truth, of single sources "
+        f"{np.mean(fitted['alone']):.0%}.",
+        f"Fewest hold for {worst} (change, noise, parameter): {shares[worst]:.0%}; at least {ASKED:.0%} are asked for. "
+        f"{trust}",
+    ]
 
 
 def _covers(rows: Results) -> Part:

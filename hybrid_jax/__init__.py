@@ -41,6 +41,7 @@ from hybrid_jax.dynamics import (
     with_disturbance,
 )
 from hybrid_jax.flights import load_log, load_windows
+from hybrid_jax.identification import Excitation, FlightBounds, InputBounds, excitation
 from hybrid_jax.integrate import RK4, SOLVERS, rollout, rollout_batch
 from hybrid_jax.io import Model, check_savable, load, portable, save
 from hybrid_jax.networks import residual_network
@@ -62,4 +63,5 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
+__all__ += ["Excitation", "FlightBounds", "InputBounds", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]

@@ -12,7 +12,16 @@ from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
 from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, results_of
 from experiments.closed_loop.models import Trained
 from experiments.closed_loop.path_figures import flown_paths, rendered
-from experiments.closed_loop.results import ORACLE, SOURCES, Agent, ablation_tables, gap_tables, speed_table, tables
+from experiments.closed_loop.results import (
+    ORACLE,
+    SOURCES,
+    Agent,
+    ablation_tables,
+    conclusion,
+    gap_tables,
+    speed_table,
+    tables,
+)
 from experiments.closed_loop.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.reporting.claims import evaluate, verdict_table
@@ -165,6 +174,7 @@ def write(
         notes=[*missing, *notes],
         extra={"ablation": ablated.rows, "speed": timed},
         head=HEAD.strip(),
+        conclusion=conclusion(rows, few),
         tables=[*titled, speed_table(timed)],
         more_rows=ablated,
     )

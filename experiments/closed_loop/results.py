@@ -5,6 +5,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
+import numpy as np
+
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
 from experiments.reporting.results import Results, Row
 from experiments.reporting.statistics import Interval, share_of_gap
@@ -69,6 +71,42 @@ def by_agent(rows: Results) -> dict[Agent, Results]:
 def away(distance: float) -> str:
     """What a name of a place has at its end."""
     return f", {distance:g} m away" if distance else ""
+
+
+def conclusion(rows: Results, few: int) -> list[str]:
+    """How close the vehicle flies before and after adaptation, alone and with an observer, next to what is possible."""
+    sentences = []
+    for domain in (PARAMETER_SHIFT, EXTERNAL_FORCE):
+        flown = {agent: _at_home(own) for agent, own in by_agent(rows.where(domain=domain, distance=0.0)).items()}
+        parts = []
+        for model, source in SOURCES.items():
+            before, after = flown.get(Agent(source)), flown.get(Agent(model, few))
+            if before is not None and after is not None:
+                both = flown.get(Agent(model, few, observer=True))
+                more = "" if both is None else f", with an observer {_in_cm(both)}"
+                parts.append(f"{LEARNED[model]}: {_in_cm(before)} before, {_in_cm(after)} after{more}")
+        if parts:
+            best = flown.get(ORACLE)
+            known = "" if best is None else f"; the {KNOWN['oracle']} {_in_cm(best)}"
+            what = f"{DOMAINS[domain].capitalize()}, adapted to {few} trajectories, median position RMSE at home"
+            sentences.append(f"{what}: {'; '.join(parts)}{known}.")
+    lost = {
+        agent.name: f"{sum(own['crashed'])} of {len(own)}"
+        for agent, own in by_agent(rows.where(lambda row: row["distance"] > 0)).items()
+        if agent.n_train == few and agent.model in SOURCES and any(own["crashed"])
+    }
+    if lost:
+        sentences.append(f"Away from home crash: {'; '.join(f'{name}: {count}' for name, count in lost.items())}.")
+    return sentences
+
+
+def _at_home(rows: Results) -> float:
+    """The median over references and seeds, infinite if half of them crash."""
+    return float(np.median(rows.numbers(ERROR)))
+
+
+def _in_cm(error: float) -> str:
+    return f"{100 * error:.2g} cm" if math.isfinite(error) else "a crash"
 
 
 def tables(rows: Results) -> list[Table]:

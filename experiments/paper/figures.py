@@ -16,7 +16,6 @@ from matplotlib.lines import Line2D
 from experiments.paper.claims import THETA_TOLERANCE
 from experiments.paper.lanes import MODELS, THETA, Cell, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.paper.tables import UNITS, value_label
-from experiments.reporting import plots
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.plots import (
     COLUMN,
@@ -38,6 +37,7 @@ MARKERS = {FINE_TUNED: "o", TARGET_ONLY: "s", SOURCE_ONLY: ""}
 LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
+HOME, FLOOR = "on source flights", "floor"  # errors of the source there, and of every model
 MEANING = "mean ± std over seeds; hollow: of the finite ones"
 
 
@@ -76,6 +76,9 @@ def _legend(figure: Figure, title: str, curves: "_Curves") -> Figure:
     entries: dict[str, Artist] = {label(model): Line2D([], [], color=colour(model), linewidth=4) for model in models}
     style = {"color": "0.2", "markersize": 4}
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
+    # Lines of no model: words beside them would lie on other lines.
+    others = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()}
+    entries |= {name: others[name] for name in (HOME, FLOOR) if name in others}
     figure.suptitle(title)
     figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title=MEANING)
     return figure
@@ -170,8 +173,7 @@ def _draw_errors(axes: Axes, curves: _Curves, floor: float) -> None:
             axes.axhspan(curve.low[0], curve.high[0], color=colour(model), alpha=0.12, linewidth=0)
             axes.axhline(curve.mean[0], color=colour(model), linestyle=":", label=label(model, mode))
     if floor > 1 / DRAWABLE:
-        axes.axhline(floor, color="0.4", linestyle="-.", label=plots.FLOOR_LABEL)
-        _name_line(axes, floor, plots.FLOOR_LABEL)
+        axes.axhline(floor, color="0.4", linestyle="-.", label=FLOOR)
     tick_errors(axes.yaxis, *axes.get_ylim(), room=3.5)
 
 
@@ -180,23 +182,15 @@ def _draw_home(axes: Axes, rows: Results) -> None:
     for model in [model for model in MODELS if model in rows["model"]][:1]:
         home = rows.where(model=model).spread("source_mse").mean
         if 1 / DRAWABLE < home < DRAWABLE:
-            axes.axhline(home, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1,
-                         label=f"{label(model, SOURCE_ONLY)}, on source flights")  # fmt: skip
+            axes.axhline(home, color=colour(model), linestyle=(0, (6, 2, 1, 2)), linewidth=1, label=HOME)
             axes.set_ylim(bottom=min(axes.get_ylim()[0], home / 2))
-            _name_line(axes, home, "source's own error on flights before the change")
-
-
-def _name_line(axes: Axes, y: float, words: str, right: float = 0.99) -> None:
-    style = {"ha": "right", "va": "top", "fontsize": 6, "color": "0.3"}
-    axes.text(right, y, f"{words} ", transform=axes.get_yaxis_transform(), **style)
 
 
 def _draw_gains(axes: Axes, curves: _Curves) -> None:
     lows = np.concatenate([curve.low for curve in curves.values()] or [np.zeros(1)])
     lowest = max(LOWEST_RHO, min(lows[np.isfinite(lows)], default=0.0))
     axes.axhline(0.0, color="0.4", linestyle=":")
-    _name_line(axes, -0.01, "no gain", 0.6)
-    axes.set(ylabel="gain ρ (1 is perfect)")
+    axes.set(ylabel="gain ρ (0: none, 1: perfect)")
     _draw_curves(axes, curves, min(lowest, 0.0) - 0.1, 1.08, lost_at_top=False)
 
 

@@ -145,8 +145,9 @@ def draw(
     title = label(domain.name).capitalize()
     flight = fly(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
+    lines = "On source flights: the source's error before the change. Floor: error that no model here can see"
     figures = {
-        "scores": (scores(found.rows, title, floor), "Test error and gain against N (paper, Figs. 3, 5)"),
+        "scores": (scores(found.rows, title, floor), f"Test error and gain against N (paper, Figs. 3, 5). {lines}"),
         "example_flight": (example, "A flight like those of the data (paper, Fig. 7)"),
     }
     if {*config.models} - {NO_PHYSICS}:

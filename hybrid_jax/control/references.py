@@ -43,19 +43,20 @@ def reference_state(path: Path, t: Scalar, gravity: float) -> State:
 
     def attitude(t):
         acceleration = jax.jvp(lambda t: moving(t)[1], (t,), (jnp.ones_like(t),))[1]
-        return _attitude(acceleration + gravity * jnp.array(Z), path(t)[1])
+        return attitude_along(acceleration + gravity * jnp.array(Z), path(t)[1])
 
     (position, velocity), (q, turning) = moving(t), jax.jvp(attitude, (t,), (jnp.ones_like(t),))
     rates = 2 * multiply(conjugate(q), turning)[1:]  # from q̇ = ½ q ⊗ [0, ω]
     return jnp.concatenate([position, q, velocity, rates])
 
 
-def _attitude(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
+def attitude_along(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
     """The attitude with this yaw whose z axis points along `thrust`: rotations about z, then y, then x."""
     ahead = jnp.cos(yaw) * thrust[0] + jnp.sin(yaw) * thrust[1]
     left = jnp.cos(yaw) * thrust[1] - jnp.sin(yaw) * thrust[0]
     pitch = jnp.arctan2(ahead, thrust[2])
-    roll = jnp.arctan2(-left, jnp.hypot(ahead, thrust[2]))
+    # Not hypot, which has no second derivative at hover.
+    roll = jnp.arctan2(-left, jnp.sqrt(ahead**2 + thrust[2] ** 2))
     return reduce(multiply, [from_axis_angle(jnp.array(axis), by) for axis, by in ((Z, yaw), (Y, pitch), (X, roll))])
 
 

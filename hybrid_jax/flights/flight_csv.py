@@ -115,7 +115,8 @@ def _header_complaint(path, name: str, names: list[str], header: str, delimiter:
         if len(names) == 1 and other != delimiter and header.count(other) > 2:
             advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map (--columns)"
             return f"{path}: row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
-    found = ", ".join(names[:20])[:200].encode("unicode_escape").decode()
+    named = [each for each in names if each]  # a table's index has no name
+    found = ", ".join(named[:20])[:200].encode("unicode_escape").decode()
     return f"{path}: row 1, field {name}: no such column among {found}; rename a column or use a column map"
 
 

@@ -11,7 +11,7 @@ from reports import row
 from rich.console import Console
 from smoke import experiments
 
-from experiments.ablation import PRESETS, Choice, experiment, varied
+from experiments.ablation import PRESETS, Choice, conclusion, experiment, varied
 from experiments.paper.conditions import Noise, measured
 from experiments.paper.figures import ablation
 from experiments.paper.lanes import TAGS
@@ -79,6 +79,18 @@ def test_tables_have_a_line_per_value_and_domain():
     assert norm.lines[0][4].startswith("0.15 ")  # of 0.1 and 0.2
     assert norm.lines[1][5] == "+25.0, +0.0, +0.0"
     assert "∞" in norm.lines[1][2]  # a pre-training that was not finite
+
+
+def test_the_conclusion_says_what_helps_what_harms_and_what_does_nothing():
+    """Paired by seed: of the same two seeds all errors here have one ratio, so that their intervals are points."""
+    values = trial("norm", "none", False, [1e-3, 2e-3], 0.05) + trial("norm", "layer", False, [1e-3, 2e-3], 0.3)
+    values += trial("norm", "batch", True, [1e-3, 2e-3], 0.1)
+    values += trial("weight", "0", True, [1e-3, 2e-3], 0.1) + trial("weight", "1", False, [1e-3, 2e-3], 0.102)
+    best, worst, idle = conclusion(values)
+    assert best.startswith("Best of all is norm = none: 0.50 times (parameter shift), 0.50 times (external force)")
+    assert worst.startswith("What harms most is norm = layer: 3.00 times")
+    assert idle == "Changes nothing by more than 5%: weight."
+    assert conclusion(ROWS.where(value="batch")) == []
 
 
 def test_figure_has_a_panel_per_domain_and_a_line_per_value():

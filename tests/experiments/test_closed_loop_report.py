@@ -12,7 +12,17 @@ from experiments.closed_loop.claims import Evidence, Speed, claims
 from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flights import Flown, Scenario
 from experiments.closed_loop.path_figures import paths, strip
-from experiments.closed_loop.results import ERROR, REFERENCES, TAGS, Agent, ablation_tables, gap_tables, gaps, tables
+from experiments.closed_loop.results import (
+    ERROR,
+    REFERENCES,
+    TAGS,
+    Agent,
+    ablation_tables,
+    conclusion,
+    gap_tables,
+    gaps,
+    tables,
+)
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT
@@ -51,6 +61,14 @@ def make_rows(reference="hover", distance=0.0):
 
 ROWS = Results([row for reference in REFERENCES for row in make_rows(reference)] + make_rows(distance=60.0), TAGS)
 WORSE_AWAY = Results([{**row, "position_rmse": row["position_rmse"] * (1.2 if row["distance"] else 1)} for row in ROWS])
+
+
+def test_the_conclusion_sets_flights_before_and_after_beside_what_is_possible():
+    _, wind = conclusion(ROWS, FEW)
+    assert "hybrid: 40 cm before, 7.1 cm after, with an observer 6.1 cm" in wind
+    assert wind.endswith("the true vehicle, mean wind 5 cm.")
+    lost = Results([{**row, "crashed": row["distance"] > 0 and row["model"] == "hybrid"} for row in ROWS], TAGS)
+    assert conclusion(lost, FEW)[-1].startswith("Away from home crash: hybrid, N = 100: 6 of 6; ")
 
 
 def changed(rows, agent, domain="external_force", reference="hover", **values):

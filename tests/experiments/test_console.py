@@ -10,8 +10,11 @@ from rich.cells import cell_len
 from rich.console import Console
 from smoke import ROOT
 
+from experiments.coverage import pooled_table
+from experiments.paper.known_body import known_body_table
 from experiments.reporting.contents import MEANINGLESS
 from experiments.reporting.report import write_report
+from experiments.reporting.results import Results
 from experiments.reporting.tables import Table, columns_of_parts, print_tables
 from experiments.runner.progress import Line
 
@@ -30,16 +33,33 @@ def tables_of(page):
 @pytest.mark.parametrize("page", REPORTS, ids=lambda page: page.parent.name)
 def test_no_word_and_no_number_is_broken(page, width, terminal):
     for table in tables_of(page):
-        text = io.StringIO()
-        print_tables(Console(file=text, width=width, force_terminal=terminal), [table])
-        printed = ANSI.sub("", text.getvalue())
-        assert max(map(cell_len, printed.splitlines())) <= width
-        words = set(printed.split())
-        cells = {cell for line in [table.header, *table.lines] for cell in line}
-        assert [word for cell in cells for word in cell.split() if word not in words] == []
-        flat = [" ".join(line.split()) for line in printed.splitlines()]
-        pairs = {pair for cell in cells for pair in re.findall(r"\S+ ± [^\s,;]+", cell)}
-        assert [pair for pair in pairs if not any(pair in line for line in flat)] == []
+        assert_whole(table, width, terminal)
+
+
+@pytest.mark.parametrize("terminal", [True, False])
+@pytest.mark.parametrize("width", [80, 120])
+def test_nor_in_the_tables_of_coverage(width, terminal):
+    """Of which no report is kept: the longest names and numbers that it can have."""
+    tags = {"domain": "load_and_wind", "noise": "1", "parameter": "k", "draw": 0}
+    numbers = {"inside": True, "alone": 1.0, "error": -123.45, "half_width": 1234.56}
+    known = {"coverage": 0.5, "standard_error": 0.05, "bias": -12.3, "half_width": 123.4, "converged": 1.0}
+    case = {"case": "exact physics", "noise_on": "targets", "parameter": "Ix"}
+    tables = pooled_table(Results([tags | numbers])), known_body_table(Results([case | known]), 0.95)
+    for table in tables:
+        assert_whole(table, width, terminal)
+
+
+def assert_whole(table, width, terminal):
+    text = io.StringIO()
+    print_tables(Console(file=text, width=width, force_terminal=terminal), [table])
+    printed = ANSI.sub("", text.getvalue())
+    assert max(map(cell_len, printed.splitlines())) <= width
+    words = set(printed.split())
+    cells = {cell for line in [table.header, *table.lines] for cell in line}
+    assert [word for cell in cells for word in cell.split() if word not in words] == []
+    flat = [" ".join(line.split()) for line in printed.splitlines()]
+    pairs = {pair for cell in cells for pair in re.findall(r"\S+ ± [^\s,;]+", cell)}
+    assert [pair for pair in pairs if not any(pair in line for line in flat)] == []
 
 
 def test_a_table_that_is_too_wide_comes_in_parts_that_each_have_the_labels():

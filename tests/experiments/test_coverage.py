@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from smoke import experiments
 
-from experiments.coverage import CLAIMS, CoverageConfig, _compared, pooled_table
+from experiments.coverage import CLAIMS, CoverageConfig, _compared, conclusion, pooled_table
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 
@@ -26,6 +26,14 @@ def test_the_claim_fails_where_significantly_fewer_intervals_hold(inside, holds)
     (verdict,) = evaluate(CLAIMS, rows(inside))
     assert verdict.holds is holds
     assert verdict.measured == f"weak_rotor 1 Ix {inside / 100:.2f} of 100"
+
+
+@pytest.mark.parametrize(("inside", "means"), [(97, "So they can be taken"), (80, "something acts")])
+def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
+    first, second = conclusion(rows(inside))
+    assert first == f"Of 100 pooled 95 % intervals {inside}% hold the truth, of single sources 50%."
+    assert second.startswith(f"Fewest hold for weak_rotor 1 Ix (change, noise, parameter): {inside}%")
+    assert means in second
 
 
 def test_a_parameter_that_was_not_fitted_does_not_count():

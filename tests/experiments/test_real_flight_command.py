@@ -21,6 +21,13 @@ from hybrid_jax.flights.windows import cut_windows, require_common_interval
 from hybrid_jax.vehicle import IRIS
 
 
+@pytest.fixture
+def vehicle(tmp_path):
+    path = tmp_path / "vehicle.toml"
+    path.write_text(vehicle_toml(IRIS))
+    return path
+
+
 def test_logs_are_read_checked_and_cleaned(tmp_path):
     source = write(tmp_path / "source", LOGS[:2])
     cleaning = replace(CONFIG.cleaning, in_flight=True, resample=0.02, low_pass=20.0, delay=0.02)
@@ -181,9 +188,7 @@ def test_lists_may_be_comma_separated():
     assert several == set(LISTS)
 
 
-def test_learn_option_overrides_the_vehicle_file(tmp_path):
-    vehicle = tmp_path / "vehicle.toml"
-    vehicle.write_text(vehicle_toml(IRIS))
+def test_learn_option_overrides_the_vehicle_file(vehicle, tmp_path):
     config = replace(CONFIG, learn=("Ix", LAG))
     *models, chooses_lag, not_learned = load_vehicle_models(vehicle, config)
     assert (chooses_lag, not_learned) == (True, "")
@@ -193,9 +198,7 @@ def test_learn_option_overrides_the_vehicle_file(tmp_path):
         replace(config, learn=(LAG, LAG))
 
 
-def test_a_term_without_a_purpose_is_not_learned(tmp_path):
-    vehicle = tmp_path / "vehicle.toml"
-    vehicle.write_text(vehicle_toml(IRIS))
+def test_a_term_without_a_purpose_is_not_learned(vehicle):
     before, after, _, line = load_vehicle_models(vehicle, CONFIG)
     assert "cable_pull" not in (*before.learn, *after.learn)
     assert "cable_pull is not learned, as the file does not say what it is for" in line
@@ -207,12 +210,11 @@ def test_a_term_without_a_purpose_is_not_learned(tmp_path):
         load_vehicle_models(vehicle, CONFIG)
 
 
-def test_a_failed_check_stops_before_training_and_says_what_to_type(tmp_path):
+def test_a_failed_check_stops_before_training_and_says_what_to_type(vehicle, tmp_path):
     """A motor beyond its limit: refused before training, or overridden."""
     source = write(tmp_path / "source", [replace(log, u=np.add(log.u, [0, 0, 900, 0])) for log in LOGS[:3]])
     (source / "notes.txt").write_text("windy")
-    (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
-    config = replace(CONFIG, vehicle=tmp_path / "vehicle.toml", source=source, cache=tmp_path)
+    config = replace(CONFIG, vehicle=vehicle, source=source, cache=tmp_path)
     with pytest.raises(ChecksFailed) as stop:
         prepare(config, Console(quiet=True))
     assert "source/chirp_run1.csv.gz: motors within limits: rotor_speed of motor 2" in stop.value.args[0]
@@ -222,22 +224,20 @@ def test_a_failed_check_stops_before_training_and_says_what_to_type(tmp_path):
 
 
 @pytest.mark.slow
-def test_failed_checks_end_with_exit_code_3(tmp_path):
-    (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
+def test_failed_checks_end_with_exit_code_3(vehicle, tmp_path):
     source = write(tmp_path / "source", [replace(log, u=log.u + 900) for log in LOGS[:3]])
-    run = command("real_flight", "--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source), folder=tmp_path)
+    run = command("real_flight", "--vehicle", str(vehicle), "--source", str(source), folder=tmp_path)
     assert run.returncode == FAILED_CHECKS
     assert "motors within limits" in run.stderr
     assert "Traceback" not in run.stderr
 
 
 @pytest.mark.slow
-def test_bad_log_is_refused_with_file_row_and_field(tmp_path):
-    (tmp_path / "vehicle.toml").write_text(vehicle_toml(IRIS))
+def test_bad_log_is_refused_with_file_row_and_field(vehicle, tmp_path):
     source = write(tmp_path / "source", LOGS[:3])
     rows = ("0,0,0,1,1,0,0,0,0,0,0,0,0,0,600,600,600,600", "0.01,0,0,1,1,0,0,0,nan,0,0,0,0,0,600,600,600,600")
     (source / "bad.csv").write_text("\n".join(["t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3", *rows]))
-    options = ("--vehicle", str(tmp_path / "vehicle.toml"), "--source", str(source))
+    options = ("--vehicle", str(vehicle), "--source", str(source))
     line = refused(command("real_flight", *options, folder=tmp_path), "real_flight")
     assert line.startswith(f"real_flight: {source / 'bad.csv'}: row 3, field vx: ")
     left = (tmp_path / "out" / "real_flight").iterdir()
@@ -274,12 +274,8 @@ def test_simulated_run_writes_a_complete_report(simulated):
         (chosen,) = (r for r in report["rows"] if (r["model"], r["fold"]) == ("chosen", fold["tested_on"]))
         assert chosen["recipe"] == selected["chosen"] in selected["scores"]
     page = (out / "report.md").read_text()
-    assert (
-        page.index("Checks: of each log")
-        < page.index("Error to expect")
-        < page.index("Test flights against")
-        < page.index("RMSE at step")
-    )
+    parts = "Checks: of each log", "Error to expect", "Test flights against", "RMSE at step"
+    assert sorted(parts, key=page.index) == [*parts]
     for figure in report["figures"]:
         assert (out / figure).read_bytes().startswith(b"\x89PNG")
         assert f"({figure})" in page

@@ -12,7 +12,7 @@ from reports import ODD_ROWS, TRUTH, changed, make_report, make_rows
 from rich.console import Console
 
 from experiments.paper.claims import DOMAINS_OF
-from experiments.paper.figures import scores
+from experiments.paper.figures import HOME, scores
 from experiments.paper.lanes import THETA, by_altitude
 from experiments.paper.study import placeholder
 from experiments.paper.tables import altitudes, parameters, run_notes
@@ -86,7 +86,7 @@ def test_altitudes_and_the_sources_own_error_are_in_table_and_figure():
     assert {key[2] for key in lines} == {"–", "100", "1000"}  # the smallest and the largest N
     left, _ = scores(rows, "Scores").axes
     drawn = dict(zip(*reversed(left.get_legend_handles_labels()), strict=True))
-    assert drawn["hybrid, source-only, on source flights"].get_ydata()[0] == 0.015
+    assert drawn[HOME].get_ydata()[0] == 0.015
     assert left.get_ylim()[0] <= 0.0075
 
 

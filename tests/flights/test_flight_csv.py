@@ -60,6 +60,7 @@ def changed(row, field, cell):
     ("lines", "words"),
     [
         (lambda rows: [HEADER.replace(",qz", ""), *rows], ("row 1", "field qz", "column map")),
+        (lambda rows: [",stamp", "0,1"], ("row 1", "no such column among stamp;")),  # a table with its index
         (lambda rows: [HEADER.replace("vy", "vx"), *rows], ("row 1", "field vx", "2 times")),
         (changed(40, "vy", "nan"), ("row 40", "field vy", "'nan'")),
         (changed(40, "vy", ""), ("row 40", "field vy", "empty")),

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights import load_logs
@@ -136,11 +137,11 @@ def bag(folder, flight, plugin, second=None):
             writer.write(lines[topic], at, store.serialize_cdr(message, lines[topic].msgtype))
 
         attitudes = flight.x[:, 3:7]
-        for t, x, q, u in zip(flight.t, flight.x, attitudes, flight.u, strict=True):
+        velocities = Rotation.from_quat(attitudes[:, [1, 2, 3, 0]]).inv().apply(flight.x[:, 7:10])
+        for t, x, q, turned, u in zip(flight.t, flight.x, attitudes, velocities, flight.u, strict=True):
             at = 10**18 + round(t * 1e9)
             stamp = kinds["Time"](sec=at // 10**9, nanosec=at % 10**9)
             header = kinds["Header"](stamp=stamp, frame_id="")
-            turned = np.linalg.inv(_matrix(q)) @ x[7:10]
             pose = kinds["PoseWithCovariance"](kinds["Pose"](kinds["Point"](*x[:3]), wxyz(q)), zeros)
             twist = kinds["TwistWithCovariance"](kinds["Twist"](point(*turned), point(*x[10:])), zeros)
             for topic in ("/odom", *([second] if second else [])):
@@ -149,14 +150,6 @@ def bag(folder, flight, plugin, second=None):
             write("/imu", at, kinds["Imu"](header, *imu))
             write("/rotors", at, kinds["Float64MultiArray"](layout, u * 30 / np.pi))
     return folder
-
-
-def _matrix(q):
-    w, x, y, z = q
-    rows = [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)]
-    rows += [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)]
-    rows += [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]
-    return np.array(rows).reshape(3, 3)
 
 
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
