@@ -1,0 +1,370 @@
+"""Adapt while it runs: an extended Kalman filter of state, θ_p and a constant disturbance, one sample at a time.
+
+The state of the filter is z = [x, θ]: the state x of the system, which the one-step predictions need without noise,
+and θ, all parameters of the physics and the disturbance. Samples enter one number after the other, so that an update
+needs no matrix inverse (Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. V.2).
+
+- Forgetting: θ is a random walk, faster the more the normalised innovations squared (NIS) exceed their expectation.
+- Test for a change: two exponentially weighted means of the whitened innovations (MEWMA: Lowry, Woodall, Champ, Rigdon,
+  "A multivariate exponentially weighted moving average control chart", 1992). An alarm opens the covariance of θ.
+- Consistency: while the mean NIS is far too large, what the filter says is not used (Bar-Shalom, Li, Kirubarajan,
+  "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the last good estimate is.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax import checks
+from hybrid_jax.adaptation.least_squares import ravel_parameters
+from hybrid_jax.adaptation.uncertainty import Interval, intervals, named_parameters
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import physics_of, with_disturbance
+from hybrid_jax.dynamics.estimator import AbstractEstimator
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.integrate import rk4_step
+from hybrid_jax.rotation import normalise
+from hybrid_jax.state import QUATERNION
+
+DISTURBANCE = "disturbance"
+Numbers = float | tuple[float, ...] | np.ndarray
+HUGE = 1e15  # a number beyond it, or NaN, was not measured
+UNEXCITED = 0.5  # share of its variance without data, above which the data have said nothing on a parameter
+
+
+@dataclass(frozen=True)
+class Tuning:
+    """How fast an `OnlineAdaptation` forgets, and what it calls a change. ValueError for numbers that are negative."""
+
+    drift: float = 0.02  # random walk of a parameter, as a share of its prior standard deviation, 1/√s
+    disturbance_drift: float = 0.15  # likewise, of the disturbance
+    forgetting: float = 10.0  # by how much the variance of the walk grows for each unit of NIS above 1
+    window: float = 0.2  # time constant of the mean NIS [s]
+    means: tuple[float, float] = (0.3, 0.06)  # weights of the newest innovation in the two means of the test
+    alarm: float = 5.0  # in standard deviations of a normal number: 5 is a chance of 3e-7 a sample
+    pause: float = 0.1  # least time between two alarms [s]
+    reject: float = 6.0  # mean NIS from which the filter is not believed
+    clip: float = 5.0  # standard deviations at which an innovation is cut off, so that an outlier does little
+    gap: float = 0.1  # after so long without a sample the state is taken from the next one [s]
+    frozen: int = 3  # equal samples in a row from which a sensor counts as frozen
+    bound: float = 4.0  # prior standard deviations that a parameter may move
+
+    def __post_init__(self):
+        for name in ("drift", "disturbance_drift", "forgetting", "pause"):
+            checks.not_negative(name, getattr(self, name))
+        for name in ("window", "alarm", "reject", "clip", "gap", "bound"):
+            checks.positive(name, getattr(self, name))
+        checks.count("frozen", self.frozen)
+
+
+class OnlineState(eqx.Module):
+    """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold."""
+
+    x: Float[Array, "*n d"]  # estimated state
+    theta: Float[Array, "*n p"]  # change of θ in prior standard deviations
+    covariance: Float[Array, "*n d+p d+p"]  # of both, in these units
+    trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
+    free: Float[Array, "*n p"]  # variances that θ would have, had nothing been measured since the last alarm
+    means: Float[Array, "*n 2 d"]  # of whitened innovations, for the test
+    nis: Float[Array, "*n"]  # mean normalised innovation squared, 1 if noise and model are as stated
+    quiet: Float[Array, "*n"]  # time since the last alarm [s]
+    silent: Float[Array, "*n"]  # time since something was measured [s]
+    last: Float[Array, "*n d"]  # the last sample
+    equal: Float[Array, "*n d"]  # how many samples in a row were equal
+    unseen: Float[Array, "*n d"]  # 1 where the last sample was not used
+    changes: Float[Array, "*n"]  # how many alarms there were
+    restarts: Float[Array, "*n"]  # how often the filter had to begin anew, since a number was not finite
+
+
+class Flags(NamedTuple):
+    """What is wrong, or was found."""
+
+    missing: Bool[Array, " d"]  # not measured in the last sample: NaN, or equal to the one before
+    frozen: Bool[Array, " d"]  # sensors that repeat their last value
+    gap: Bool[Array, ""]  # nothing was measured for longer than `Tuning.gap`
+    changed: Bool[Array, ""]  # an alarm in the last second
+    inconsistent: Bool[Array, ""]  # errors are too large for the model at any θ: the last good estimate is used
+    unexcited: Bool[Array, " p"]  # parameters on which the data say nothing
+    at_bound: Bool[Array, " p"]  # parameters at the end of their range
+
+
+class OnlineAdaptation(AbstractEstimator):
+    """Recursive estimator of the parameters of any field, and of a constant disturbance, with their covariance.
+
+        filter = hj.OnlineAdaptation(field, dt=0.01, noise=0.02, disturbance=1.0)
+        state = filter.begin(x)
+        state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
+
+    Pure: its methods compile and map over stacked states, and do not raise for bad samples; see `flags`.
+
+    Attributes:
+        field: its physics is adapted from the values that it has; a network beside it stays as it is.
+        dt: time between two samples [s].
+        noise: standard deviation of what is measured of each state.
+        prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
+            a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
+            array, efficiency.
+        disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
+        indices: of the disturbed states; by default v̇ and ω̇ of a rigid body.
+        process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
+        initial: share of the prior that is uncertain at the start, before a change.
+
+    Raises:
+        ValueError: a number out of range, an unknown name, or physics without parameters.
+    """
+
+    field: AbstractVectorField
+    dt: float = eqx.field(static=True)
+    noise: tuple[float, ...] = eqx.field(static=True)  # one for each state, or one for all
+    process: tuple[float, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters, in the order of θ
+    scales: tuple[float, ...] = eqx.field(static=True)  # the prior standard deviation of each
+    initial: float = eqx.field(static=True)
+    tuning: Tuning = eqx.field(static=True)
+
+    def __init__(
+        self,
+        field: AbstractVectorField,
+        dt: float,
+        noise: Numbers,
+        prior: float | Mapping[str, float] = 0.3,
+        disturbance: Numbers = 0.0,
+        indices: tuple[int, ...] | None = None,
+        process: Numbers = 0.0,
+        initial: float = 1.0,
+        tuning: Tuning | None = None,
+    ):
+        checks.positive("dt", dt, "a positive number of seconds")
+        for name, numbers, check in (("noise", noise, checks.positive), ("process", process, checks.not_negative)):
+            for number in np.ravel(numbers):
+                check(name, number)
+        if not 0 < initial <= 1:
+            raise ValueError(f"initial must be a share above 0 and at most 1, got {initial}")
+        if np.any(disturbance):
+            if indices is None and not moves_a_rigid_body(physics_of(field)):
+                raise ValueError("indices must say which states are disturbed, as the system is no rigid body")
+            field = with_disturbance(field, indices)
+        self.field, self.dt, self.initial = field, float(dt), float(initial)
+        self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
+        self.names = _names(field)
+        self.scales = _scales(self.names, prior, disturbance)
+        self.tuning = Tuning() if tuning is None else tuning
+
+    def begin(self, x: Float[Array, " d"]) -> OnlineState:
+        """Before the first sample x, at the field's own parameters."""
+        x = jnp.asarray(x, float)
+        p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
+        zero, start = jnp.zeros((), x.dtype), jnp.full(p, self.initial**2, x.dtype)
+        covariance = jnp.diag(jnp.concatenate([self._variances(x), start]))
+        theta = jnp.zeros(p, x.dtype)
+        means = jnp.zeros((2, len(x)), x.dtype)
+        long = zero + 1e3
+        return OnlineState(x, theta, covariance, theta, start, means, zero + 1, long, zero, x, none, none, zero, zero)
+
+    def update(
+        self, state: OnlineState, x: Float[Array, " d"], u: Float[Array, " m"], elapsed: Float[Array, ""] | float = 1.0
+    ) -> OnlineState:
+        """After one period.
+
+        Args:
+            x: the new sample; NaN where nothing was measured.
+            u: the mean input over the period, as it acted: delayed and lagged, not as it was commanded.
+            elapsed: periods since the last update. Over more than one nothing is learned of the input, and the state is
+                taken from the sample.
+        """
+        tuning, d = self.tuning, len(state.x)
+        x = self._same_hemisphere(jnp.asarray(x, state.x.dtype), state.x)
+        equal = jnp.where(x == state.last, state.equal + 1, 0.0)
+        seen = (jnp.abs(x) < HUGE) & (equal == 0)
+        acted = jnp.all(jnp.abs(u) < HUGE) & (elapsed < 1.5)
+        any_seen = jnp.any(seen)
+        silent = jnp.where(any_seen, 0.0, state.silent + self.dt * elapsed)
+        anew = any_seen & (~acted | (state.silent + self.dt * elapsed > tuning.gap + self.dt))
+
+        z, covariance, free = self._predict(state, u, acted, elapsed)
+        z, covariance = self._from_sample(anew, seen, x, z, covariance)
+        z, covariance, white = self._correct(z, covariance, x, seen & ~anew)
+
+        theta = jnp.clip(z[d:], -tuning.bound, tuning.bound)
+        z = jnp.concatenate([self._unit(z[:d]), theta])
+        share = jnp.sum(jnp.square(white)) / jnp.maximum(jnp.sum(jnp.where(seen, 1.0, 0.0)), 1.0)
+        weight = jnp.where(any_seen & ~anew, -jnp.expm1(-self.dt / tuning.window), 0.0)
+        nis = state.nis + weight * (share - state.nis)
+        alarm, means = self._test(state, white, any_seen & ~anew)
+        open_up = jnp.concatenate([jnp.zeros(d, x.dtype), jnp.where(alarm, jnp.ones_like(theta), 0.0)])
+        covariance, free = covariance + jnp.diag(open_up), jnp.where(alarm, free + 1, free)
+        believed = nis < tuning.reject
+        new = OnlineState(
+            z[:d],
+            theta,
+            covariance,
+            jnp.where(believed, theta, state.trusted),
+            free,
+            means,
+            nis,
+            jnp.where(alarm, 0.0, state.quiet + self.dt * elapsed),
+            silent,
+            jnp.where(jnp.abs(x) < HUGE, x, state.last),
+            equal,
+            jnp.where(seen, 0.0, 1.0),
+            state.changes + jnp.where(alarm, 1.0, 0.0),
+            state.restarts,
+        )
+        return self._sound(new, state)
+
+    def model(self, state: OnlineState) -> AbstractVectorField:
+        """The field at the last good estimate, with its disturbance."""
+        theta, unravel = ravel_parameters(self.field)
+        return unravel((theta + jnp.asarray(self.scales, theta.dtype) * state.trusted).astype(theta.dtype))
+
+    def intervals(self, state: OnlineState, level: float = 0.95) -> dict[str, Interval]:
+        """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`."""
+        scales, d = jnp.asarray(self.scales, state.x.dtype), state.x.shape[-1]
+        return intervals(self.model(state), scales[:, None] * state.covariance[d:, d:] * scales, level)
+
+    def flags(self, state: OnlineState) -> Flags:
+        """What is wrong with samples, parameters and model, or was found."""
+        tuning, d = self.tuning, state.x.shape[-1]
+        return Flags(
+            missing=state.unseen > 0,
+            frozen=state.equal >= tuning.frozen,
+            gap=state.silent > tuning.gap,
+            changed=state.quiet < 1,
+            inconsistent=state.nis >= tuning.reject,
+            unexcited=jnp.diagonal(state.covariance, axis1=-2, axis2=-1)[..., d:] > UNEXCITED * state.free,
+            at_bound=jnp.abs(state.theta) >= tuning.bound,
+        )
+
+    def _variances(self, x) -> Float[Array, " d"]:
+        return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
+
+    def _is_rigid(self) -> bool:
+        return moves_a_rigid_body(physics_of(self.field))
+
+    def _same_hemisphere(self, x, like):
+        """The sample with the sign of its quaternion that is nearer."""
+        if not self._is_rigid():
+            return x
+        other = jnp.sum(x[QUATERNION] * like[QUATERNION]) < 0
+        return x.at[QUATERNION].multiply(jnp.where(other, -1.0, 1.0))
+
+    def _unit(self, x):
+        return x.at[QUATERNION].set(normalise(x[QUATERNION])) if self._is_rigid() else x
+
+    def _predict(self, state: OnlineState, u, acted, elapsed):
+        """Mean and covariance before the sample, and the variances without data."""
+        tuning, d, p = self.tuning, len(state.x), len(state.theta)
+        start, unravel = ravel_parameters(self.field)
+        scales = jnp.asarray(self.scales, state.x.dtype)
+        held = jnp.where(jnp.abs(u) < HUGE, u, 0.0)
+
+        def ahead(z):
+            field = unravel((start + scales * z[d:]).astype(start.dtype))
+            return self._unit(rk4_step(field, z[:d], held, self.dt))
+
+        z = jnp.concatenate([state.x, state.theta])
+        moved, push = jax.linearize(ahead, z)
+        slope = jax.vmap(push, out_axes=1)(jnp.eye(d + p, dtype=z.dtype))  # of the new x by z
+        top = slope @ state.covariance
+        inner = top @ slope.T
+        covariance = jnp.concatenate(
+            [jnp.concatenate([inner, top[:, d:]], 1), jnp.concatenate([top[:, d:].T, state.covariance[d:, d:]], 1)]
+        )
+        covariance = jnp.where(acted, (covariance + covariance.T) / 2, state.covariance)
+        walk = [tuning.disturbance_drift if name.startswith(DISTURBANCE) else tuning.drift for name in self.names]
+        walk = np.array(walk)
+        faster = 1 + tuning.forgetting * jnp.maximum(state.nis - 1, 0.0)
+        walked = jnp.asarray(self.dt * walk**2, z.dtype) * faster * elapsed
+        noise = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, z.dtype)), (d,))
+        covariance = covariance + jnp.diag(jnp.concatenate([noise, walked]))
+        # No parameter becomes less certain than the prior, also if nothing excites it for long.
+        variance = jnp.diagonal(covariance)[d:]
+        shrink = jnp.concatenate([jnp.ones(d, z.dtype), jnp.sqrt(1 / jnp.maximum(variance, 1.0))])
+        free = jnp.minimum(state.free + walked, 1.0)
+        z = jnp.where(acted, jnp.concatenate([moved, state.theta]), z)
+        return z, shrink[:, None] * covariance * shrink, free
+
+    def _from_sample(self, anew, seen, x, z, covariance):
+        """The state as the sample has it, if `anew`; θ stays."""
+        d, p = len(x), len(z) - len(x)
+        kept = jnp.concatenate([jnp.full(d, jnp.where(anew, 0.0, 1.0), z.dtype), jnp.ones(p, z.dtype)])
+        variance = jnp.where(seen, self._variances(x), 1e4 * self._variances(x))
+        added = jnp.concatenate([jnp.where(anew, variance, 0.0), jnp.zeros(p, z.dtype)])
+        z = jnp.concatenate([jnp.where(anew & seen, x, z[:d]), z[d:]])
+        return z, kept[:, None] * covariance * kept + jnp.diag(added)
+
+    def _correct(self, z, covariance, x, seen):
+        """With one measured number after the other; also the innovations over their standard deviations."""
+        noise, white, clip = self._variances(x), [], self.tuning.clip
+        for i in range(len(x)):
+            column = covariance[:, i]
+            size = jnp.sqrt(column[i] + noise[i])
+            error = jnp.where(seen[i], jnp.clip((x[i] - z[i]) / size, -clip, clip), 0.0)
+            gain = jnp.where(seen[i], column / size, 0.0)
+            z = z + gain * error
+            covariance = covariance - gain[:, None] * gain
+            white.append(error)
+        return z, covariance, jnp.stack(white)
+
+    def _test(self, state: OnlineState, white, measured):
+        """Whether the innovations have a mean, and their means afterwards; an alarm begins these anew."""
+        tuning, m = self.tuning, len(white)
+        weight = jnp.asarray(tuning.means, white.dtype)
+        means = state.means + jnp.where(measured, weight[:, None] * (white - state.means), 0.0)
+        square = (2 - weight) / weight * jnp.sum(jnp.square(means), axis=1)
+        # Wilson and Hilferty's quantile of χ² (1931).
+        limit = m * (1 - 2 / (9 * m) + tuning.alarm * (2 / (9 * m)) ** 0.5) ** 3
+        alarm = jnp.any(square > limit) & (state.quiet > tuning.pause)
+        return alarm, jnp.where(alarm, 0.0, means)
+
+    def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
+        """The new state, or a beginning at the last good θ if a number of it is not finite."""
+        total = jnp.sum(jnp.abs(new.covariance)) + jnp.sum(jnp.abs(new.x)) + jnp.sum(jnp.abs(new.theta))
+        least = jnp.min(jnp.diagonal(new.covariance))
+        sound = (total < HUGE) & (new.nis < HUGE) & (least > 0)
+        x = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0)
+        again = self.begin(x)
+        p = len(again.theta)
+        ones = jnp.ones(p, x.dtype)
+        covariance = jnp.diag(jnp.concatenate([self._variances(x), ones]))
+        parts = ("theta", "trusted", "covariance", "free", "changes", "restarts")
+        values = old.trusted, old.trusted, covariance, ones, old.changes, old.restarts + 1
+        again = eqx.tree_at(lambda s: [getattr(s, name) for name in parts], again, list(values))
+        return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, again)
+
+
+def _names(field: AbstractVectorField) -> tuple[str, ...]:
+    """The name of each parameter of the physics, in the order of the vector of all; the field may be traced."""
+
+    def numbers(theta, unravel):
+        return jnp.stack(list(named_parameters(unravel(theta)).values()))
+
+    with jax.ensure_compile_time_eval():
+        like = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype) if eqx.is_inexact_array(a) else a, field)
+        theta, unravel = ravel_parameters(like)
+        slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
+        labels = list(named_parameters(like))
+    return tuple(labels[i] for i in np.argmax(np.abs(slopes), axis=0))
+
+
+def _scales(names: tuple[str, ...], prior: float | Mapping[str, float], disturbance: Numbers) -> tuple[float, ...]:
+    """The prior standard deviation of each parameter."""
+    groups = [name.partition("[")[0] for name in names]
+    own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
+    if unknown := sorted(own.keys() - {*names, *groups}):
+        raise ValueError(f"prior: {', '.join(unknown)}: must be among {', '.join(dict.fromkeys(groups))}")
+    disturbed = iter(np.broadcast_to(disturbance, groups.count(DISTURBANCE)).tolist())
+    found = []
+    for name, group in zip(names, groups, strict=True):
+        scale = next(disturbed) if group == DISTURBANCE else own.get(name, own.get(group))
+        if scale is None:
+            raise ValueError(f"prior: {group} must be given")
+        checks.positive(group if group == DISTURBANCE else f"prior of {name}", scale)
+        found.append(float(scale))
+    return tuple(found)
