@@ -55,7 +55,7 @@ PARTS = 4 * 3  # Ix, Iy, Iz, centre of mass (2), efficiency (4), added drag (3):
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
 PROCESS = (0.0,) * 7 + (0.02,) * 3 + (0.05,) * 3
-INITIAL = 0.1  # before the change the model is known to a tenth of the prior
+INITIAL = 1.0
 
 
 def nominal() -> AbstractVectorField:

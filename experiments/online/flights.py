@@ -179,7 +179,7 @@ class Program:
 
     def __init__(self, own: Setting, most: int):
         width = min(WIDTH.get(jax.default_backend(), most), most)
-        self.map = LaneMap(partial(simulate, own), width, min_capacity=most, compiler=FASTEST_COMPILE)
+        self.map = LaneMap(partial(simulate, own), width, min_capacity=most, compiler=None)
         self.shared = (own.references,)
 
     def __call__(self, halves: Sequence[Half], active: bool = True):

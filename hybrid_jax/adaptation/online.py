@@ -4,11 +4,14 @@ The state of the filter is z = [x, θ]: the state x of the system, which the one
 and θ, all parameters of the physics and the disturbance. Samples enter one number after the other, so that an update
 needs no matrix inverse (Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. V.2).
 
-- Forgetting: θ is a random walk, faster the more the normalised innovations squared (NIS) exceed their expectation.
-- Test for a change: two exponentially weighted means of the whitened innovations (MEWMA: Lowry, Woodall, Champ, Rigdon,
-  "A multivariate exponentially weighted moving average control chart", 1992). An alarm opens the covariance of θ.
-- Consistency: while the mean NIS is far too large, what the filter says is not used (Bar-Shalom, Li, Kirubarajan,
-  "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the last good estimate is.
+- Test for a change: if noise and model are right, the corrections of a parameter are uncorrelated; if it has changed,
+  they pull to one side. Their exponentially weighted sum over its standard deviation is the test (the idea of the local
+  approach: Benveniste, Basseville, Moustakides, "The asymptotic local approach to change detection and model
+  validation", 1987). It also sees changes without a steady push, such as of an inertia. An alarm opens the covariance.
+- Forgetting: θ is a slow random walk, and a parameter that is pulled walks faster.
+- Consistency: while the mean of the normalised innovations squared (NIS) is far too large, what the filter says is not
+  used (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the
+  last good estimate is.
 """
 
 from collections.abc import Mapping
@@ -35,6 +38,7 @@ from hybrid_jax.state import QUATERNION
 DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
 HUGE = 1e15  # a number beyond it, or NaN, was not measured
+FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
 UNEXCITED = 0.5  # share of its variance without data, above which the data have said nothing on a parameter
 
 
@@ -42,12 +46,12 @@ UNEXCITED = 0.5  # share of its variance without data, above which the data have
 class Tuning:
     """How fast an `OnlineAdaptation` forgets, and what it calls a change. ValueError for numbers that are negative."""
 
-    drift: float = 0.02  # random walk of a parameter, as a share of its prior standard deviation, 1/√s
-    disturbance_drift: float = 0.15  # likewise, of the disturbance
-    forgetting: float = 10.0  # by how much the variance of the walk grows for each unit of NIS above 1
+    drift: float = 0.002  # random walk of a parameter, as a share of its prior standard deviation, 1/√s
+    forgetting: float = 10.0  # how much faster a parameter walks for each unit of its squared test beyond `eager`
+    eager: float = 6.0  # of a χ² of one degree
     window: float = 0.2  # time constant of the mean NIS [s]
-    means: tuple[float, float] = (0.3, 0.06)  # weights of the newest innovation in the two means of the test
-    alarm: float = 5.0  # in standard deviations of a normal number: 5 is a chance of 3e-7 a sample
+    spans: tuple[float, float] = (0.05, 0.5)  # time constants of the two sums of the test [s]
+    alarm: float = 5.0  # of the test, a normal number if nothing has changed
     pause: float = 0.1  # least time between two alarms [s]
     reject: float = 6.0  # mean NIS from which the filter is not believed
     clip: float = 5.0  # standard deviations at which an innovation is cut off, so that an outlier does little
@@ -56,7 +60,7 @@ class Tuning:
     bound: float = 4.0  # prior standard deviations that a parameter may move
 
     def __post_init__(self):
-        for name in ("drift", "disturbance_drift", "forgetting", "pause"):
+        for name in ("drift", "forgetting", "eager", "pause"):
             checks.not_negative(name, getattr(self, name))
         for name in ("window", "alarm", "reject", "clip", "gap", "bound"):
             checks.positive(name, getattr(self, name))
@@ -71,7 +75,8 @@ class OnlineState(eqx.Module):
     covariance: Float[Array, "*n d+p d+p"]  # of both, in these units
     trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
     free: Float[Array, "*n p"]  # variances that θ would have, had nothing been measured since the last alarm
-    means: Float[Array, "*n 2 d"]  # of whitened innovations, for the test
+    pull: Float[Array, "*n 2 p"]  # weighted sums of the corrections of θ, for the test
+    spread: Float[Array, "*n 2 p"]  # their variances if nothing has changed
     nis: Float[Array, "*n"]  # mean normalised innovation squared, 1 if noise and model are as stated
     quiet: Float[Array, "*n"]  # time since the last alarm [s]
     silent: Float[Array, "*n"]  # time since something was measured [s]
@@ -163,9 +168,10 @@ class OnlineAdaptation(AbstractEstimator):
         zero, start = jnp.zeros((), x.dtype), jnp.full(p, self.initial**2, x.dtype)
         covariance = jnp.diag(jnp.concatenate([self._variances(x), start]))
         theta = jnp.zeros(p, x.dtype)
-        means = jnp.zeros((2, len(x)), x.dtype)
-        long = zero + 1e3
-        return OnlineState(x, theta, covariance, theta, start, means, zero + 1, long, zero, x, none, none, zero, zero)
+        sums, long = jnp.zeros((2, p), x.dtype), zero + 1e3
+        return OnlineState(
+            x, theta, covariance, theta, start, sums, sums, zero + 1, long, zero, x, none, none, zero, zero
+        )
 
     def update(
         self, state: OnlineState, x: Float[Array, " d"], u: Float[Array, " m"], elapsed: Float[Array, ""] | float = 1.0
@@ -189,14 +195,15 @@ class OnlineAdaptation(AbstractEstimator):
 
         z, covariance, free = self._predict(state, u, acted, elapsed)
         z, covariance = self._from_sample(anew, seen, x, z, covariance)
-        z, covariance, white = self._correct(z, covariance, x, seen & ~anew)
+        before = z[d:]
+        z, covariance, white, variance = self._correct(z, covariance, x, seen & ~anew)
+        pull, spread, alarm = self._test(state, z[d:] - before, variance, any_seen & ~anew)
 
         theta = jnp.clip(z[d:], -tuning.bound, tuning.bound)
         z = jnp.concatenate([self._unit(z[:d]), theta])
         share = jnp.sum(jnp.square(white)) / jnp.maximum(jnp.sum(jnp.where(seen, 1.0, 0.0)), 1.0)
         weight = jnp.where(any_seen & ~anew, -jnp.expm1(-self.dt / tuning.window), 0.0)
         nis = state.nis + weight * (share - state.nis)
-        alarm, means = self._test(state, white, any_seen & ~anew)
         open_up = jnp.concatenate([jnp.zeros(d, x.dtype), jnp.where(alarm, jnp.ones_like(theta), 0.0)])
         covariance, free = covariance + jnp.diag(open_up), jnp.where(alarm, free + 1, free)
         believed = nis < tuning.reject
@@ -206,7 +213,8 @@ class OnlineAdaptation(AbstractEstimator):
             covariance,
             jnp.where(believed, theta, state.trusted),
             free,
-            means,
+            pull,
+            spread,
             nis,
             jnp.where(alarm, 0.0, state.quiet + self.dt * elapsed),
             silent,
@@ -277,10 +285,9 @@ class OnlineAdaptation(AbstractEstimator):
             [jnp.concatenate([inner, top[:, d:]], 1), jnp.concatenate([top[:, d:].T, state.covariance[d:, d:]], 1)]
         )
         covariance = jnp.where(acted, (covariance + covariance.T) / 2, state.covariance)
-        walk = [tuning.disturbance_drift if name.startswith(DISTURBANCE) else tuning.drift for name in self.names]
-        walk = np.array(walk)
-        faster = 1 + tuning.forgetting * jnp.maximum(state.nis - 1, 0.0)
-        walked = jnp.asarray(self.dt * walk**2, z.dtype) * faster * elapsed
+        pulled = jnp.max(_squares(state.pull, state.spread), axis=0)
+        faster = 1 + tuning.forgetting * jnp.maximum(pulled - tuning.eager, 0.0)
+        walked = self.dt * elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
         noise = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, z.dtype)), (d,))
         covariance = covariance + jnp.diag(jnp.concatenate([noise, walked]))
         # No parameter becomes less certain than the prior, also if nothing excites it for long.
@@ -300,8 +307,12 @@ class OnlineAdaptation(AbstractEstimator):
         return z, kept[:, None] * covariance * kept + jnp.diag(added)
 
     def _correct(self, z, covariance, x, seen):
-        """With one measured number after the other; also the innovations over their standard deviations."""
+        """With one measured number after the other.
+
+        Also the innovations over their standard deviations, and the variance of what they were to correct of θ.
+        """
         noise, white, clip = self._variances(x), [], self.tuning.clip
+        variance = jnp.zeros(len(z) - len(x), z.dtype)
         for i in range(len(x)):
             column = covariance[:, i]
             size = jnp.sqrt(column[i] + noise[i])
@@ -309,19 +320,19 @@ class OnlineAdaptation(AbstractEstimator):
             gain = jnp.where(seen[i], column / size, 0.0)
             z = z + gain * error
             covariance = covariance - gain[:, None] * gain
+            variance = variance + jnp.square(gain[len(x) :])
             white.append(error)
-        return z, covariance, jnp.stack(white)
+        return z, covariance, jnp.stack(white), variance
 
-    def _test(self, state: OnlineState, white, measured):
-        """Whether the innovations have a mean, and their means afterwards; an alarm begins these anew."""
-        tuning, m = self.tuning, len(white)
-        weight = jnp.asarray(tuning.means, white.dtype)
-        means = state.means + jnp.where(measured, weight[:, None] * (white - state.means), 0.0)
-        square = (2 - weight) / weight * jnp.sum(jnp.square(means), axis=1)
-        # Wilson and Hilferty's quantile of χ² (1931).
-        limit = m * (1 - 2 / (9 * m) + tuning.alarm * (2 / (9 * m)) ** 0.5) ** 3
-        alarm = jnp.any(square > limit) & (state.quiet > tuning.pause)
-        return alarm, jnp.where(alarm, 0.0, means)
+    def _test(self, state: OnlineState, correction, variance, measured):
+        """The sums of the test with another correction of θ, and whether it says that θ has changed."""
+        spans = jnp.asarray(self.tuning.spans, correction.dtype)[:, None]
+        kept = jnp.where(measured, jnp.exp(-self.dt / spans), 1.0)
+        pull = kept * state.pull + jnp.where(measured, correction, 0.0)
+        spread = kept**2 * state.spread + jnp.where(measured, variance, 0.0)
+        pulled = jnp.max(_squares(pull, spread)) > self.tuning.alarm**2
+        alarm = pulled & (state.quiet > self.tuning.pause)
+        return jnp.where(alarm, 0.0, pull), jnp.where(alarm, 0.0, spread), alarm
 
     def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
         """The new state, or a beginning at the last good θ if a number of it is not finite."""
@@ -368,3 +379,8 @@ def _scales(names: tuple[str, ...], prior: float | Mapping[str, float], disturba
         checks.positive(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
     return tuple(found)
+
+
+def _squares(pull, spread):
+    """The squared test of each parameter, of one degree of freedom."""
+    return jnp.square(pull) / jnp.where(spread > 0, spread, 1.0)
