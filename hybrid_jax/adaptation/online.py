@@ -52,6 +52,7 @@ class Tuning:
     window: float = 0.2  # time constant of the mean NIS [s]
     spans: tuple[float, float] = (0.05, 0.5)  # time constants of the two sums of the test [s]
     alarm: float = 5.0  # of the test, a normal number if nothing has changed
+    caution: float = 0.3  # share of what uncertain parameters do to a step that counts as noise, for its nonlinearity
     pause: float = 0.1  # least time between two alarms [s]
     reject: float = 6.0  # mean NIS from which the filter is not believed
     clip: float = 5.0  # standard deviations at which an innovation is cut off, so that an outlier does little
@@ -60,7 +61,7 @@ class Tuning:
     bound: float = 4.0  # prior standard deviations that a parameter may move
 
     def __post_init__(self):
-        for name in ("drift", "forgetting", "eager", "pause"):
+        for name in ("drift", "forgetting", "eager", "caution", "pause"):
             checks.not_negative(name, getattr(self, name))
         for name in ("window", "alarm", "reject", "clip", "gap", "bound"):
             checks.positive(name, getattr(self, name))
@@ -204,8 +205,10 @@ class OnlineAdaptation(AbstractEstimator):
         share = jnp.sum(jnp.square(white)) / jnp.maximum(jnp.sum(jnp.where(seen, 1.0, 0.0)), 1.0)
         weight = jnp.where(any_seen & ~anew, -jnp.expm1(-self.dt / tuning.window), 0.0)
         nis = state.nis + weight * (share - state.nis)
+        # The state, too, has followed the wrong model since the change.
+        z, covariance = self._from_sample(alarm, seen, x, z, covariance)
         open_up = jnp.concatenate([jnp.zeros(d, x.dtype), jnp.where(alarm, jnp.ones_like(theta), 0.0)])
-        covariance, free = covariance + jnp.diag(open_up), jnp.where(alarm, free + 1, free)
+        covariance, free = covariance + jnp.diag(open_up), jnp.where(alarm, jnp.ones_like(free), free)
         believed = nis < tuning.reject
         new = OnlineState(
             z[:d],
@@ -289,6 +292,9 @@ class OnlineAdaptation(AbstractEstimator):
         faster = 1 + tuning.forgetting * jnp.maximum(pulled - tuning.eager, 0.0)
         walked = self.dt * elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
         noise = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, z.dtype)), (d,))
+        # While θ is uncertain, products of its errors, which the linear filter leaves out, move the state as well.
+        by_theta = slope[:, d:]
+        noise = noise + tuning.caution**2 * jnp.sum((by_theta @ state.covariance[d:, d:]) * by_theta, axis=1)
         covariance = covariance + jnp.diag(jnp.concatenate([noise, walked]))
         # No parameter becomes less certain than the prior, also if nothing excites it for long.
         variance = jnp.diagonal(covariance)[d:]
