@@ -54,8 +54,8 @@ PARTS = 4 * 3  # Ix, Iy, Iz, centre of mass (2), efficiency (4), added drag (3):
 # Logarithms of inertia and efficiency, 1 cm or so of the arm, and half the vehicle's own drag or more.
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
-PROCESS = (0.0,) * 7 + (0.02,) * 3 + (0.05,) * 3
-INITIAL = 1.0
+PROCESS = (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3  # m/s² and rad/s² of a white noise, √s
+INITIAL = 1.0  # nothing but the prior is known at the start
 
 
 def nominal() -> AbstractVectorField:

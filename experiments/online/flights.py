@@ -22,7 +22,6 @@ from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import Controller, Hardware, Loop, sample
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
-from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sim.domain import SOURCE, Quadrotor
 from hybrid_jax.sim.flight import CLOCK, fly
 from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, weak_rotor, wind

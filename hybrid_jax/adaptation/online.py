@@ -8,7 +8,8 @@ needs no matrix inverse (Bierman, "Factorization methods for discrete sequential
   they pull to one side. Their exponentially weighted sum over its standard deviation is the test (the idea of the local
   approach: Benveniste, Basseville, Moustakides, "The asymptotic local approach to change detection and model
   validation", 1987). It also sees changes without a steady push, such as of an inertia. An alarm opens the covariance.
-- Forgetting: θ is a slow random walk, and a parameter that is pulled walks faster.
+- Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster while it is pulled. Parameters
+  of a vehicle are constant between two changes; they do so only where no disturbance is estimated.
 - Consistency: while the mean of the normalised innovations squared (NIS) is far too large, what the filter says is not
   used (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the
   last good estimate is.
@@ -47,12 +48,12 @@ class Tuning:
     """How fast an `OnlineAdaptation` forgets, and what it calls a change. ValueError for numbers that are negative."""
 
     drift: float = 0.002  # random walk of a parameter, as a share of its prior standard deviation, 1/√s
-    forgetting: float = 10.0  # how much faster a parameter walks for each unit of its squared test beyond `eager`
+    forgetting: float = 30.0  # how much faster a parameter walks for each unit of its squared test beyond `eager`
     eager: float = 6.0  # of a χ² of one degree
     window: float = 0.2  # time constant of the mean NIS [s]
     spans: tuple[float, float] = (0.05, 0.5)  # time constants of the two sums of the test [s]
     alarm: float = 5.0  # of the test, a normal number if nothing has changed
-    caution: float = 0.3  # share of what uncertain parameters do to a step that counts as noise, for its nonlinearity
+    caution: float = 1.5  # share of what uncertain parameters do to a step that counts as noise, for its nonlinearity
     pause: float = 0.1  # least time between two alarms [s]
     reject: float = 6.0  # mean NIS from which the filter is not believed
     clip: float = 5.0  # standard deviations at which an innovation is cut off, so that an outlier does little
@@ -289,7 +290,9 @@ class OnlineAdaptation(AbstractEstimator):
         )
         covariance = jnp.where(acted, (covariance + covariance.T) / 2, state.covariance)
         pulled = jnp.max(_squares(state.pull, state.spread), axis=0)
-        faster = 1 + tuning.forgetting * jnp.maximum(pulled - tuning.eager, 0.0)
+        constant = [not name.startswith(DISTURBANCE) for name in self.names]
+        forgotten = np.where(constant if not all(constant) else np.zeros(p, bool), 0.0, tuning.forgetting)
+        faster = 1 + jnp.asarray(forgotten, z.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
         walked = self.dt * elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
         noise = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, z.dtype)), (d,))
         # While θ is uncertain, products of its errors, which the linear filter leaves out, move the state as well.
