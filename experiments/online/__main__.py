@@ -1,32 +1,23 @@
 """The vehicle changes in the air, and the controller's model adapts: python -m experiments.online"""
 
-import time
-from concurrent.futures import ProcessPoolExecutor
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
-import numpy as np
 from rich.console import Console
 
 from experiments.closed_loop.flights import PATHS
-from experiments.closed_loop.timing import use_one_core
 from experiments.online import agents, figures
 from experiments.online.config import PRESETS, OnlineConfig
 from experiments.online.flights import Run, Setting, flown, setting
 from experiments.online.results import Evidence, claims, results_of, tables
+from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.runner import command
 from experiments.runner.run_record import environment
-from hybrid_jax.control import Hardware
-from hybrid_jax.vehicle import IRIS
 
 NAME = "online"
-STEPS = 1000  # of the filter, that are timed
 
 HEAD = """# online
 
@@ -88,31 +79,6 @@ def draw(run: Run, own: Setting, config: OnlineConfig, out: Path):
     index = list(PATHS).index(reference)
     figures.animate(out / "flight.gif", run, own, change, reference, own.references[index])
     return drawn, {"flight.gif": f"One flight, {agents.CHANGE_NAMES[change]}"}
-
-
-def step_time(cache: Path, hardware: Hardware, period: float) -> float:
-    """Processor time of a step of the filter on one core [ms]."""
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (cache,)) as process:
-        return process.submit(_step_time, hardware, period).result()
-
-
-def _step_time(hardware: Hardware, period: float) -> float:
-    adaptation = agents.online(hardware, period)
-    start = jnp.zeros(13).at[2].set(1.5).at[3].set(1.0)
-    noise = 0.01 * jax.random.normal(jax.random.key(0), (STEPS, 13))
-    u = jnp.full(IRIS.rotors, IRIS.hover_speed)
-
-    @jax.jit
-    def steps(state):
-        return jax.lax.scan(lambda state, e: (adaptation.update(state, start + e, u), None), state, noise)[0]
-
-    state = jax.block_until_ready(steps(adaptation.begin(start)))
-    taken = []
-    for _ in range(5):
-        began = time.process_time()
-        state = jax.block_until_ready(steps(state))
-        taken.append(time.process_time() - began)
-    return 1e3 * float(np.median(taken)) / STEPS
 
 
 ABOUT = "The vehicle changes in the air. How soon does the controller fly as well as one that was told the change?"

@@ -138,12 +138,19 @@ class L1(AbstractEstimator):
         return self.field
 
     def command(self, state, x, u):
+        return self._added(u, -state[2])
+
+    def effective(self, state, u):
+        return self._added(u, state[2])
+
+    def _added(self, u, accelerations):
+        """The speeds that give these accelerations, along the thrust and about the three axes, beside those of u."""
         px, py = np.array(IRIS.rotor_positions).T
         k, c_m = IRIS.thrust_coefficient, IRIS.torque_coefficient
         mixer = np.stack([k * np.ones(4), k * py, -k * px, c_m * np.array(IRIS.spin)])
         mixer = mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
-        squares = jnp.square(u) - jnp.asarray(np.linalg.inv(mixer), u.dtype) @ state[2]
-        return jnp.sqrt(jnp.clip(squares, 0.0, IRIS.max_rotor_speed**2))
+        squares = jnp.square(u) + jnp.asarray(np.linalg.inv(mixer), u.dtype) @ accelerations
+        return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
 
 
 def told(field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0) -> Told:

@@ -30,9 +30,9 @@ class OnlineConfig(Run):
     """From a sample to its command, a multiple of 0.01 [s]."""
     rotor_lag: NotNegative = 0.03
     """Time constant of the rotors [s]."""
-    bandwidth: Positive = 5.0
+    bandwidth: Positive = 8.0
     """Of the disturbance observer [rad/s]."""
-    l1_cutoff: Positive = 5.0
+    l1_cutoff: Positive = 8.0
     """Of the low-pass filter of L1 adaptive augmentation [rad/s]."""
 
     def __post_init__(self):

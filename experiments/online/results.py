@@ -154,7 +154,7 @@ def _no_worse(e: Evidence) -> Iterator[Part]:
 
 def _holds_truth(e: Evidence) -> Iterator[Part]:
     for change, own in e.rows.where(agent="online").group("change").items():
-        shares = np.array([np.mean(list(row["inside"].values())) for row in own])
+        shares = np.array([list(row["inside"].values()) for row in own], float).mean(axis=1)
         if not np.isfinite(shares).all():
             raise Undecided(f"flights end before {LEARNED:g} s after the change")
         margin = 1.96 * shares.std() / np.sqrt(len(shares))  # flights are independent, parameters of one are not

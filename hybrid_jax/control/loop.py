@@ -122,9 +122,9 @@ class Loop(NamedTuple):
         model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
         for command in now.sent:
             mean, speeds = self._lag(speeds, command)
-            x = advance(model, x, mean, period)
+            x = advance(model, x, estimator.effective(now.estimate, mean), period)
         wanted = controller.horizon(reference, i + len(now.sent))
-        u, plan = controller(model, wanted, x, now.plan, speeds)
+        u, plan = controller(model, wanted, x, now.plan, estimator.effective(now.estimate, speeds))
         u = estimator.command(now.estimate, x, u)
         sent = jnp.concatenate([now.sent, u[None]])
         mean, speeds = self._lag(now.speeds, sent[0])

@@ -27,3 +27,7 @@ class AbstractEstimator(eqx.Module):
     def command(self, state: Any, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " m"]:
         """The input to command where the controller asks for u at the state x; by default that."""
         return u
+
+    def effective(self, state: Any, u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The input at which the model moves as the system does at u; by default that. It undoes `command`."""
+        return u
