@@ -190,10 +190,12 @@ class OnlineAdaptation(AbstractEstimator):
         x = self._same_hemisphere(jnp.asarray(x, state.x.dtype), state.x)
         equal = jnp.where(x == state.last, state.equal + 1, 0.0)
         seen = (jnp.abs(x) < HUGE) & (equal == 0)
-        acted = jnp.all(jnp.abs(u) < HUGE) & (elapsed < 1.5)
-        any_seen = jnp.any(seen)
-        silent = jnp.where(any_seen, 0.0, state.silent + self.dt * elapsed)
-        anew = any_seen & (~acted | (state.silent + self.dt * elapsed > tuning.gap + self.dt))
+        # Sums in place of `all` and `any`, which the export to C does not know.
+        acted = (jnp.sum(jnp.where(jnp.abs(u) < HUGE, 0.0, 1.0)) == 0) & (elapsed < 1.5)
+        any_seen = jnp.sum(jnp.where(seen, 1.0, 0.0)) > 0
+        waited = state.silent + self.dt * (elapsed - 1)
+        silent = jnp.where(any_seen, self.dt * (elapsed - 1), waited + self.dt)
+        anew = any_seen & (~acted | (waited > tuning.gap))
 
         z, covariance, free = self._predict(state, u, acted, elapsed)
         z, covariance = self._from_sample(anew, seen, x, z, covariance)
@@ -264,7 +266,7 @@ class OnlineAdaptation(AbstractEstimator):
         if not self._is_rigid():
             return x
         other = jnp.sum(x[QUATERNION] * like[QUATERNION]) < 0
-        return x.at[QUATERNION].multiply(jnp.where(other, -1.0, 1.0))
+        return x.at[QUATERNION].set(jnp.where(other, -x[QUATERNION], x[QUATERNION]))
 
     def _unit(self, x):
         return x.at[QUATERNION].set(normalise(x[QUATERNION])) if self._is_rigid() else x
@@ -300,7 +302,7 @@ class OnlineAdaptation(AbstractEstimator):
         noise = noise + tuning.caution**2 * jnp.sum((by_theta @ state.covariance[d:, d:]) * by_theta, axis=1)
         covariance = covariance + jnp.diag(jnp.concatenate([noise, walked]))
         # No parameter becomes less certain than the prior, also if nothing excites it for long.
-        variance = jnp.diagonal(covariance)[d:]
+        variance = _diagonal(covariance)[d:]
         shrink = jnp.concatenate([jnp.ones(d, z.dtype), jnp.sqrt(1 / jnp.maximum(variance, 1.0))])
         free = jnp.minimum(state.free + walked, 1.0)
         z = jnp.where(acted, jnp.concatenate([moved, state.theta]), z)
@@ -346,7 +348,7 @@ class OnlineAdaptation(AbstractEstimator):
     def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
         """The new state, or a beginning at the last good θ if a number of it is not finite."""
         total = jnp.sum(jnp.abs(new.covariance)) + jnp.sum(jnp.abs(new.x)) + jnp.sum(jnp.abs(new.theta))
-        least = jnp.min(jnp.diagonal(new.covariance))
+        least = jnp.min(_diagonal(new.covariance))
         sound = (total < HUGE) & (new.nis < HUGE) & (least > 0)
         x = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0)
         again = self.begin(x)
@@ -388,6 +390,11 @@ def _scales(names: tuple[str, ...], prior: float | Mapping[str, float], disturba
         checks.positive(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
     return tuple(found)
+
+
+def _diagonal(matrix):
+    """As jnp.diagonal, by operations that the export to C knows."""
+    return matrix.ravel()[:: len(matrix) + 1]
 
 
 def _squares(pull, spread):
