@@ -4,7 +4,7 @@
 `open_loop_costs` compares the predicted cost of plans with the actual one. An example: docs/howto/control.md.
 """
 
-from hybrid_jax.control.controller import Controller, Plan
+from hybrid_jax.control.controller import Controller, Plan, rotor_speeds
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import (
     Flight,
@@ -22,6 +22,6 @@ from hybrid_jax.control.references import add_body_rates, figure_eight, hover, l
 from hybrid_jax.control.sensitivities import advance
 
 __all__ = ["Controller", "Flight", "Hardware", "Loop", "Observer", "OpenLoopCosts", "Performance"]
-__all__ += ["Plan", "Weights"]
+__all__ += ["Plan", "Weights", "rotor_speeds"]
 __all__ += ["advance", "fly", "open_loop_costs", "performance", "relative_cost_error"]
 __all__ += ["add_body_rates", "figure_eight", "hover", "low_pass", "sample", "step"]
