@@ -46,8 +46,8 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     run = flown(own, config.agents, config.changes, config.references, config.seeds, bandwidths, console)
     rows = results_of(run, own)
     step = step_time(config.cache, config.hardware(), own.period)
-    spent = sum(taken for name, taken in run.seconds.items() if name != "compiling")
-    evidence = Evidence(rows, step, spent, len(rows))
+    spent = sum(taken for name, taken in run.seconds.items() if name.startswith("flying"))
+    evidence = Evidence(rows, step, spent, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)
     out = config.out / NAME
     drawn, notes = draw(run, own, config, out)

@@ -1,8 +1,10 @@
 """Flights in which the vehicle changes in the air: one program for each kind of estimator, run before and after it."""
 
+import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,7 +24,7 @@ from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import Controller, Hardware, Loop, sample
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
-from hybrid_jax.sim.domain import SOURCE, Quadrotor
+from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.flight import CLOCK, fly
 from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, weak_rotor, wind
 from hybrid_jax.state import POSITION
@@ -115,11 +117,6 @@ def learned(estimator, state) -> tuple[Array, ...]:
     return scales * state.theta, scales * jnp.sqrt(jnp.diagonal(state.covariance)[d:]), state.nis, state.changes
 
 
-def trimmed(own: Setting) -> Any:
-    """The plan with which a vehicle hovers: that of a controller at rest."""
-    return own.controller.begin()
-
-
 def before(own: Setting, name: str, path: str, seed: int, key, bandwidths: Mapping[str, float]) -> Half:
     """The first half of a flight; agents that are the same before the change share it."""
     clock = np.float32(np.random.default_rng(seed).uniform(0, CLOCK))
@@ -132,7 +129,7 @@ def before(own: Setting, name: str, path: str, seed: int, key, bandwidths: Mappi
     }
     estimator, index = estimators[name](), list(PATHS).index(path)
     start = Loop(own.controller, own.hardware, estimator).begin(
-        jnp.asarray(own.references[index, 0]), trimmed(own), key
+        jnp.asarray(own.references[index, 0]), own.controller.begin(), key
     )
     return agents.as_numpy(
         Half(estimator, start, *world("nothing"), np.asarray(index, np.int32), clock, np.asarray(0, np.int32))
@@ -197,7 +194,36 @@ class Run(NamedTuple):
     tags: list[dict[str, Any]]
     flown: Flown
     beginnings: dict[tuple[str, str, int], Flown]  # before the change, by agent, reference and seed
-    seconds: dict[str, float]
+    seconds: dict[str, float]  # on the clock, of each stage
+    processor_seconds: float = math.nan  # of all flights, on all cores, without compiling
+
+
+class Fleet(NamedTuple):
+    """What flies, before it flies."""
+
+    own: Setting
+    changes: Sequence[str]
+    firsts: Mapping[str, Mapping[tuple[str, int], Half]]  # by agent, then by reference and seed
+    fitted: Mapping[str, Any]  # by least squares on the ground, by change
+
+    def first_spots(self, members: Sequence[str]) -> list[tuple[str, str, int]]:
+        """Agent, reference and seed of each flight before the change that these agents need."""
+        names = dict.fromkeys(SHARED.get(name, name) for name in members)
+        return [(name, *place) for name in names for place in self.firsts[name]]
+
+    def begun(self, members: Sequence[str]) -> list[Half]:
+        return [self.firsts[name][path, seed] for name, path, seed in self.first_spots(members)]
+
+    def second_spots(self, members: Sequence[str]) -> list[tuple[str, str, str, int]]:
+        """Agent, change, reference and seed of each flight after the change."""
+        places = next(iter(self.firsts.values()))
+        return [(name, change, *place) for name in members for change in self.changes for place in places]
+
+    def second(self, spot: tuple[str, str, str, int], moment: Any) -> Half:
+        """The flight after the change, from where the one before it ended."""
+        name, change, path, seed = spot
+        first = self.firsts[SHARED.get(name, name)][path, seed]
+        return after(self.own, first, moment, change, changed(self.own, name, change, seed, first, self.fitted))
 
 
 def flown(
@@ -211,56 +237,46 @@ def flown(
 ) -> Run:
     """Fly every agent along every reference, through every change, with every seed."""
     seconds: dict[str, float] = {}
-    fitted = {}
+    fitted: dict[str, Any] = {}
     if "least_squares" in names:
-        began = time.perf_counter()
-        with Line("least squares on the ground", console) as line:
+        with _stage("least squares on the ground", seconds, console) as line:
             for change in changes:
                 line.say(change)
                 fitted[change] = ground_fits(change, seeds, own.hardware)
-        seconds["ground"] = time.perf_counter() - began
     keys = jax.random.split(jax.random.PRNGKey(0), len(references) * seeds).reshape(len(references), seeds, -1)
-    places = [(path, i, seed) for i, path in enumerate(references) for seed in range(seeds)]
-    firsts: dict[str, dict[tuple[str, int], Half]] = {}
-    for name in dict.fromkeys(SHARED.get(name, name) for name in names):
-        firsts[name] = {
-            (path, seed): before(own, name, path, seed, keys[i, seed], bandwidths) for path, i, seed in places
-        }
-    programs = {}
-    for kind, members in kinds(names).items():
-        programs[kind] = Program(own, max(1, len(members) * len(changes) * len(places)))
-    first_of = {kind: [n for n in firsts if n in {SHARED.get(m, m) for m in of}] for kind, of in kinds(names).items()}
-    begun = {
-        kind: [firsts[name][path, seed] for name in first_of[kind] for path, _, seed in places] for kind in programs
+    places = {(path, seed): keys[i, seed] for i, path in enumerate(references) for seed in range(seeds)}
+    firsts = {
+        name: {place: before(own, name, *place, key, bandwidths) for place, key in places.items()}
+        for name in dict.fromkeys(SHARED.get(name, name) for name in names)
     }
-    began = time.perf_counter()
-    with Line("compiling", console) as line, ThreadPoolExecutor(2) as pool:
+    fleet, found = Fleet(own, changes, firsts, fitted), kinds(names)
+    programs = {kind: Program(own, len(fleet.second_spots(members))) for kind, members in found.items()}
+    with _stage("compiling", seconds, console) as line, ThreadPoolExecutor(2) as pool:
         line.say(f"{len(programs)} programs")
-        list(pool.map(lambda kind: programs[kind](begun[kind], active=False), programs))
-    seconds["compiling"] = time.perf_counter() - began
-    tags, parts, beginnings = [], [], {}
-    for kind, members in kinds(names).items():
-        with Line(f"flying {kind}", console) as line:
-            began = time.perf_counter()
-            line.say(f"{len(begun[kind])} first halves")
-            moments, early = programs[kind](begun[kind])
-            spots = [(name, path, seed) for name in first_of[kind] for path, _, seed in places]
-            at = {spot: i for i, spot in enumerate(spots)}
+        list(pool.map(lambda kind: programs[kind](fleet.begun(found[kind]), active=False), programs))
+    tags, parts, beginnings, worked = [], [], {}, time.process_time()
+    for kind, members in found.items():
+        with _stage(f"flying {kind}", seconds, console) as line:
+            line.say(f"{len(fleet.first_spots(members))} first halves")
+            moments, early = programs[kind](fleet.begun(members))
+            at = {spot: i for i, spot in enumerate(fleet.first_spots(members))}
             beginnings |= {spot: lane(early, i) for spot, i in at.items()}
-            halves = []
-            for name in members:
-                for change in changes:
-                    for path, _, seed in places:
-                        first = firsts[SHARED.get(name, name)][path, seed]
-                        moment = lane(moments, at[SHARED.get(name, name), path, seed])
-                        estimator = changed(own, name, change, seed, first, fitted)
-                        halves.append(after(own, first, moment, change, estimator))
-                        tags.append({"change": change, "reference": path, "agent": name, "seed": seed})
-            line.say(f"{len(halves)} second halves")
-            parts.append(programs[kind](halves)[1])
-            seconds[f"flying {kind}"] = time.perf_counter() - began
-    padded = [widened(part) for part in parts]
-    return Run(tags, Flown(*(np.concatenate(leaves) for leaves in zip(*padded, strict=True))), beginnings, seconds)
+            spots = fleet.second_spots(members)
+            line.say(f"{len(spots)} second halves")
+            ends = [lane(moments, at[SHARED.get(name, name), path, seed]) for name, _, path, seed in spots]
+            parts.append(programs[kind]([fleet.second(*pair) for pair in zip(spots, ends, strict=True)])[1])
+            tags += [dict(zip(("agent", "change", "reference", "seed"), spot, strict=True)) for spot in spots]
+    together = Flown(*(np.concatenate(leaves) for leaves in zip(*map(widened, parts), strict=True)))
+    return Run(tags, together, beginnings, seconds, time.process_time() - worked)
+
+
+@contextmanager
+def _stage(name: str, seconds: dict[str, float], console: Console) -> Iterator[Line]:
+    """A line of progress, and how long it took."""
+    began = time.perf_counter()
+    with Line(name, console) as line:
+        yield line
+    seconds[name] = time.perf_counter() - began
 
 
 def widened(flown: Flown) -> Flown:
@@ -278,6 +294,3 @@ def changed(own: Setting, name: str, change: str, seed: int, first: Half, fitted
     if name == "least_squares":
         return agents.told(lane(fitted[change], seed), own.period, float(first.clock))
     return first.estimator
-
-
-__all__ = ["SOURCE", "Run", "flown", "setting"]

@@ -27,7 +27,8 @@ class Evidence:
 
     rows: Results
     step_ms: float  # processor time of one step of the filter on one core
-    seconds: float  # of all flights and fits, without compiling
+    seconds: float  # of all flights, on the clock, without compiling
+    processor_seconds: float  # likewise, on all cores
     flights: int
 
 
@@ -167,7 +168,9 @@ def _fast_step(e: Evidence) -> Part:
 
 
 def _fast_table(e: Evidence) -> Part:
-    return e.seconds / 60 <= MINUTES, f"{e.seconds / 60:.1f} minutes for {e.flights} flights"
+    minutes, alone = e.seconds / 60, e.processor_seconds / 60
+    words = f"{minutes:.1f} minutes on the clock for {e.flights} flights, {alone:.1f} of one core's time"
+    return minutes <= MINUTES, words
 
 
 _PAIRED = "on each reference (95 % interval of the paired difference over seeds)"
@@ -192,5 +195,5 @@ def claims(changes: list[str]) -> list[Claim[Evidence]]:
         Claim("O3", _WORSE, lambda e: all_of(_no_worse(e))),
         Claim("O4", _COVERS, lambda e: all_of(_holds_truth(e))),
         Claim("O5", f"A step of the filter takes at most {STEP_MS:g} ms on one core.", _fast_step),
-        Claim("O6", f"All flights and fits take at most {MINUTES:g} minutes (without compiling).", _fast_table),
+        Claim("O6", f"All flights take at most {MINUTES:g} minutes on two cores (without compiling).", _fast_table),
     ]

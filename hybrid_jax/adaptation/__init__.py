@@ -16,7 +16,8 @@ from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
-from hybrid_jax.adaptation.online import OnlineAdaptation, OnlineState, Tuning
+from hybrid_jax.adaptation.online import OnlineAdaptation
+from hybrid_jax.adaptation.online_state import Flags, OnlineState, Tuning
 from hybrid_jax.adaptation.pooling import pool
 from hybrid_jax.adaptation.uncertainty import (
     DisturbanceSelection,
@@ -28,6 +29,6 @@ from hybrid_jax.adaptation.uncertainty import (
 
 __all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "DisturbanceSelection", "ExpertAugmented", "FineTune"]
 __all__ += ["Interval", "LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
-__all__ += ["OnlineAdaptation", "OnlineState", "Tuning"]
+__all__ += ["Flags", "OnlineAdaptation", "OnlineState", "Tuning"]
 __all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "pool"]
 __all__ += ["select_disturbance"]

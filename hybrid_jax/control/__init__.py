@@ -4,7 +4,7 @@
 `open_loop_costs` compares the predicted cost of plans with the actual one. An example: docs/howto/control.md.
 """
 
-from hybrid_jax.control.controller import Controller, Plan, rotor_speeds
+from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import (
     Flight,
@@ -19,6 +19,7 @@ from hybrid_jax.control.loop import (
 )
 from hybrid_jax.control.observer import Observer
 from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_pass, sample, step
+from hybrid_jax.control.rotor_lag import rotor_speeds
 from hybrid_jax.control.sensitivities import advance
 
 __all__ = ["Controller", "Flight", "Hardware", "Loop", "Observer", "OpenLoopCosts", "Performance"]

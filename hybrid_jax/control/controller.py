@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
+from hybrid_jax.control.rotor_lag import lag_matrix, rotor_speeds
 from hybrid_jax.control.sensitivities import advance, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
@@ -43,26 +44,6 @@ class Plan(eqx.Module):
 
 _Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
 _Start = tuple[State, Input]  # state and rotor speeds
-
-
-def rotor_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
-    """The mean speeds [rad/s] over dt [s] of rotors that follow a command with a lag, τ ẇ = c − w, and those after it.
-
-    Exact for a command that is held. The library's models take the mean as speeds that are held, which is right to
-    first order in dt / τ of the change.
-    """
-    if not lag:
-        return command, command
-    kept = math.exp(-dt / lag)
-    return command + (speeds - command) * ((1 - kept) * lag / dt), command + (speeds - command) * kept
-
-
-def _lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
-    """What the speeds before the first of some intervals (t), and the commands of all (t, t), add to each mean."""
-    kept, k = math.exp(-dt / lag), np.arange(steps)
-    left = (1 - kept) * lag / dt  # of the speeds at the start of an interval, in its mean
-    since = np.maximum(k[:, None] - k - 1, 0)
-    return left * kept**k, np.tril(left * (1 - kept) * kept**since, -1) + (1 - left) * np.eye(steps)
 
 
 def checked_states(
@@ -277,7 +258,7 @@ class Controller:
         slope = 1 - jnp.square(share)  # of the tanh
         commands, to_speed = self._speeds(share), self._range()[1] * slope
         if self.rotor_lag:
-            kept, mixed = (part.astype(x.dtype) for part in _lag_matrix(self.rotor_lag, self.interval, self.steps))
+            kept, mixed = (part.astype(x.dtype) for part in lag_matrix(self.rotor_lag, self.interval, self.steps))
             speeds, ones = jnp.asarray(kept[:, None] * before + mixed @ commands), jnp.ones_like(commands)
             slopes = condensed(model, x[:-1], speeds, ones, self.interval, self.unit_quaternion)
             slopes = slopes.reshape(self.steps, -1, *commands.shape)

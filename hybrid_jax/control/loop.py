@@ -11,9 +11,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.control.controller import Controller, Plan, checked_states, rotor_speeds
+from hybrid_jax.control.controller import Controller, Plan, checked_states
 from hybrid_jax.control.cost import Scalar, plan_cost
 from hybrid_jax.control.observer import Observer
+from hybrid_jax.control.rotor_lag import rotor_speeds
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.rotation import heading, normalise

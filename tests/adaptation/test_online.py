@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.online import OnlineAdaptation, Tuning
+from hybrid_jax.adaptation import OnlineAdaptation, Tuning
 from hybrid_jax.integrate import rk4_step
 
 DT, NOISE = 0.05, 0.01

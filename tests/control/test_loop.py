@@ -228,6 +228,6 @@ def test_hardware_that_cannot_be_is_refused():
             control.Hardware(**options)
     with pytest.raises(ValueError, match="latency must be a multiple"):
         control.Hardware(latency=0.015).delay(0.01)
+    noisy = control.Hardware(noise=(0.1, 0.0, 0.0, 0.0))
     with pytest.raises(ValueError, match="key must be"):
-        noisy = control.Hardware(noise=(0.1, 0.0, 0.0, 0.0))
         control.fly(plant(BODY), BODY, reference_of("hover"), reference_of("hover")[0], CONTROLLER, hardware=noisy)
