@@ -19,6 +19,7 @@ from hybrid_jax.adaptation import (
     FineTune,
     LeastSquares,
     Method,
+    OnlineAdaptation,
     Ridge,
     Solution,
     Source,
@@ -63,5 +64,5 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
-__all__ += ["Excitation", "FlightBounds", "InputBounds", "excitation"]
+__all__ += ["Excitation", "FlightBounds", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]

@@ -13,7 +13,7 @@ from experiments.reporting.tables import Table, best_cells, number_in
 from hybrid_jax.io.files import json_text
 
 LARGEST_SVG = 1_000_000  # bytes; a larger drawing is shown as its PNG
-TYPES = {".svg": "image/svg+xml", ".png": "image/png"}
+TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif"}
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; --link: #0072b2; --good: #009e73; --bad: #d55e00 }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 1rem }

@@ -8,6 +8,8 @@ from hybrid_jax.control.controller import Controller, Plan
 from hybrid_jax.control.cost import Weights
 from hybrid_jax.control.loop import (
     Flight,
+    Hardware,
+    Loop,
     OpenLoopCosts,
     Performance,
     fly,
@@ -15,9 +17,12 @@ from hybrid_jax.control.loop import (
     performance,
     relative_cost_error,
 )
+from hybrid_jax.control.observer import Observer
 from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_pass, sample, step
+from hybrid_jax.control.rotor_lag import rotor_speeds
 from hybrid_jax.control.sensitivities import advance
 
-__all__ = ["Controller", "Flight", "OpenLoopCosts", "Performance", "Plan", "Weights"]
+__all__ = ["Controller", "Flight", "Hardware", "Loop", "Observer", "OpenLoopCosts", "Performance"]
+__all__ += ["Plan", "Weights", "rotor_speeds"]
 __all__ += ["advance", "fly", "open_loop_costs", "performance", "relative_cost_error"]
 __all__ += ["add_body_rates", "figure_eight", "hover", "low_pass", "sample", "step"]

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
+from hybrid_jax.control.rotor_lag import lag_matrix, rotor_speeds
 from hybrid_jax.control.sensitivities import advance, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
@@ -42,6 +43,7 @@ class Plan(eqx.Module):
 
 
 _Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
+_Start = tuple[State, Input]  # state and rotor speeds
 
 
 def checked_states(
@@ -76,6 +78,7 @@ class Controller:
     damping: float = 1e-3  # lower bound of the damping
     min_speed: float = 0.0  # lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's
     unit_quaternion: bool = True  # normalise the quaternion after each step of the prediction
+    rotor_lag: float = 0.0  # time constant with which rotors follow their commands [s]; see `rotor_speeds`
 
     def __post_init__(self):
         for name, kind in (("vehicle", Vehicle), ("weights", Weights)):
@@ -86,6 +89,7 @@ class Controller:
         for name in ("interval", "period", "damping"):
             checks.positive(name, getattr(self, name))
         checks.not_negative("min_speed", self.min_speed)
+        checks.not_negative("rotor_lag", self.rotor_lag)
         if abs(self.stride * self.period - self.interval) > 1e-6 * self.interval:
             raise ValueError(f"interval must be a multiple of period {self.period}, got {self.interval}")
         if not self.min_speed < self.vehicle.hover_speed < self.vehicle.max_rotor_speed:
@@ -126,13 +130,19 @@ class Controller:
         return reference[i + self.stride * jnp.arange(1, self.steps + 1)]
 
     def __call__(
-        self, model: AbstractVectorField, reference: Float[Array, "t 13"], x: State, plan: Plan
+        self,
+        model: AbstractVectorField,
+        reference: Float[Array, "t 13"],
+        x: State,
+        plan: Plan,
+        speeds: Input | None = None,
     ) -> tuple[Input, Plan]:
-        """Rotor speeds [rad/s] to hold for one period from state x, and the new plan.
+        """Rotor speeds [rad/s] to command for one period from state x, and the new plan.
 
         Args:
             reference: the state to reach by the end of each interval (see `horizon`).
             plan: that of the last call, or `begin()`.
+            speeds: of the rotors at state x [rad/s], by default those that the plan commands; without lag unused.
 
         Raises:
             ValueError: something does not fit; for concrete values also if one is not finite or a quaternion is not of
@@ -147,10 +157,11 @@ class Controller:
         x, reference, plan = checked_states("x", x, reference, plan, self.steps)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
         model = fuse_for_inference(model)
-        point = self._initial_guess(model, reference, x, plan)
+        start = x, (self.speeds(plan)[0] if speeds is None else speeds).astype(x.dtype)
+        point = self._initial_guess(model, reference, start, plan)
 
         def iteration(_, point):
-            return self._improve(model, reference, x, point)
+            return self._improve(model, reference, start, point)
 
         plan, _ = jax.lax.fori_loop(0, self.iterations, iteration, point)
         return self.speeds(plan)[0], plan
@@ -162,19 +173,20 @@ class Controller:
         middle, half = self._range()
         return middle + half * share
 
-    def _initial_guess(self, model, reference, x: State, plan: Plan) -> _Point:
+    def _initial_guess(self, model, reference, start: _Start, plan: Plan) -> _Point:
         """The shifted plan or the attitude recovery, whichever costs less."""
         # One period later, interpolated; the last interval stays.
         following = jnp.concatenate([plan.variables[1:], plan.variables[-1:]])
         shifted = plan.variables + (following - plan.variables) / self.stride
 
-        def interval(x, inputs):
+        def interval(both, inputs):
             wanted, held = inputs
-            variables = jnp.stack([held, self._recovery(wanted, x[1])])
-            x = jax.vmap(lambda x, variables: self._step(model, x, variables))(x, variables)
-            return x, (x, variables)
+            variables = jnp.stack([held, self._recovery(wanted, both[0][1])])
+            both = jax.vmap(lambda start, variables: self._step(model, start, variables))(both, variables)
+            return both, (both[0], variables)
 
-        both = jax.lax.scan(interval, jnp.stack([x, x]), (reference, shifted))[1]
+        twice = jax.tree.map(lambda leaf: jnp.stack([leaf, leaf]), start)
+        both = jax.lax.scan(interval, twice, (reference, shifted))[1]
         states, variables = (jnp.swapaxes(leaf, 0, 1) for leaf in both)
         costs = jax.vmap(lambda *plan: self._cost(reference, *plan))(states, variables)
         best = jax.tree.map(lambda leaf: jnp.where(costs[1] < costs[0], leaf[1], leaf[0]), (variables, costs, states))
@@ -198,28 +210,32 @@ class Controller:
         share = (jnp.sqrt(jnp.maximum(squares, 0.0)) - middle) / half
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 
-    def _step(self, model: AbstractVectorField, x: State, variables: Float[Array, " rotors"]) -> State:
-        return advance(model, x, self._speeds(jnp.tanh(variables)), self.interval, self.unit_quaternion)
+    def _step(self, model: AbstractVectorField, start: _Start, variables: Float[Array, " rotors"]) -> _Start:
+        """State and rotor speeds at the end of an interval."""
+        x, speeds = start
+        mean, speeds = rotor_speeds(speeds, self._speeds(jnp.tanh(variables)), self.rotor_lag, self.interval)
+        return advance(model, x, mean, self.interval, self.unit_quaternion), speeds
 
     def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t rotors"]) -> Scalar:
         return plan_cost(self.weights, reference, states, jnp.tanh(variables))
 
-    def _improve(self, model, reference, x: State, point: _Point) -> _Point:
+    def _improve(self, model, reference, start: _Start, point: _Point) -> _Point:
         """Take the best of the damped Gauss–Newton steps, if it lowers the cost, and keep its damping."""
         plan, states = point
-        matrix, gradient = self._quadratic(model, reference, jnp.concatenate([x[None], states]), plan.variables)
+        path = jnp.concatenate([start[0][None], states])
+        matrix, gradient = self._quadratic(model, reference, path, start[1], plan.variables)
         dampings = jnp.clip(plan.damping * jnp.array(DAMPING_FACTORS, gradient.dtype), self.damping, MAX_DAMPING)
 
-        def interval(x, held):
-            x = self._step(model, x, held)
-            return x, x
+        def interval(start, held):
+            start = self._step(model, start, held)
+            return start, start[0]
 
         def attempt(damping):
             step = _solve(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
             gain = step @ gradient + damping * step @ step  # decrease of the quadratic model
             variables = plan.variables - step.reshape(plan.variables.shape)
             variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
-            states = jax.lax.scan(interval, x, variables)[1]
+            states = jax.lax.scan(interval, start, variables)[1]
             cost = self._cost(reference, states, variables)
             return (Plan(variables, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), states), gain
 
@@ -232,7 +248,7 @@ class Controller:
         converged = gains[0] < jnp.finfo(gains.dtype).eps * (1 + plan.cost)
         return Plan(best.variables, best.cost, jnp.where(converged, INITIAL_DAMPING, best.damping)), states
 
-    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], variables: Float[Array, "t rotors"]):
+    def _quadratic(self, model, reference, x: Float[Array, "t+1 13"], before: Input, variables):
         """JᵀJ and Jᵀr for the residuals r of the cost and their Jacobian J in the decision variables."""
         factor = stage_factors(self.weights, self.steps)
         weighted = partial(deviations, self.weights)
@@ -240,8 +256,15 @@ class Controller:
         jacobian = jax.vmap(jax.jacfwd(weighted, argnums=1))(reference, x[1:])
         share = jnp.tanh(variables)
         slope = 1 - jnp.square(share)  # of the tanh
-        speeds, to_speed = self._speeds(share), self._range()[1] * slope
-        sensitivities = condensed(model, x[:-1], speeds, to_speed, self.interval, self.unit_quaternion)
+        commands, to_speed = self._speeds(share), self._range()[1] * slope
+        if self.rotor_lag:
+            kept, mixed = (part.astype(x.dtype) for part in lag_matrix(self.rotor_lag, self.interval, self.steps))
+            speeds, ones = jnp.asarray(kept[:, None] * before + mixed @ commands), jnp.ones_like(commands)
+            slopes = condensed(model, x[:-1], speeds, ones, self.interval, self.unit_quaternion)
+            slopes = slopes.reshape(self.steps, -1, *commands.shape)
+            sensitivities = (jnp.einsum("tskr,kj->tsjr", slopes, mixed) * to_speed).reshape(self.steps, -1, share.size)
+        else:
+            sensitivities = condensed(model, x[:-1], commands, to_speed, self.interval, self.unit_quaternion)
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         changes = input_rate_penalty(self.weights, self.steps)
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)

@@ -1,35 +1,81 @@
 """The closed loop: a plant, a controller with its prediction model and disturbance observer, and how well it flew."""
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller, Plan, checked_states
 from hybrid_jax.control.cost import Scalar, plan_cost
+from hybrid_jax.control.observer import Observer
+from hybrid_jax.control.rotor_lag import rotor_speeds
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.rotation import canonicalize_quaternion, heading
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY, Input, State
+from hybrid_jax.rotation import heading, normalise
+from hybrid_jax.state import POSITION, QUATERNION, Input, State
 
 Plant = Callable[[State, Input, Scalar], State]  # the state one period after time t [s], u held
 
-MOTION = slice(VELOCITY.start, BODY_RATES.stop)
 SATURATION_MARGIN = 0.01  # share of its range from a limit, within which a rotor speed counts as saturated
 
 
 class Flight(eqx.Module):
     """A closed-loop flight of t periods."""
 
-    x: Float[Array, "*n t+1 13"]  # states, the initial one first
-    u: Float[Array, "*n t 4"]  # rotor speeds held over each period, rad/s
+    x: Float[Array, "*n t+1 13"]  # true states, the initial one first
+    u: Float[Array, "*n t 4"]  # rotor speeds that are commanded over each period, rad/s
     plans: Plan  # of the controller at each call
-    disturbance: Float[Array, "*n t 6"]  # of the observer at each call, see `Estimate`
+    estimates: Any  # state of the estimator at each call
+
+    @property
+    def disturbance(self) -> Float[Array, "*n t 6"]:
+        """Of the observer at each call, see `Estimate`."""
+        return self.estimates.disturbance
+
+
+@dataclass(frozen=True)
+class Hardware:
+    """What stands between controller and vehicle. ValueError if a number is negative or not finite.
+
+    A sample at time t decides what is commanded from t + latency on, and the rotors follow with a lag. The plant is
+    told their mean speed over each period. Sensors add white noise to each entry of the state.
+    """
+
+    latency: float = 0.0  # from a sample to its command, a multiple of the controller's period [s]
+    rotor_lag: float = 0.0  # time constant [s]
+    noise: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # std: m, of quaternions, m/s, rad/s
+
+    def __post_init__(self):
+        checks.not_negative("latency", self.latency)
+        checks.not_negative("rotor_lag", self.rotor_lag)
+        if not isinstance(self.noise, tuple) or len(self.noise) != 4:
+            raise ValueError(f"noise must be four standard deviations, got {checks.short_repr(self.noise)}")
+        for size in self.noise:
+            checks.not_negative("noise", size)
+
+    def delay(self, period: float) -> int:
+        """The latency in periods."""
+        periods = round(self.latency / period)
+        if abs(periods * period - self.latency) > 1e-6 * period:
+            raise ValueError(f"latency must be a multiple of the period {period}, got {self.latency}")
+        return periods
+
+    def measure(self, x: State, key: PRNGKeyArray) -> State:
+        """The state as the sensors see it."""
+        if not any(self.noise):
+            return x
+        noisy = x + jnp.asarray(self.sizes(), x.dtype) * jax.random.normal(key, x.shape, x.dtype)
+        return noisy.at[QUATERNION].set(normalise(noisy[QUATERNION]))
+
+    def sizes(self) -> Float[np.ndarray, "13"]:
+        """The standard deviation of each entry of the state."""
+        return np.repeat(self.noise, [3, 4, 3, 3])
 
 
 class Performance(eqx.Module):
@@ -42,31 +88,54 @@ class Performance(eqx.Module):
     saturation: Scalar  # share of the rotor speeds at a limit
 
 
-class Estimate(eqx.Module):
-    """State of the disturbance observer: a constant acceleration beyond the model, from one-step prediction errors.
+class Moment(eqx.Module):
+    """Everything that a closed loop carries from one period to the next."""
 
-    The discrete-time form of Chen, Yang, Guo and Li, "Disturbance-observer-based control and related methods", 2016:
-    the prediction error divided by the period is the error of d, and a first-order filter of bandwidth β adds the share
-    1 − exp(−β period) of it to d.
-    """
+    x: State  # true
+    seen: State  # by the sensors
+    speeds: Input  # of the rotors [rad/s]
+    sent: Float[Array, "l 4"]  # commands on their way, the oldest first
+    plan: Plan
+    estimate: Any
+    key: PRNGKeyArray
 
-    disturbance: Float[Array, "6"]  # d: acceleration [m/s², world] and angular acceleration [rad/s², body]
-    expected: Float[Array, "6"]  # v [m/s] and ω [rad/s] predicted for the next sample
 
-    @classmethod
-    def begin(cls, x: State) -> "Estimate":
-        """Zero disturbance at state x."""
-        return cls(jnp.zeros_like(x, shape=6), x[MOTION])
+class Loop(NamedTuple):
+    """A closed loop that can be stopped and continued, which `fly` is made of."""
 
-    def correct(self, x: State, bandwidth: Scalar | float, period: float) -> "Estimate":
-        """Update with the sample x; a bandwidth [rad/s] of 0 leaves the disturbance as it is."""
-        error = (x[MOTION] - self.expected) / period
-        return Estimate(self.disturbance - jnp.expm1(-bandwidth * period) * error, self.expected)
+    controller: Controller
+    hardware: Hardware
+    estimator: Any  # an `AbstractEstimator` or one with its methods
 
-    def predict(self, field: AbstractVectorField, x: State, u: Input, period: float) -> "Estimate":
-        """Predict the next sample with u held from x for one period [s]."""
-        x = x.at[QUATERNION].set(canonicalize_quaternion(x[QUATERNION]))
-        return Estimate(self.disturbance, advance(disturbed(field, self.disturbance), x, u, period)[MOTION])
+    def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> Moment:
+        """At the state x0, with the rotors at the speeds of the plan."""
+        key, now = jax.random.split(key)
+        seen, speeds = self.hardware.measure(x0, now), self.controller.speeds(plan)[0].astype(x0.dtype)
+        sent = jnp.tile(speeds, (self.hardware.delay(self.controller.period), 1))
+        return Moment(x0, seen, speeds, sent, plan, self.estimator.begin(seen), key)
+
+    def tick(self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i) -> tuple[Moment, Input]:
+        """One period, the i-th; also returns what is commanded [rad/s].
+
+        The controller plans from where its model expects the vehicle when the command arrives.
+        """
+        controller, estimator, period = self.controller, self.estimator, self.controller.period
+        model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
+        for command in now.sent:
+            mean, speeds = self._lag(speeds, command)
+            x = advance(model, x, estimator.effective(now.estimate, mean), period)
+        wanted = controller.horizon(reference, i + len(now.sent))
+        u, plan = controller(model, wanted, x, now.plan, estimator.effective(now.estimate, speeds))
+        u = estimator.command(now.estimate, x, u)
+        sent = jnp.concatenate([now.sent, u[None]])
+        mean, speeds = self._lag(now.speeds, sent[0])
+        x = plant(now.x, mean, i * period).astype(now.x.dtype)
+        key, noise = jax.random.split(now.key)
+        seen = self.hardware.measure(x, noise)
+        return Moment(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
+
+    def _lag(self, speeds: Input, command: Input) -> tuple[Input, Input]:
+        return rotor_speeds(speeds, command, self.hardware.rotor_lag, self.controller.period)
 
 
 def fly(
@@ -76,41 +145,49 @@ def fly(
     x0: State,
     controller: Controller,
     bandwidth: Scalar | float = 0.0,
+    *,
+    hardware: Hardware | None = None,
+    estimator: Any = None,
+    key: PRNGKeyArray | None = None,
 ) -> Flight:
     """Fly a plant along a reference for n − 1 − horizon periods.
 
     The function is pure: use it under `jit`, and under `vmap` over any argument. A crash does not stop a flight; one
-    that diverges continues as infinity or NaN. `plans`, the largest part of the result, costs nothing if a compiled
-    function does not return it.
+    that diverges continues as infinity or NaN. `plans` and `estimates`, the largest parts of the result, cost nothing
+    if a compiled function does not return them.
 
     Args:
         plant: returns the state one period later.
         model: prediction model of the controller and of the observer.
         reference: one state per period (see `references.sample`).
         bandwidth: of the disturbance observer [rad/s]; 0 for none.
+        hardware: latency, rotor lag and noise, by default none. Give the controller the same `rotor_lag`.
+        estimator: in place of the observer, with the methods of `AbstractEstimator`, such as an `OnlineAdaptation`; it
+            then has the model.
+        key: of the noise; required for it.
 
     Raises:
         ValueError: shapes do not fit, or the reference is no longer than the horizon; for concrete values also if one
-            is not finite, a quaternion is not of length 1, or the bandwidth is negative.
+            is not finite, a quaternion is not of length 1, or the bandwidth is negative; noise without a key.
     """
     checks.not_negative("bandwidth", bandwidth)
+    hardware = Hardware() if hardware is None else hardware
+    if key is None and any(hardware.noise):
+        raise ValueError("key must be a random key, as the hardware has noise")
     x0, reference, plan = checked_states("x0", x0, reference, controller.begin())
     periods = len(reference) - 1 - controller.steps * controller.stride
     if periods < 1:
         raise ValueError(f"reference must be longer than the horizon, got {len(reference)} samples")
+    estimator = Observer(model, bandwidth, controller.period) if estimator is None else estimator
+    loop = Loop(controller, hardware, estimator)
 
-    def tick(carry, i):
-        x, plan, estimate = carry
-        estimate = estimate.correct(x, bandwidth, controller.period)
-        corrected = disturbed(model, estimate.disturbance)
-        u, plan = controller(corrected, controller.horizon(reference, i), x, plan)
-        estimate = estimate.predict(model, x, u, controller.period)
-        x = plant(x, u, i * controller.period).astype(x.dtype)
-        return (x, plan, estimate), (x, u, plan, estimate.disturbance)
+    def tick(now, i):
+        after, u = loop.tick(plant, reference, now, i)
+        return after, (after.x, u, after.plan, now.estimate)
 
-    start = (x0, plan, Estimate.begin(x0))
-    _, (x, u, plans, disturbance) = jax.lax.scan(tick, start, jnp.arange(periods))
-    return Flight(jnp.concatenate([x0[None], x]), u, plans, disturbance)
+    start = loop.begin(x0, plan, jax.random.key(0) if key is None else key)
+    x, u, plans, estimates = jax.lax.scan(tick, start, jnp.arange(periods))[1]
+    return Flight(jnp.concatenate([x0[None], x]), u, plans, estimates)
 
 
 def performance(

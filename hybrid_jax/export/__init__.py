@@ -2,14 +2,16 @@
 
 - `export_field`, `export_step`, `load_program`: StableHLO in a file, through `jax.export` (extra `export`).
 - `casadi_function`, `casadi_step`, `acados_model`: CasADi functions, for optimal control (extra `casadi`).
-- `export_c`: C99 for a flight controller.
+- `export_c`, `export_adaptation_c`: C99 for a flight controller.
 
 See docs/howto/export.md for an example.
 """
 
+from hybrid_jax.export.c_adaptation import export_adaptation_c
 from hybrid_jax.export.c_code import export_c
 from hybrid_jax.export.casadi_functions import acados_model, casadi_function, casadi_step
 from hybrid_jax.export.stablehlo import Program, export_field, export_step, load_program
 
-__all__ = ["Program", "acados_model", "casadi_function", "casadi_step", "export_c"]
+__all__ = ["Program", "acados_model", "casadi_function", "casadi_step"]
+__all__ += ["export_adaptation_c", "export_c"]
 __all__ += ["export_field", "export_step", "load_program"]

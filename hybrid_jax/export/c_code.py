@@ -60,8 +60,8 @@ def export_c(
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in (d, m)]
         fused = fuse_for_inference(prepared(field, likes, smooth))
-        values = _body(fused, likes, tables, ("xdot",))
-        slopes = _body(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
+        values = body_of(fused, likes, tables, ("xdot",))
+        slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
     code = "\n".join([values, slopes])
     words = set(re.findall(r"\w+", code))
     parts = {
@@ -89,11 +89,13 @@ def _with_slopes(field: AbstractVectorField, x, u):
     return linearize(field, x, u, directions[: len(x)], directions[len(x) :])
 
 
-def _body(function: Callable, likes, tables: Tables, outputs: tuple[str, ...]) -> str:
-    """The statements of a C function of x and u that fills these arrays."""
+def body_of(
+    function: Callable, likes, tables: Tables, outputs: tuple[str, ...], inputs: tuple[str, ...] = ("x", "u")
+) -> str:
+    """The statements of a C function of some arrays, x and u by default, that fills others."""
     translation = CTranslation(tables)
     sizes = [like.shape[0] for like in likes]
-    arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip("xu", sizes, strict=True)]
+    arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip(inputs, sizes, strict=True)]
     results = translation.run(jax.make_jaxpr(function)(*likes), arguments, sizes)
     kept = needed(translation.statements, frozenset().union(*map(used, results)))
     lines = [statement.text for statement in kept]

@@ -189,3 +189,45 @@ def test_the_guide_s_example_runs(capsys):
     exec(compile(code, "example", "exec"), {})
     away = float(capsys.readouterr().out.split()[3])
     assert away < 0.01
+
+
+def test_a_late_and_lagging_vehicle_is_flown_by_a_controller_that_knows():
+    """It tracks nearly as well as without latency and lag; one that does not know of the lag is worse."""
+    late, reference = control.Hardware(latency=0.02, rotor_lag=0.05), reference_of("fast eight")
+
+    def flown(lag):
+        own = control.Controller(hj.IRIS, rotor_lag=lag)
+        flight = jax.jit(lambda: control.fly(plant(BODY), BODY, reference, reference[0], own, hardware=late))()
+        return control.performance(flight, reference, own).position_rmse
+
+    known, unknown = flown(0.05), flown(0.0)
+    assert known < 0.01
+    assert known < 0.8 * unknown
+
+
+def test_a_command_arrives_late_and_the_rotors_follow():
+    late = control.Hardware(latency=0.02, rotor_lag=0.05)
+    own = control.Controller(hj.IRIS, rotor_lag=0.05)
+    reference, seen = reference_of("eight"), []
+    loop = control.Loop(own, late, control.Observer(BODY, 0.0, own.period))
+    now = loop.begin(reference[0], own.begin(), jax.random.key(0))
+    tick = jax.jit(lambda now, i: loop.tick(lambda x, u, t: x.at[:4].set(u), reference, now, i))
+    start, commands = now.speeds, []
+    for i in range(4):
+        now, u = tick(now, i)
+        seen.append(now.x[:4])
+        commands.append(u)
+    np.testing.assert_allclose(seen[1], start, rtol=1e-6)  # the first command is still on its way
+    share = 1 - 0.05 / 0.01 * -np.expm1(-0.01 / 0.05)  # of the way that the mean over a period goes
+    np.testing.assert_allclose(seen[2] - start, share * (commands[0] - start), rtol=1e-3, atol=1e-3)
+
+
+def test_hardware_that_cannot_be_is_refused():
+    for options in ({"latency": -1.0}, {"rotor_lag": np.nan}, {"noise": (0.1,)}, {"noise": (-1.0, 0.0, 0.0, 0.0)}):
+        with pytest.raises(ValueError, match=next(iter(options))):
+            control.Hardware(**options)
+    with pytest.raises(ValueError, match="latency must be a multiple"):
+        control.Hardware(latency=0.015).delay(0.01)
+    noisy = control.Hardware(noise=(0.1, 0.0, 0.0, 0.0))
+    with pytest.raises(ValueError, match="key must be"):
+        control.fly(plant(BODY), BODY, reference_of("hover"), reference_of("hover")[0], CONTROLLER, hardware=noisy)

@@ -7,7 +7,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.loop import Estimate
+from hybrid_jax.control.observer import Estimate
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.networks.mlp import InputScaling
 

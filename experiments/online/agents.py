@@ -1,0 +1,170 @@
+"""What flies: prediction models of the Iris, estimators that adapt them in the air, and the truth after each change."""
+
+import math
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.adaptation.online import OnlineAdaptation
+from hybrid_jax.control import Hardware, Observer, advance
+from hybrid_jax.control.observer import MOTION
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.corrected_body import corrected
+from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
+from hybrid_jax.dynamics.estimator import AbstractEstimator
+from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.terms import Terms, units_of
+from hybrid_jax.rotation import body_z
+from hybrid_jax.sim.changes import DOUBLED_DRAG, OFF_CENTRE_LOAD, WEAK_ROTOR
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.forces import DRAG_COEFFICIENT, LOST_THRUST, parameters_of, weak_rotor, wind
+from hybrid_jax.state import QUATERNION
+from hybrid_jax.vehicle import IRIS
+
+CHANGES: Mapping[str, Domain] = {
+    "inertia": PARAMETER_SHIFT,
+    "load": OFF_CENTRE_LOAD,
+    "wind": EXTERNAL_FORCE,
+    "weak_rotor": WEAK_ROTOR,
+    "drag": DOUBLED_DRAG,
+    "nothing": SOURCE,
+}
+CHANGE_NAMES = {
+    "inertia": "other inertia",
+    "load": "load of 20 % off centre",
+    "wind": "side wind",
+    "weak_rotor": "one rotor 15 % weaker",
+    "drag": "twice the drag",
+    "nothing": "no change",
+}
+AGENTS = {
+    "unadapted": "unadapted",
+    "observer": "disturbance observer",
+    "l1": "L1 adaptive augmentation",
+    "least_squares": "least squares after 10 s on the ground",
+    "online": "online adaptation",
+    "oracle": "oracle",
+}
+LEARNED = ("Ix", "Iy", "Iz", "centre_of_mass")
+PARTS = 4 * 3  # Ix, Iy, Iz, centre of mass (2), efficiency (4), added drag (3): entries of θ before the disturbance
+# Logarithms of inertia and efficiency, 1 cm or so of the arm, and half the vehicle's own drag or more.
+PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
+DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
+PROCESS = (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3  # m/s² and rad/s² of a white noise, √s
+INITIAL = 1.0  # nothing but the prior is known at the start
+
+
+def nominal() -> AbstractVectorField:
+    """The Iris with its drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
+    body = multirotor(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT,) * 3))
+    return corrected(body, IRIS.rotors)
+
+
+def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
+    """The truth after a change as `nominal` holds it. Its mass is fixed, so that another mass shows in all others."""
+    vehicle, share = domain.vehicle, IRIS.mass / domain.vehicle.mass
+    inertia = np.log(share * np.divide(vehicle.inertia, IRIS.inertia))
+    centre = np.subtract(IRIS.rotor_positions, vehicle.rotor_positions)[0] / units_of(IRIS)["centre_of_mass"]
+    efficiency = np.full(IRIS.rotors, math.log(share))
+    if weak_rotor in domain.forces:
+        efficiency[0] += math.log(1 - LOST_THRUST)
+    drag = np.full(3, domain.drag_coefficient / vehicle.mass - DRAG_COEFFICIENT / IRIS.mass)
+    return np.concatenate([inertia, centre, efficiency, drag])
+
+
+def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
+    """`nominal` at other parameters, in the order of `true_theta`."""
+    values = jnp.asarray(theta, float)
+    deviations = dict(zip(LEARNED, [*values[:3], values[3:5]], strict=True))
+    return eqx.tree_at(
+        lambda field: [*(field.body.deviations[name] for name in LEARNED), field.log_efficiency, field.drag],
+        nominal(),
+        [*deviations.values(), values[5:9], values[9:12]],
+    )
+
+
+class Told(AbstractEstimator):
+    """A model, a disturbance observer of bandwidth ≥ 0, and what an oracle is told of the wind."""
+
+    observer: Observer
+    share: Float[Array, ""]  # 1 if it knows the wind
+    clock: Float[Array, ""]  # of the wind at the start of the flight [s]
+
+    def begin(self, x):
+        return self.observer.begin(x), jnp.zeros((), x.dtype)
+
+    def update(self, state, x, u):
+        return self.observer.update(state[0], x, u), state[1] + self.observer.period
+
+    def model(self, state):
+        force = wind(jnp.zeros(13), jnp.zeros(4), self.clock + state[1], parameters_of(IRIS)).force
+        known = self.share * jnp.concatenate([force, jnp.zeros(3)]) / IRIS.mass
+        return disturbed(self.observer.field, state[0].disturbance + known)
+
+
+class L1(AbstractEstimator):
+    """L1 adaptive augmentation with a piecewise constant law.
+
+    Hanover, Foehn, Sun, Kaufmann and Scaramuzza, "Performance, precision, and payloads: adaptive nonlinear MPC for
+    quadrotors", 2021: a predictor of v and ω, whose error gives the force and torque that the model lacks; of these
+    thrust and torques pass a low-pass filter and are taken off what the controller commands.
+    """
+
+    field: AbstractVectorField
+    gain: float = eqx.field(static=True)  # of the predictor [rad/s]
+    cutoff: Float[Array, ""]  # of the filter [rad/s]
+    period: float = eqx.field(static=True)
+
+    def begin(self, x):
+        return x, x[MOTION], jnp.zeros(4, x.dtype)
+
+    def update(self, state, x, u):
+        before, predicted, filtered = state
+        kept = math.exp(-self.gain * self.period)
+        error = predicted - before[MOTION]
+        span = (1 - kept) / self.gain
+        missing = -kept / span * error
+        moved = advance(self.field, before, u, self.period)[MOTION]
+        predicted = moved + kept * error + span * missing
+        matched = jnp.concatenate([(missing[:3] @ body_z(before[QUATERNION]))[None], missing[3:]])
+        filtered = filtered - jnp.expm1(-self.cutoff * self.period) * (matched - filtered)
+        return x, predicted, filtered
+
+    def model(self, state):
+        return self.field
+
+    def command(self, state, x, u):
+        return self._added(u, -state[2])
+
+    def effective(self, state, u):
+        return self._added(u, state[2])
+
+    def _added(self, u, accelerations):
+        """The speeds that give these accelerations, along the thrust and about the three axes, beside those of u."""
+        px, py = np.array(IRIS.rotor_positions).T
+        k, c_m = IRIS.thrust_coefficient, IRIS.torque_coefficient
+        mixer = np.stack([k * np.ones(4), k * py, -k * px, c_m * np.array(IRIS.spin)])
+        mixer = mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
+        squares = jnp.square(u) + jnp.asarray(np.linalg.inv(mixer), u.dtype) @ accelerations
+        return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
+
+
+def told(field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0) -> Told:
+    """An agent that does not learn, or by an observer alone."""
+    first, *others = (np.asarray(number, np.float32) for number in (bandwidth, share, clock))
+    return Told(Observer(as_numpy(with_disturbance(field)), first, period), *others)
+
+
+def online(hardware: Hardware, period: float) -> OnlineAdaptation:
+    sizes = np.maximum(hardware.sizes(), 1e-4)
+    return OnlineAdaptation(
+        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, initial=INITIAL
+    )
+
+
+def as_numpy(tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf) if eqx.is_array(leaf) else leaf, tree)

@@ -1,0 +1,59 @@
+"""Options of the experiment that adapts in the air, and its presets."""
+
+from dataclasses import dataclass
+from typing import Literal, get_args
+
+from experiments.runner.options import NotNegative, Positive, Run, distinct
+from hybrid_jax.control import Hardware
+
+Change = Literal["inertia", "load", "wind", "weak_rotor", "drag", "nothing"]
+Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracle"]
+Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
+NOISE = (0.001, 0.002, 0.02, 0.02)  # m, of quaternions, m/s, rad/s: motion capture and a gyroscope
+
+
+@dataclass(frozen=True)
+class OnlineConfig(Run):
+    """At 4 s the simulated vehicle changes in the air. Every agent flies every reference through every change."""
+
+    seconds: Positive = 4.0
+    """Length of a flight after the change [s]."""
+    changes: tuple[Change, ...] = get_args(Change)
+    """What changes."""
+    references: tuple[Reference, ...] = ("hover", "figure_eight", "fast_figure_eight", "low_pass")
+    """References flown."""
+    agents: tuple[Agent, ...] = get_args(Agent)
+    """Who flies."""
+    noise: NotNegative = 1.0
+    """White noise on the measured states; 1 is typical of motion capture and a gyroscope."""
+    latency: NotNegative = 0.01
+    """From a sample to its command, a multiple of 0.01 [s]."""
+    rotor_lag: NotNegative = 0.03
+    """Time constant of the rotors [s]."""
+    bandwidth: Positive = 8.0
+    """Of the disturbance observer [rad/s]."""
+    l1_cutoff: Positive = 8.0
+    """Of the low-pass filter of L1 adaptive augmentation [rad/s]."""
+
+    def __post_init__(self):
+        Run.__post_init__(self)
+        for name in ("changes", "references", "agents"):
+            distinct(f"--{name}", getattr(self, name))
+        if self.seconds < 1.5:
+            raise ValueError(f"--seconds must be at least 1.5, got {self.seconds}")
+        if self.distributed:
+            raise ValueError("--distributed: this experiment runs in one process")
+        self.hardware().delay(0.01)
+
+    def hardware(self) -> Hardware:
+        return Hardware(self.latency, self.rotor_lag, tuple(self.noise * size for size in NOISE))  # type: ignore
+
+
+PRESETS = {
+    "paper": OnlineConfig(),
+    "quick": OnlineConfig(preset="quick", seeds=2),
+    "smoke": OnlineConfig(
+        preset="smoke", seeds=1, seconds=1.5, changes=("wind", "nothing"), references=("hover",),
+        agents=("unadapted", "online", "oracle"),
+    ),
+}  # fmt: skip

@@ -1,0 +1,199 @@
+"""The results of flights with a change in the air: a row for each flight, tables, and the claims on them."""
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from experiments.closed_loop.results import REFERENCES
+from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, PARTS, true_theta
+from experiments.online.flights import Run, Setting
+from experiments.reporting.claims import Claim, Part, Undecided, all_of
+from experiments.reporting.results import Results, Row
+from experiments.reporting.tables import EMPTY, Table, cross_table
+
+CRASH = 10.0  # m from the reference
+SETTLED, LEARNED = 1.0, 3.0  # s after the change, from which errors and intervals are judged
+FACTOR, WORSE, COVERED = 1.2, 1.02, 0.9
+STEP_MS, MINUTES = 0.2, 5.0
+Z = 1.959964
+TAGS = ("change", "reference", "agent", "seed")
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """All flights, and how long things took."""
+
+    rows: Results
+    step_ms: float  # processor time of one step of the filter on one core
+    seconds: float  # of all flights, on the clock, without compiling
+    processor_seconds: float  # likewise, on all cores
+    flights: int
+
+
+def results_of(run: Run, setting: Setting) -> Results:
+    """A row for each flight. RMSE in m: of the first second after the change, and from SETTLED on."""
+    rate = round(1 / setting.period)
+    rows = []
+    for i, tags in enumerate(run.tags):
+        error, low = run.flown.error[i], run.flown.altitude[i].min()
+        crashed = not (np.isfinite(error).all() and error.max() <= CRASH and low >= 0)
+        row: dict[str, Any] = {**tags, "crashed": crashed, "largest": float(np.max(error))}
+        row |= {name: rms(part) for name, part in (("first_second", error[:rate]), ("settled", error[rate:]))}
+        if tags["agent"] == "online":
+            row |= _intervals(run, i, tags["change"], rate)
+        rows.append(row)
+    return Results(rows, TAGS)
+
+
+def rms(values: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(np.square(values))))
+
+
+def _intervals(run: Run, i: int, change: str, rate: int) -> Row:
+    """The share of the time from LEARNED on that the interval of each parameter holds the truth; when it alarmed."""
+    late = slice(round(LEARNED * rate), None)
+    theta, std = run.flown.theta[i][late, :PARTS], run.flown.std[i][late, :PARTS]
+    inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
+    alarms = np.flatnonzero(np.diff(run.flown.changes[i], prepend=run.flown.changes[i][:1]))
+    shares = inside.mean(axis=0) if len(theta) else np.full(PARTS, np.nan)
+    first = float(alarms[0]) / rate if len(alarms) else None
+    return {"inside": dict(zip(NAMES, shares.tolist(), strict=True)), "first_alarm": first, "alarms": len(alarms)}
+
+
+NAMES = (
+    *("Ix", "Iy", "Iz", "centre_of_mass x", "centre_of_mass y"),
+    *(f"efficiency {i}" for i in range(4)),
+    *(f"drag {axis}" for axis in "xyz"),
+)
+
+
+def error(name: str):
+    """An error in cm, infinite for a crash."""
+    return lambda row: np.inf if row["crashed"] or row[name] is None else 100 * row[name]
+
+
+def tables(rows: Results) -> list[Table]:
+    """Errors after the change of each agent, by reference; when it was found; coverage."""
+    made = []
+    columns = {REFERENCES[name]: {"reference": name} for name in rows.unique("reference")}
+    for change, group in rows.group("change").items():
+        lines = {AGENTS[agent]: own for agent, own in group.group("agent").items()}
+        for title, name in ((f"from {SETTLED:g} s after it on", "settled"), ("in the first second", "first_second")):
+
+            def cell(own: Results, name=name) -> str:
+                crashes = sum(own["crashed"])
+                text = f"{np.mean(own.numbers(error(name))):.2f}" if not crashes else f"{crashes} of {len(own)} crash"
+                return text if len(own) else EMPTY
+
+            title = f"RMSE of the position [cm], {CHANGE_NAMES[change]}, {title} (mean over seeds; less is better)"
+            made.append(cross_table(title, lines, columns, cell)._replace(best="column"))
+    return [*made, *_found(rows), *_coverage(rows)]
+
+
+def _found(rows: Results) -> list[Table]:
+    lines = []
+    for change, group in rows.where(agent="online").group("change").items():
+        own = [CHANGE_NAMES[change]]
+        for reference in rows.unique("reference"):
+            flights = group.where(reference=reference)
+            times = [t for t in flights["first_alarm"] if t is not None]
+            own.append(f"{len(times)} of {len(flights)}" + (f", {1000 * np.median(times):.0f} ms" if times else ""))
+        lines.append(tuple(own))
+    header = ("change", *(REFERENCES[name] for name in rows.unique("reference")))
+    return (
+        [Table("Flights in which the filter found a change, and the median time until then", header, lines)]
+        if lines
+        else []
+    )
+
+
+def _coverage(rows: Results) -> list[Table]:
+    lines = [
+        (
+            CHANGE_NAMES[change],
+            *(f"{100 * np.mean(own.numbers(lambda row, name=name: row['inside'][name])):.0f}" for name in NAMES),
+        )
+        for change, own in rows.where(agent="online").group("change").items()
+    ]
+    title = f"Share of 95 % intervals that hold the truth [%], from {LEARNED:g} s after the change on"
+    return [Table(title, ("change", *NAMES), lines)] if lines else []
+
+
+def _pair(e: Evidence, change: str, agent: str, other: str, reference: str) -> tuple[Results, Results]:
+    found = [e.rows.where(change=change, agent=name, reference=reference) for name in (agent, other)]
+    if not all(map(len, found)):
+        raise Undecided(f"{AGENTS[agent]} or {AGENTS[other]} did not fly")
+    return found[0], found[1]
+
+
+def _near_oracle(change: str, e: Evidence) -> Iterator[Part]:
+    for reference in e.rows.unique("reference"):
+        own, best = _pair(e, change, "online", "oracle", reference)
+        excess = own.interval(error("settled"), best, FACTOR)
+        ratio = np.mean(own.numbers(error("settled"))) / np.mean(best.numbers(error("settled")))
+        yield excess.below(0), f"{REFERENCES[reference]}: {ratio:.2f} ×"
+
+
+def _no_crash(e: Evidence) -> Part:
+    oracle = {tuple(row[t] for t in TAGS if t != "agent"): row["crashed"] for row in e.rows.where(agent="oracle")}
+    own = e.rows.where(agent="online")
+    if not oracle or not len(own):
+        raise Undecided("the oracle or the online adaptation did not fly")
+    crashes = sum(row["crashed"] and not oracle[tuple(row[t] for t in TAGS if t != "agent")] for row in own)
+    return crashes == 0, f"{crashes} of {len(own)} flights, the oracle {sum(oracle.values())}"
+
+
+def _no_worse(e: Evidence) -> Iterator[Part]:
+    for reference in e.rows.unique("reference"):
+        own, without = _pair(e, "nothing", "online", "unadapted", reference)
+        excess = own.interval(error("settled"), without, WORSE)
+        ratio = np.mean(own.numbers(error("settled"))) / np.mean(without.numbers(error("settled")))
+        yield excess.below(0), f"{REFERENCES[reference]}: {100 * (ratio - 1):+.1f} %"
+
+
+def _holds_truth(e: Evidence) -> Iterator[Part]:
+    for change, own in e.rows.where(agent="online").group("change").items():
+        shares = np.array([list(row["inside"].values()) for row in own], float).mean(axis=1)
+        if not np.isfinite(shares).all():
+            raise Undecided(f"flights end before {LEARNED:g} s after the change")
+        margin = 1.96 * shares.std() / np.sqrt(len(shares))  # flights are independent, parameters of one are not
+        holds = True if shares.mean() >= COVERED else False if shares.mean() + margin < COVERED else None
+        yield holds, f"{CHANGE_NAMES[change]}: {shares.mean():.2f}"
+
+
+def _fast_step(e: Evidence) -> Part:
+    return e.step_ms <= STEP_MS, f"{e.step_ms:.3f} ms"
+
+
+def _fast_table(e: Evidence) -> Part:
+    minutes, alone = e.seconds / 60, e.processor_seconds / 60
+    words = f"{minutes:.1f} minutes on the clock for {e.flights} flights, {alone:.1f} of one core's time"
+    return minutes <= MINUTES, words
+
+
+_PAIRED = "on each reference (95 % interval of the paired difference over seeds)"
+_NEAR = (
+    f"from {SETTLED:g} s after it on the RMSE of online adaptation is at most {FACTOR:g} times the oracle's {_PAIRED}."
+)
+_WORSE = f"Without a change its RMSE is at most {WORSE - 1:.0%} above that of the unadapted model {_PAIRED}."
+_COVERS = (
+    f"From {LEARNED:g} s after the change on, at least {COVERED:.0%} of the 95 % intervals of its parameters hold the "
+    "truth, after each change (fails: significantly fewer)."
+)
+
+
+def claims(changes: list[str]) -> list[Claim[Evidence]]:
+    near = [
+        Claim(f"O1{letter}", f"{CHANGE_NAMES[change]}: {_NEAR}", lambda e, own=change: all_of(_near_oracle(own, e)))
+        for letter, change in zip("abcdef", changes, strict=False)
+    ]
+    return [
+        *near,
+        Claim("O2", "No flight with online adaptation crashes where the oracle does not.", _no_crash),
+        Claim("O3", _WORSE, lambda e: all_of(_no_worse(e))),
+        Claim("O4", _COVERS, lambda e: all_of(_holds_truth(e))),
+        Claim("O5", f"A step of the filter takes at most {STEP_MS:g} ms on one core.", _fast_step),
+        Claim("O6", f"All flights take at most {MINUTES:g} minutes on two cores (without compiling).", _fast_table),
+    ]

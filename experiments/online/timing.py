@@ -1,0 +1,42 @@
+"""Time of one step of the filter, on one core."""
+
+import time
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.closed_loop.timing import use_one_core
+from experiments.online import agents
+from hybrid_jax.control import Hardware
+from hybrid_jax.vehicle import IRIS
+
+STEPS = 1000  # that are timed
+
+
+def step_time(cache: Path, hardware: Hardware, period: float) -> float:
+    """Processor time of a step of the filter on one core [ms]."""
+    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (cache,)) as process:
+        return process.submit(_step_time, hardware, period).result()
+
+
+def _step_time(hardware: Hardware, period: float) -> float:
+    adaptation = agents.online(hardware, period)
+    start = jnp.zeros(13).at[2].set(1.5).at[3].set(1.0)
+    noise = 0.01 * jax.random.normal(jax.random.key(0), (STEPS, 13))
+    u = jnp.full(IRIS.rotors, IRIS.hover_speed)
+
+    @jax.jit
+    def steps(state):
+        return jax.lax.scan(lambda state, e: (adaptation.update(state, start + e, u), None), state, noise)[0]
+
+    state = jax.block_until_ready(steps(adaptation.begin(start)))
+    taken = []
+    for _ in range(5):
+        began = time.process_time()
+        state = jax.block_until_ready(steps(state))
+        taken.append(time.process_time() - began)
+    return 1e3 * float(np.median(taken)) / STEPS

@@ -1,0 +1,109 @@
+"""Flights in which the vehicle changes in the air: the truth, the claims, and the command."""
+
+import json
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import command, experiments, refused, unbegun
+
+from experiments.online.agents import CHANGES, L1, nominal, told, true_theta, with_theta
+from experiments.online.results import NAMES, TAGS, Evidence, claims, tables
+from experiments.reporting.claims import evaluate
+from experiments.reporting.results import Results
+from hybrid_jax.sim.forces import ground_effect, wind
+from hybrid_jax.vehicle import IRIS
+
+STATES = np.random.default_rng(0).normal(size=(3, 13)).astype(np.float32)
+STATES[:, 3:7] /= np.linalg.norm(STATES[:, 3:7], axis=1, keepdims=True)
+SPEEDS = (IRIS.hover_speed + 80 * np.random.default_rng(1).normal(size=(3, 4))).astype(np.float32)
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_the_oracle_is_the_simulator_without_ground_effect(change):
+    quadrotor = CHANGES[change].quadrotor()
+    known = tuple(force for force in quadrotor.forces if force not in (ground_effect, wind))
+    truth, field = type(quadrotor)(quadrotor.parameters, known), with_theta(true_theta(CHANGES[change]))
+    for x, u in zip(STATES, SPEEDS, strict=True):
+        expected = eqx.filter_jit(truth.derivative)(jnp.asarray(x), jnp.asarray(u), 0.0)
+        np.testing.assert_allclose(field(x, u), expected, rtol=2e-4, atol=2e-4)
+
+
+def test_an_oracle_of_the_wind_expects_its_force():
+    agent = told(nominal(), 0.01, clock=1.3, share=1.0)
+    state = agent.update(agent.begin(jnp.asarray(STATES[0])), jnp.asarray(STATES[0]), jnp.asarray(SPEEDS[0]))
+    extra = agent.model(state)(STATES[0], SPEEDS[0]) - nominal()(STATES[0], SPEEDS[0])
+    force = (-4 + np.sin(2 / 3 * np.pi * 1.31)) / IRIS.mass
+    np.testing.assert_allclose(extra[7:10], [0, force, 0], atol=1e-4)
+
+
+def test_what_l1_commands_is_what_its_model_lacks():
+    agent = L1(nominal(), 5.0, np.float32(5.0), 0.01)
+    missing = jnp.array([-0.5, 1.0, -2.0, 0.3])  # thrust [m/s²] and ω̇ that the model lacks
+    u = jnp.asarray(SPEEDS[0])
+    commanded = agent.command((None, None, missing), None, u)
+    x = jnp.zeros(13).at[3].set(1.0)
+    gained = nominal()(x, commanded)[9:] - nominal()(x, u)[9:]
+    np.testing.assert_allclose(gained, -missing, atol=2e-3)
+    np.testing.assert_allclose(agent.effective((None, None, missing), commanded), u, rtol=1e-5)
+
+
+def rows(online=1.1, unchanged=1.0, inside=0.95, crash=False):
+    """Three seeds in which the oracle errs by 1 cm and the unadapted model by 3; online adaptation as given."""
+    found = []
+    for change in ("wind", "nothing"):
+        for agent in ("unadapted", "online", "oracle"):
+            for seed in range(3):
+                own = {"unadapted": 1.0 if change == "nothing" else 3.0, "oracle": 1.0}.get(agent, online)
+                own = unchanged if (agent, change) == ("online", "nothing") else own
+                row = {"change": change, "reference": "hover", "agent": agent, "seed": seed}
+                row |= {"settled": own * (1 + 0.001 * seed) / 100, "first_second": 0.05, "largest": 0.1}
+                row |= {"crashed": crash and agent == "online", "alarms": 1, "first_alarm": 0.06}
+                found.append(row | ({"inside": dict.fromkeys(NAMES, inside)} if agent == "online" else {}))
+    return Results(found, TAGS)
+
+
+@pytest.mark.parametrize(
+    ("change", "fails"),
+    [
+        ({}, []),
+        ({"online": 1.3}, ["O1a"]),
+        ({"unchanged": 1.05}, ["O3"]),
+        ({"inside": 0.8}, ["O4"]),
+        ({"crash": True}, ["O1a", "O1b", "O2", "O3"]),
+    ],
+)
+def test_each_claim_fails_where_it_should(change, fails):
+    evidence = Evidence(rows(**change), step_ms=0.1, seconds=60.0, processor_seconds=100.0, flights=18)
+    found = {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
+    assert [id for id, holds in found.items() if not holds] == fails
+    assert {each.header[0] for each in tables(rows(**change))} >= {"change"}
+
+
+def test_slow_is_said():
+    evidence = Evidence(rows(), step_ms=0.3, seconds=600.0, processor_seconds=100.0, flights=18)
+    found = {each.id: each.holds for each in evaluate(claims(["wind", "nothing"]), evidence)}
+    assert (found["O5"], found["O6"]) == (False, False)
+
+
+def test_options_that_cannot_be_are_refused():
+    assert "latency must be a multiple" in refused(
+        unbegun("online", "--preset", "smoke", "--latency", "0.015"), "online"
+    )
+    assert "--seconds must be" in refused(unbegun("online", "--preset", "smoke", "--seconds", "1"), "online")
+
+
+@pytest.mark.slow
+def test_the_command_flies_and_reports(tmp_path):
+    (run,) = experiments("online", "online", folder=tmp_path)
+    assert run.returncode == 0, run.stderr
+    out = tmp_path / "out" / "online"
+    report = json.loads((out / "report.json").read_text())
+    assert len(report["rows"]) == 6
+    assert not any(row["crashed"] for row in report["rows"])
+    assert {"errors.png", "parameters.png", "flight.gif"} <= {path.name for path in out.iterdir()}
+    wind_rows = {row["agent"]: row["settled"] for row in report["rows"] if row["change"] == "wind"}
+    assert wind_rows["oracle"] < wind_rows["online"] < wind_rows["unadapted"] / 2
+    again = command("online", "--references", "hover,hover", folder=tmp_path)
+    assert "--references must be" in refused(again, "online")
