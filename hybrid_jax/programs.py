@@ -37,7 +37,6 @@ LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "line
 STANDARD = ("builtins", "collections", "copyreg", "functools", "ml_dtypes", "operator", "types")
 KNOWN = frozenset((*OWN, *LIBRARIES, *STANDARD))  # packages whose code the key describes
 IN_MEMORY = 64  # programs of one function
-SUFFIX = ".executable"
 HIT = "/jax/compilation_cache/cache_hits"
 
 
@@ -112,7 +111,7 @@ class _Kept:
             digest.update(repr(part).encode())
         folder = runtime.kept_programs()
         assert folder is not None  # asked by the caller
-        return folder / f"{self._name}-{digest.hexdigest()}{SUFFIX}"
+        return folder / f"{self._name}-{digest.hexdigest()}{runtime.EXECUTABLE}"
 
     def _compile(self, leaves: list, structure, path: Path) -> Callable:
         """The program for these arguments; kept in a file if its result can be described."""
@@ -182,7 +181,7 @@ def _read(path: Path) -> Callable | None:
         compiled = serialize_executable.deserialize_and_load(executable, before, after, devices[0], chosen)
     except Exception:  # whatever a file of another making raises: the program is compiled anew
         return None
-    path.touch()  # see runtime: programs long unused are deleted
+    path.touch()  # those that nobody uses are deleted, see runtime
     return functools.partial(_call, compiled, skeleton, rest)
 
 

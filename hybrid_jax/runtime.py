@@ -3,6 +3,7 @@
 import contextlib
 import os
 import platform
+import time
 import zlib
 from collections import Counter
 from importlib.metadata import version
@@ -26,6 +27,8 @@ if version("jaxlib").split(".")[:2] == ["0", "10"]:
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
 # level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
+EXECUTABLE = ".executable"  # the suffix of a kept program, see programs.py
+UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
 _kept: list[Path] = []  # the folder that `configure` was given last
 
 
@@ -42,6 +45,7 @@ def configure(cache: Path) -> None:
     try:
         programs.mkdir(parents=True, exist_ok=True)
         _delete_truncated(programs)
+        _delete_unused(programs)
     except OSError as error:
         where = f"{PROGRAMS} {programs}" if os.environ.get(PROGRAMS) else f"--cache {cache}"
         raise ValueError(f"{where}: cannot be written: {error.strerror}") from error
@@ -107,6 +111,14 @@ def _delete_truncated(programs: Path) -> None:
     for path in programs.glob("*-cache"):
         with contextlib.suppress(FileNotFoundError):  # deleted by another process
             if path.stat().st_mtime_ns >= since and _is_truncated(path.read_bytes()):
+                path.unlink()
+
+
+def _delete_unused(programs: Path) -> None:
+    """Delete kept programs of other sources or versions, which nothing will ask for again."""
+    for path in programs.glob(f"*{EXECUTABLE}"):
+        with contextlib.suppress(FileNotFoundError):
+            if time.time() - path.stat().st_mtime > UNUSED:
                 path.unlink()
 
 

@@ -1,5 +1,6 @@
 """Programs that are kept on disk are found again without tracing, and only where nothing differs."""
 
+import os
 from uuid import uuid4
 
 import equinox as eqx
@@ -33,7 +34,7 @@ def folder(tmp_path, monkeypatch):
 
 
 def kept(folder):
-    return sorted(folder.glob(f"*{programs.SUFFIX}"))
+    return sorted(folder.glob(f"*{runtime.EXECUTABLE}"))
 
 
 def called(*arguments):
@@ -155,3 +156,12 @@ def test_a_new_process_adapts_as_the_first_one_did(tmp_path):
     # It calls LAPACK, which a process that lowered nothing has not set up.
     first, again = (script("-c", ADAPT, tmp_path).rpartition("\n[") for _ in range(2))
     assert again[0] == first[0]
+
+
+def test_programs_that_nobody_used_for_a_month_are_deleted(folder):
+    called(2.0, np.ones(3))
+    called(3.0, np.ones(3))
+    old, new = kept(folder)
+    os.utime(old, (0, 0))
+    runtime._delete_unused(folder)
+    assert kept(folder) == [new]
