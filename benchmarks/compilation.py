@@ -1,8 +1,10 @@
-"""How long does an experiment wait for its programs: from nothing, and with the programs that the last run kept?
+"""How long does a process wait for its programs: from nothing, and with the programs that the last one kept?
 
 An experiment in its smoke preset, which runs every program of the whole one on little data, in a process of its own and
 with an empty cache; then once more with the cache of programs that the first one left, and nothing else of it. Counted
 is the time in which JAX traces, lowers, compiles or reads a program from the cache, on any thread, and no moment twice.
+
+Then `hybrid_jax.adapt` of a rigid body to a hundred windows, the whole process: import, first call, and a second call.
 """
 
 import json
@@ -17,6 +19,7 @@ from benchmarks.timing import Findings, Ratio, run, run_together, table
 from hybrid_jax.runtime import PROGRAMS
 
 COLD, CACHED = 15.0, 2.0  # s, to reach
+ADAPT_COLD, ADAPT_CACHED = 4.0, 1.5  # s, to reach: the first call; import and the first call
 
 
 @dataclass(frozen=True)
@@ -46,6 +49,30 @@ try:
 finally:
     with open(os.environ["HYBRID_JAX_PROBE"], "w") as file:
         json.dump({"seconds": time.monotonic() - began, "stages": stages}, file)
+"""
+
+
+# The same for a user's script: seconds of the import, of the first call and of a second one.
+ADAPT = """
+import json, sys, time
+began = time.monotonic()
+import hybrid_jax as hj
+imported = time.monotonic() - began
+from pathlib import Path
+import numpy as np
+hj.runtime.configure(Path(sys.argv[1]))
+draw = np.random.default_rng(0).normal
+x0 = np.zeros((100, 13), "f4")
+x0[:, :3], x0[:, 6] = draw(size=(100, 3)), 1
+u = (600 + 50 * draw(size=(100, 10, 4))).astype("f4")
+body = hj.rigid_body(hj.IRIS)
+windows = hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(body, x0, u, 0.01)), 0.01)
+seconds = [imported]
+for _ in range(2):
+    began = time.monotonic()
+    hj.adapt(body, windows)
+    seconds.append(time.monotonic() - began)
+print(json.dumps(seconds))
 """
 
 
@@ -86,11 +113,26 @@ def measure(preset: Preset) -> Findings:
                 elif found.name != "programs":
                     shutil.rmtree(found)
     cold, cached = (row["waited_seconds"] for row in rows)
+    with TemporaryDirectory() as folder:
+        adapted = [json.loads(run_together("adapt", [["-c", ADAPT, folder]])[0].splitlines()[-1]) for _ in range(2)]
+    names = "import_seconds", "first_seconds", "second_seconds"
+    calls = [
+        {"case": case, **dict(zip(names, seconds, strict=True))}
+        for case, seconds in zip(("cold", "cached"), adapted, strict=True)
+    ]
+    first, again = calls
     ratios = [
         Ratio(f"seconds for all programs of {preset.experiment}, from nothing", cold, at_most=COLD),
         Ratio("the same with the cache", cached, at_most=CACHED),
+        Ratio("seconds of the first adapt, from nothing", first["first_seconds"], at_most=ADAPT_COLD),
+        Ratio(
+            "seconds of import and the first adapt, with the cache",
+            again["import_seconds"] + again["first_seconds"],
+            at_most=ADAPT_CACHED,
+        ),
     ]
-    return Findings(rows, [table(f"programs of {preset.experiment}", rows, COLUMNS)], ratios)
+    tables = [table(f"programs of {preset.experiment}", rows, COLUMNS), table("a script that adapts", calls, CALLS)]
+    return Findings(rows + calls, tables, ratios)
 
 
 COLUMNS = {
@@ -98,6 +140,12 @@ COLUMNS = {
     "programs": lambda row: str(row["programs"]),
     "waited for them [s]": lambda row: f"{row['waited_seconds']:.1f}",
     "whole run [s]": lambda row: f"{row['run_seconds']:.1f}",
+}
+CALLS = {
+    "": lambda row: row["case"],
+    "import [s]": lambda row: f"{row['import_seconds']:.2f}",
+    "first adapt [s]": lambda row: f"{row['first_seconds']:.2f}",
+    "second [s]": lambda row: f"{row['second_seconds']:.2f}",
 }
 
 
