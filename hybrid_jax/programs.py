@@ -27,9 +27,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
-from jaxlib import lapack
 
-import hybrid_jax
 from hybrid_jax import checks, runtime
 
 OWN = ("hybrid_jax", "experiments", "benchmarks")  # known by their source
@@ -106,12 +104,11 @@ class _Kept:
     def _path(self, leaves: list, structure) -> Path:
         shapes = jax.tree.unflatten(structure, [_kind(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves])
         described, packages = _described((self._function, shapes, self._options))
-        digest = hashlib.sha256(described)
-        for part in (_context(), _environment(), *(source_digest(package) for package in sorted(packages))):
-            digest.update(repr(part).encode())
+        call = hashlib.sha256(described + repr((_context(), _environment())).encode()).hexdigest()
+        source = hashlib.sha256("".join(map(source_digest, sorted(packages))).encode()).hexdigest()
         folder = runtime.kept_programs()
         assert folder is not None  # asked by the caller
-        return folder / f"{self._name}-{digest.hexdigest()}{runtime.EXECUTABLE}"
+        return folder / f"{self._name}_{call}-{source}{runtime.EXECUTABLE}"
 
     def _compile(self, leaves: list, structure, path: Path) -> Callable:
         """The program for these arguments; kept in a file if its result can be described."""
@@ -126,18 +123,17 @@ class _Kept:
             results[:] = [found]
             return [leaf for leaf in found[0] if eqx.is_array(leaf)]
 
-        # In the next release JAX's cache has no program of this name, so that the new one can be kept.
-        flat.__name__ = f"{self._name}_{hybrid_jax.__version__}"
-        if path.exists():  # it is damaged
-            for twin in path.parent.glob(f"jit_{flat.__name__}-*-cache"):
-                twin.unlink(missing_ok=True)
+        flat.__name__ = path.name.partition("-")[0]  # for JAX's cache, too
         lowered = jax.jit(flat, **self._options).lower(arrays)
         _compiler.hits = 0  # not of small programs that ran while this one was traced
         compiled = lowered.compile()
         (found, shape), *_ = results
         rest = [None if eqx.is_array(leaf) else (leaf,) for leaf in found]
         skeleton = jax.tree.unflatten(shape, range(len(rest)))
-        if not _compiler.hits:  # jaxlib loses the kernels of a program from JAX's cache when it is serialised again
+        if _compiler.hits:  # jaxlib loses the kernels of a program from JAX's cache when it is serialised again
+            for entry in path.parent.glob(f"jit_{flat.__name__}-*"):
+                entry.unlink(missing_ok=True)  # so that the next process compiles and keeps it
+        else:
             _keep(path, compiled, len(arrays), skeleton, rest)
         return functools.partial(_call, compiled, skeleton, rest)
 
@@ -172,8 +168,7 @@ def _read(path: Path) -> Callable | None:
         if hashlib.sha256(content).digest() != digest:
             return None
         executable, devices, inputs, skeleton, rest = pickle.loads(content)
-        # A program calls LAPACK through pointers, which JAX sets when it lowers a first call.
-        lapack.prepare_lapack_call("potrf_ffi", jnp.dtype("float32"))
+        runtime.load_lapack()  # JAX does that when it lowers a first call, which it may not do here
         by_id = {device.id: device for device in jax.devices(devices[0])}
         chosen = [by_id[i] for i in devices[1]]
         before = jax.tree.structure((([0] * inputs,), {}))

@@ -1,6 +1,7 @@
 """Programs that are kept on disk are found again without tracing, and only where nothing differs."""
 
 import os
+from pathlib import Path
 from uuid import uuid4
 
 import equinox as eqx
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 from smoke import script
 
-import hybrid_jax
 from hybrid_jax import programs, runtime
 from hybrid_jax.programs import kept_jit
 
@@ -27,7 +27,8 @@ def scaled(factor: float, x):
 def folder(tmp_path, monkeypatch):
     """Where programs are kept; this module counts as a package whose source is known."""
     monkeypatch.setattr(runtime, "_kept", [tmp_path])
-    monkeypatch.setattr(hybrid_jax, "__version__", uuid4().hex)  # JAX's own cache must not have the program
+    salt = uuid4().hex  # JAX's own cache must not have the program
+    monkeypatch.setattr(programs, "_environment", lambda: salt)
     monkeypatch.setattr(programs, "KNOWN", programs.KNOWN | {__name__})
     TRACED.clear()
     return tmp_path
@@ -35,6 +36,12 @@ def folder(tmp_path, monkeypatch):
 
 def kept(folder):
     return sorted(folder.glob(f"*{runtime.EXECUTABLE}"))
+
+
+def forget(path):
+    """Delete a program from JAX's own cache."""
+    for entry in Path(os.environ.get(runtime.PROGRAMS, path.parent)).glob(f"jit_{path.name.partition('-')[0]}*"):
+        entry.unlink()
 
 
 def called(*arguments):
@@ -83,11 +90,11 @@ DAMAGES = {"cut": lambda data: data[:-9], "empty": lambda data: b"", "changed": 
 
 
 @pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
-def test_a_damaged_program_is_compiled_anew(folder, monkeypatch, damage):
+def test_a_damaged_program_is_compiled_anew(folder, damage):
     called(2.0, np.ones(3))
     (path,) = kept(folder)
     path.write_bytes(damage(whole := path.read_bytes()))
-    monkeypatch.setattr(hybrid_jax, "__version__", uuid4().hex)
+    forget(path)
     found, traced = called(2.0, np.ones(3))
     assert traced
     np.testing.assert_array_equal(found["x"], 2 * np.ones(3))

@@ -29,6 +29,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.programs import kept_jit
+from hybrid_jax.runtime import load_lapack
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
@@ -189,6 +190,7 @@ def adapt(
         raise ValueError(f"field: {physics} has {size} parameters, no named physics to fit; use method='fine_tune'")
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=2)
+    load_lapack()
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
