@@ -99,7 +99,10 @@ class FlatOutputs(eqx.Module):
     seconds: float = eqx.field(static=True)
     harmonics: int = eqx.field(static=True)
     dt: float = eqx.field(static=True)
-    names = ("x", "y", "z", "speed", "tilt", "yaw", "rotor_speed")
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return "x", "y", "z", "speed", "tilt", "yaw", *(f"rotor_speed[{i}]" for i in range(self.vehicle.rotors))
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -188,7 +191,7 @@ class FlatOutputs(eqx.Module):
         tilt = (1 - upright) / (1 - math.cos(bounds.tilt))
         yaw = jnp.abs(heading(x[:, QUATERNION])) / bounds.yaw
         least, most = (share * self.vehicle.max_rotor_speed for share in bounds.rotor_speed)
-        rotors = jnp.abs(2 * (u * jnp.abs(u) - least**2) / (most**2 - least**2) - 1).max(axis=1)
+        rotors = jnp.abs(2 * (u * jnp.abs(u) - least**2) / (most**2 - least**2) - 1)
         return jnp.column_stack([place, speed, tilt, yaw, rotors])
 
 

@@ -140,6 +140,7 @@ def flights():
     return [hj.excitation(model, ("Ix", "k"), hj.FlightBounds(), **given, steps=steps) for steps in (0, 40)]
 
 
+@pytest.mark.slow
 def test_a_flight_tells_more_than_any_start_and_keeps_its_limits(flights):
     begun, found = flights
     assert found.log_det > begun.log_det
@@ -149,6 +150,7 @@ def test_a_flight_tells_more_than_any_start_and_keeps_its_limits(flights):
         assert 0 < found.standard_errors[name] < value
 
 
+@pytest.mark.slow
 def test_a_flight_is_what_its_reference_says_and_the_vehicle_can_do(flights):
     found = flights[1]
     wanted = jax.vmap(lambda t: reference_state(found.reference, t, hj.IRIS.gravity))(jnp.asarray(found.t))
