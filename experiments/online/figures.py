@@ -98,9 +98,8 @@ def parameters(run: Run, setting: Setting, reference: str) -> Figure:
         panel.axvline(0, color="0.7", linestyle=":", linewidth=1)
     for panel in panels[-1]:
         panel.set_xlabel("time after the change [s]")
-    figure.suptitle(
-        f"Estimates and 95 % intervals of seed 0, {REFERENCES[reference]}; broken: the truth, of wind its mean"
-    )
+    title = f"Seed 0, {REFERENCES[reference]}: estimates, 95 % intervals, truth (broken; of wind its mean)"
+    figure.suptitle(title, fontsize=9)
     return figure
 
 
