@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 from experiments.closed_loop.results import REFERENCES
 from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, PARTS, true_theta
 from experiments.online.flights import CHANGE, SHARED, SHOWN_EVERY, Run, Setting
-from experiments.reporting.plots import PAGE, legend_below, subplots
+from experiments.reporting.plots import PAGE, legend_below, subplots, tick_errors
 from hybrid_jax.sim.forces import WIND_MEAN
 from hybrid_jax.state import POSITION
 from hybrid_jax.sweep.lanes import lane
@@ -67,9 +67,10 @@ def errors(run: Run, setting: Setting, reference: str) -> Figure:
             panel.plot(times[shown], rms[shown], color=COLOURS[agent], linewidth=width, label=AGENTS[agent])
         panel.axvline(0, color="0.7", linestyle=":", linewidth=1)
         panel.set(title=CHANGE_NAMES[change], yscale="log", ylabel="error [cm]")
+        tick_errors(panel.yaxis, *panel.get_ylim())
     for panel in panels[-1]:
         panel.set_xlabel("time after the change [s]")
-    return legend_below(figure, f"Distance from the reference, {REFERENCES[reference]}: RMS over seeds")
+    return legend_below(figure, f"Distance from the reference, {REFERENCES[reference]}: RMS over seeds", columns=2)
 
 
 def parameters(run: Run, setting: Setting, reference: str) -> Figure:
@@ -97,9 +98,8 @@ def parameters(run: Run, setting: Setting, reference: str) -> Figure:
         panel.axvline(0, color="0.7", linestyle=":", linewidth=1)
     for panel in panels[-1]:
         panel.set_xlabel("time after the change [s]")
-    figure.suptitle(
-        f"Estimates and 95 % intervals of seed 0, {REFERENCES[reference]}; broken: the truth, of wind its mean"
-    )
+    title = f"Seed 0, {REFERENCES[reference]}: estimates, 95 % intervals, truth (broken; of wind its mean)"
+    figure.suptitle(title, fontsize=9)
     return figure
 
 

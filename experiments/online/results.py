@@ -16,7 +16,7 @@ from experiments.reporting.tables import EMPTY, Table, cross_table
 CRASH = 10.0  # m from the reference
 SETTLED, LEARNED = 1.0, 3.0  # s after the change, from which errors and intervals are judged
 FACTOR, WORSE, COVERED = 1.2, 1.02, 0.9
-STEP_MS, MINUTES = 0.2, 5.0
+STEP_MS, MINUTES, FLIGHTS = 0.2, 5.0, 1440
 Z = 1.959964
 TAGS = ("change", "reference", "agent", "seed")
 
@@ -168,8 +168,8 @@ def _fast_step(e: Evidence) -> Part:
 
 
 def _fast_table(e: Evidence) -> Part:
-    minutes, alone = e.seconds / 60, e.processor_seconds / 60
-    words = f"{minutes:.1f} minutes on the clock for {e.flights} flights, {alone:.1f} of one core's time"
+    minutes, alone = (FLIGHTS / e.flights * taken / 60 for taken in (e.seconds, e.processor_seconds))
+    words = f"{minutes:.1f} minutes on the clock, {alone:.1f} of one core's time (from {e.flights} flights)"
     return minutes <= MINUTES, words
 
 
@@ -195,5 +195,7 @@ def claims(changes: list[str]) -> list[Claim[Evidence]]:
         Claim("O3", _WORSE, lambda e: all_of(_no_worse(e))),
         Claim("O4", _COVERS, lambda e: all_of(_holds_truth(e))),
         Claim("O5", f"A step of the filter takes at most {STEP_MS:g} ms on one core.", _fast_step),
-        Claim("O6", f"All flights take at most {MINUTES:g} minutes on two cores (without compiling).", _fast_table),
+        Claim(
+            "O6", f"{FLIGHTS} flights take at most {MINUTES:g} minutes on two cores (without compiling).", _fast_table
+        ),
     ]

@@ -25,15 +25,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.online_state import (
-    DISTURBANCE,
-    Flags,
-    Numbers,
-    OnlineState,
-    Tuning,
-    parameter_names,
-    parameter_scales,
-)
+from hybrid_jax.adaptation.online_state import DISTURBANCE, Flags, Numbers, OnlineState, Tuning, named_priors
 from hybrid_jax.adaptation.uncertainty import Interval, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import physics_of, with_disturbance
@@ -106,8 +98,7 @@ class OnlineAdaptation(AbstractEstimator):
             field = with_disturbance(field, indices)
         self.field, self.dt, self.initial = field, float(dt), float(initial)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
-        self.names = parameter_names(field)
-        self.scales = parameter_scales(self.names, prior, disturbance)
+        self.names, self.scales = named_priors(field, prior, disturbance)
         self.tuning = Tuning() if tuning is None else tuning
 
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
@@ -205,18 +196,15 @@ class OnlineAdaptation(AbstractEstimator):
     def _variances(self, x) -> Float[Array, " d"]:
         return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
 
-    def _is_rigid(self) -> bool:
-        return moves_a_rigid_body(physics_of(self.field))
-
     def _same_hemisphere(self, x, like):
         """The sample with the sign of its quaternion that is nearer."""
-        if not self._is_rigid():
+        if not moves_a_rigid_body(self.field):
             return x
         other = jnp.sum(x[QUATERNION] * like[QUATERNION]) < 0
         return x.at[QUATERNION].set(jnp.where(other, -x[QUATERNION], x[QUATERNION]))
 
     def _unit(self, x):
-        return x.at[QUATERNION].set(normalise(x[QUATERNION])) if self._is_rigid() else x
+        return x.at[QUATERNION].set(normalise(x[QUATERNION])) if moves_a_rigid_body(self.field) else x
 
     def _predict(self, state: OnlineState, u, acted, elapsed):
         """Mean and covariance before the sample, and the variances without data."""
@@ -234,13 +222,11 @@ class OnlineAdaptation(AbstractEstimator):
         slope = jax.vmap(push, out_axes=1)(jnp.eye(d + p, dtype=z.dtype))  # of the new x by z
         top = slope @ state.covariance
         inner = top @ slope.T
-        covariance = jnp.concatenate(
-            [jnp.concatenate([inner, top[:, d:]], 1), jnp.concatenate([top[:, d:].T, state.covariance[d:, d:]], 1)]
-        )
+        covariance = jnp.block([[inner, top[:, d:]], [top[:, d:].T, state.covariance[d:, d:]]])
         covariance = jnp.where(acted, (covariance + covariance.T) / 2, state.covariance)
         pulled = jnp.max(_squares(state.pull, state.spread), axis=0)
-        constant = [not name.startswith(DISTURBANCE) for name in self.names]
-        forgotten = np.where(constant if not all(constant) else np.zeros(p, bool), 0.0, tuning.forgetting)
+        varies = np.array([name.startswith(DISTURBANCE) for name in self.names])
+        forgotten = np.where(varies | ~varies.any(), tuning.forgetting, 0.0)
         faster = 1 + jnp.asarray(forgotten, z.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
         walked = self.dt * elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
         noise = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, z.dtype)), (d,))
@@ -294,17 +280,14 @@ class OnlineAdaptation(AbstractEstimator):
 
     def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
         """The new state, or a beginning at the last good θ if a number of it is not finite."""
-        total = jnp.sum(jnp.abs(new.covariance)) + jnp.sum(jnp.abs(new.x)) + jnp.sum(jnp.abs(new.theta))
-        least = jnp.min(_diagonal(new.covariance))
-        sound = (total < HUGE) & (new.nis < HUGE) & (least > 0)
-        x = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0)
-        again = self.begin(x)
-        p = len(again.theta)
-        ones = jnp.ones(p, x.dtype)
+        total = sum(jnp.sum(jnp.abs(part)) for part in (new.covariance, new.x, new.theta, new.nis))
+        sound = (total < HUGE) & (jnp.min(_diagonal(new.covariance)) > 0)
+        x, ones = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0), jnp.ones_like(old.theta)
         covariance = jnp.diag(jnp.concatenate([self._variances(x), ones]))
-        parts = ("theta", "trusted", "covariance", "free", "changes", "restarts")
         values = old.trusted, old.trusted, covariance, ones, old.changes, old.restarts + 1
-        again = eqx.tree_at(lambda s: [getattr(s, name) for name in parts], again, list(values))
+        again = eqx.tree_at(
+            lambda s: (s.theta, s.trusted, s.covariance, s.free, s.changes, s.restarts), self.begin(x), values
+        )
         return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, again)
 
 

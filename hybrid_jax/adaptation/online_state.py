@@ -77,24 +77,11 @@ class Flags(NamedTuple):
     at_bound: Bool[Array, " p"]  # parameters at the end of their range
 
 
-def parameter_names(field: AbstractVectorField) -> tuple[str, ...]:
-    """The name of each parameter of the physics, in the order of the vector of all; the field may be traced."""
-
-    def numbers(theta, unravel):
-        return jnp.stack(list(named_parameters(unravel(theta)).values()))
-
-    with jax.ensure_compile_time_eval():
-        like = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype) if eqx.is_inexact_array(a) else a, field)
-        theta, unravel = ravel_parameters(like)
-        slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
-        labels = list(named_parameters(like))
-    return tuple(labels[i] for i in np.argmax(np.abs(slopes), axis=0))
-
-
-def parameter_scales(
-    names: tuple[str, ...], prior: float | Mapping[str, float], disturbance: Numbers
-) -> tuple[float, ...]:
-    """The prior standard deviation of each parameter."""
+def named_priors(
+    field: AbstractVectorField, prior: float | Mapping[str, float], disturbance: Numbers
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Name and prior standard deviation of each parameter of the physics, in the order of the vector of all."""
+    names = _names(field)
     groups = [name.partition("[")[0] for name in names]
     own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
     if unknown := sorted(own.keys() - {*names, *groups}):
@@ -107,4 +94,18 @@ def parameter_scales(
             raise ValueError(f"prior: {group} must be given")
         checks.positive(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
-    return tuple(found)
+    return names, tuple(found)
+
+
+def _names(field: AbstractVectorField) -> tuple[str, ...]:
+    """The name of each parameter; the field may be traced."""
+
+    def numbers(theta, unravel):
+        return jnp.stack(list(named_parameters(unravel(theta)).values()))
+
+    with jax.ensure_compile_time_eval():
+        like = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype) if eqx.is_inexact_array(a) else a, field)
+        theta, unravel = ravel_parameters(like)
+        slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
+        labels = list(named_parameters(like))
+    return tuple(labels[i] for i in np.argmax(np.abs(slopes), axis=0))

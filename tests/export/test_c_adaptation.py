@@ -40,7 +40,7 @@ def test_c_is_the_filter(precise, tmp_path):
     samples, speeds = flight()
     source = export_adaptation_c(tmp_path, adaptation, double=precise)[1]
     library = tmp_path / "adaptation.so"
-    run("gcc", *C99, "-O1", "-fPIC", "-shared", source, "-o", library, "-lm")
+    run("gcc", *C99, "-O0", "-fPIC", "-shared", source, "-o", library, "-lm")
     functions, kind = ctypes.CDLL(str(library)), np.float64 if precise else np.float32
     with jax.enable_x64(True):
         exact = double(adaptation)
