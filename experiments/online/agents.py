@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -60,7 +61,7 @@ INITIAL = 1.0  # nothing but the prior is known at the start
 
 def nominal() -> AbstractVectorField:
     """The Iris with its drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
-    body = multirotor(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT,) * 3))
+    body = multirotor(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
     return corrected(body, IRIS.rotors)
 
 
@@ -116,7 +117,7 @@ class L1(AbstractEstimator):
 
     field: AbstractVectorField
     gain: float = eqx.field(static=True)  # of the predictor [rad/s]
-    cutoff: Float[Array, ""]  # of the filter [rad/s]
+    cutoff: Float[Any, ""]  # of the filter [rad/s]
     period: float = eqx.field(static=True)
 
     def begin(self, x):
@@ -155,8 +156,8 @@ class L1(AbstractEstimator):
 
 def told(field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0) -> Told:
     """An agent that does not learn, or by an observer alone."""
-    first, *others = (np.asarray(number, np.float32) for number in (bandwidth, share, clock))
-    return Told(Observer(as_numpy(with_disturbance(field)), first, period), *others)
+    numbers: list[Any] = [np.asarray(number, np.float32) for number in (bandwidth, share, clock)]
+    return Told(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
 
 
 def online(hardware: Hardware, period: float) -> OnlineAdaptation:

@@ -47,7 +47,7 @@ def indices(run: Run, **tags) -> list[int]:
 def whole(run: Run, i: int, name: str) -> np.ndarray:
     """A quantity of a flight from its beginning on."""
     tags = run.tags[i]
-    early = run.beginnings[SHARED.get(tags["agent"], tags["agent"]), tags["reference"], tags["seed"]]
+    early = run.beginnings[str(SHARED.get(tags["agent"], tags["agent"])), tags["reference"], tags["seed"]]
     return np.concatenate([getattr(early, name), getattr(lane(run.flown, i), name)])
 
 

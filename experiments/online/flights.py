@@ -54,13 +54,13 @@ class Half(NamedTuple):
 class Flown(NamedTuple):
     """A flight after the change: numbers at each period."""
 
-    error: Float[Array, " t"]  # distance from the reference [m]
-    altitude: Float[Array, " t"]  # m
-    states: Float[Array, "s 13"]
-    theta: Float[Array, "t p"]  # estimated change of θ in the physics' own parametrisation; nothing if not adapted
-    std: Float[Array, "t p"]
-    nis: Float[Array, " t"]
-    changes: Float[Array, " t"]
+    error: Float[Any, " t"]  # distance from the reference [m]
+    altitude: Float[Any, " t"]  # m
+    states: Float[Any, "s 13"]
+    theta: Float[Any, "t p"]  # estimated change of θ in the physics' own parametrisation; nothing if not adapted
+    std: Float[Any, "t p"]
+    nis: Float[Any, " t"]
+    changes: Float[Any, " t"]
 
 
 class Setting(NamedTuple):
@@ -119,7 +119,7 @@ def learned(estimator, state) -> tuple[Array, ...]:
 
 def before(own: Setting, name: str, path: str, seed: int, key, bandwidths: Mapping[str, float]) -> Half:
     """The first half of a flight; agents that are the same before the change share it."""
-    clock = np.float32(np.random.default_rng(seed).uniform(0, CLOCK))
+    clock: Any = np.float32(np.random.default_rng(seed).uniform(0, CLOCK))
     field = agents.nominal()
     estimators = {
         "unadapted": lambda: agents.told(field, own.period, clock),

@@ -47,7 +47,7 @@ def results_of(run: Run, setting: Setting) -> Results:
     return Results(rows, TAGS)
 
 
-def rms(values: np.ndarray) -> float:
+def rms(values: Any) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
@@ -185,7 +185,7 @@ _COVERS = (
 
 
 def claims(changes: list[str]) -> list[Claim[Evidence]]:
-    near = [
+    near: list[Claim[Evidence]] = [
         Claim(f"O1{letter}", f"{CHANGE_NAMES[change]}: {_NEAR}", lambda e, own=change: all_of(_near_oracle(own, e)))
         for letter, change in zip("abcdef", changes, strict=False)
     ]
