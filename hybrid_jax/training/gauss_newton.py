@@ -43,7 +43,7 @@ class GaussNewtonFit(eqx.Module):
 def least_action(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
     """f_d along the predicted trajectory: its mean square is `residual_norm` of loss.py (Yin et al. 2021)."""
     x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
-    parts = jax.vmap(field.residual)(x, u)
+    parts = jax.vmap(field.residual)(x, jnp.asarray(u))
     return parts.ravel() / len(u) ** 0.5
 
 
