@@ -105,7 +105,7 @@ def fit_gauss_newton(
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)
-    if penalty is not None and (penalty not in PENALTIES or not isinstance(field, Hybrid)):
+    if penalty is not None and ([penalty] != [n for n in PENALTIES if n == penalty] or not isinstance(field, Hybrid)):
         known = ", ".join(PENALTIES)
         raise ValueError(f"penalty must be one of {known}, of a Hybrid, got {penalty!r} of {type(field).__name__}")
     size = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(field, trainable(field))))
@@ -114,7 +114,10 @@ def fit_gauss_newton(
     field = ready(field, windows)
     learned, rest = eqx.partition(field, trainable(field))
     rows = None if penalty is None else PENALTIES[penalty]
-    scale = None if scale is None else jnp.asarray(scale)
+    if scale is not None:
+        scale = checks.floating("scale", scale)
+        if scale.shape != windows.x0.shape[1:] or not (scale > 0).all():
+            raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
     data, penalised = jax.tree.map(jnp.asarray, windows), jnp.asarray(weight, float)
     problem = _Problem(learned, rest, data, penalised, scale, rows, RK4() if solver is None else solver)
     return _descend(problem, max_steps)
