@@ -83,27 +83,24 @@ def plain_step(field, adam, windows):
 
 
 def measured(kernel: int, preset: Preset) -> dict[str, Any]:
-    field, grid = hybrid(kernel, preset), hybrid(kernel, preset).physics.grid
+    field: Any = hybrid(kernel, preset)
+    grid = field.physics.grid
     x0 = np.random.default_rng(0).random((1, grid.size)).astype(np.float32)
     u = np.zeros((1, preset.intervals, 0), np.float32)
     x = np.asarray(hj.rollout_batch(hybrid(1, preset), x0, u, DT, hj.RK4(substeps=SUBSTEPS))) * np.float32(0.9)
     windows, settings = hj.Trajectories(x0, u, x, DT), hj.Settings(batch_size=1, solver=hj.RK4(substeps=SUBSTEPS))
     state, plan = start(field, jax.random.key(0)), make_run_config(RATE, np.arange(1), 1, 1, 1, 1, 0.0)
-    ours, _, our_memory = compiled_with_memory(
-        lambda field, adam, windows: gradient_step(field, adam, plan, windows, settings), field, state.adam, windows
-    )
+    step = partial(gradient_step, settings=settings)
+    ours, _, our_memory = compiled_with_memory(step, field, state.adam, plan, windows)
     plain, _, memory = compiled_with_memory(plain_step, field, state.adam, windows)
-    moments = [(result[2], result[1].mu) for result in (ours(), plain())]
+    own, theirs = ((result[2], result[1].mu) for result in (ours(), plain()))
     assert all(jax.tree.leaves(trainable(field)))
-    difference = agree(f"steps of kernel {kernel}", *moments, AGREEMENT)
+    difference = agree(f"steps of kernel {kernel}", own, theirs, AGREEMENT)
     times = in_turns({"ours": ours, "plain": plain}, preset.turns)
     seconds = {name: times.median(name) for name in ("ours", "plain")}
     sizes = {"bytes": our_memory, "plain_bytes": memory}
-    return (
-        {"kernel": kernel, "difference": difference, "seconds": seconds}
-        | sizes
-        | {"plain_over_ours": times.ratio("plain", "ours")}
-    )
+    ratio = {"plain_over_ours": times.ratio("plain", "ours")}
+    return {"kernel": kernel, "difference": difference, "seconds": seconds} | sizes | ratio
 
 
 COLUMNS = {

@@ -39,7 +39,8 @@ Partial differential equations on a periodic grid of 32 × 32 points, 2048 state
 - **Gray–Scott** in the protocol of Neural Context Flows (Nzoyem et al. 2025): one trajectory in each of four
   environments, then one in each of four new ones. Physics knows D_u, D_v, feed and kill terms, with F and k unknown in
   each environment; a pointwise network, shared by all, learns the reaction. F and k alone are adapted. What differs:
-  Neural Context Flows know none of that; their Laplacian has nine points, ours five; trajectories are our own.
+  Neural Context Flows know none of that; their Laplacian has nine points, ours five; trajectories are our own. F and k
+  that are found count from what the network took: it may hold a part that all environments share.
 """
 
 

@@ -98,7 +98,7 @@ def test_claims_are_decided_by_the_rows():
     ]
     results = Results([*forecast, *rows])
     verdicts = {each.id.split()[0]: each.holds for each in evaluate(claims(results), results)}
-    assert verdicts["C1"] and verdicts["C2"] and verdicts["C3"] and verdicts["C6"]
+    assert all(verdicts[name] for name in ("C1", "C2", "C3", "C6"))
     assert verdicts["G2"] is False  # one seed is off by 0.3 %
     assert verdicts["C8"] is False  # twice the error
     assert len(tables(results)) == 3
