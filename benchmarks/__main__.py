@@ -14,7 +14,9 @@ from benchmarks import history
 from benchmarks.timing import BAD_INPUT, Ratio, check_file, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 
-Benchmark = Literal["training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest"]
+Benchmark = Literal[
+    "training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest", "grids"
+]  # fmt: skip
 PEERS = "training_peers", "environment_peers"
 
 

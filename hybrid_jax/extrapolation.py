@@ -28,7 +28,7 @@ def motion(x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> Motion:
 def motion_of(windows: Trajectories) -> Motion:
     """`motion` of every sample of some windows."""
     x, u = np.asarray(windows.x), np.asarray(windows.u)
-    return motion(x.reshape(-1, x.shape[-1]), u.reshape(-1, u.shape[-1]))
+    return motion(*(part.reshape(x.shape[0] * x.shape[1], part.shape[-1]) for part in (x, u)))
 
 
 def shares_outside(known: Motion, asked: Motion) -> dict[str, float]:

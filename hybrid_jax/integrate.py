@@ -33,11 +33,16 @@ class RK4(diffrax.AbstractSolver):
 
     Attributes:
         scanned: whether its stages are a loop, see `compact`. The result is the same.
+        substeps: steps of equal length in each interval, where one would be unstable or inaccurate.
     """
 
     scanned: bool = False
+    substeps: int = 1
     term_structure: ClassVar = diffrax.AbstractTerm
     interpolation_cls: ClassVar = diffrax.LocalLinearInterpolation
+
+    def __check_init__(self):
+        checks.count("substeps", self.substeps)
 
     def order(self, terms):
         return 4
@@ -46,7 +51,17 @@ class RK4(diffrax.AbstractSolver):
         return None
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        half, middle = (t1 - t0) / 2, (t0 + t1) / 2
+        if self.substeps == 1:  # training usually takes one: that program has no loop in it
+            y1 = self._one(terms, t0, t1 - t0, y0, args)
+        else:
+            length = (t1 - t0) / self.substeps
+            times = t0 + length * jnp.arange(self.substeps, dtype=y0.dtype)
+            y1 = jax.lax.scan(lambda y, t: (self._one(terms, t, length, y, args), None), y0, times)[0]
+        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+
+    def _one(self, terms, t0, length, y0, args):
+        half = length / 2
+        middle, t1 = t0 + half, t0 + length
         if self.scanned:
             times, steps = jnp.array([t0, middle, middle, t1]), jnp.array([0, half, half, 2 * half], y0.dtype)
             k1, k2, k3, k4 = _slopes(terms, y0, args, times, steps)
@@ -55,8 +70,7 @@ class RK4(diffrax.AbstractSolver):
             k2 = terms.vf(middle, y0 + half * k1, args)
             k3 = terms.vf(middle, y0 + half * k2, args)
             k4 = terms.vf(t1, y0 + 2 * half * k3, args)
-        y1 = y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
-        return y1, None, {"y0": y0, "y1": y1}, None, diffrax.RESULTS.successful
+        return y0 + (half / 3) * (k1 + 2 * (k2 + k3) + k4)
 
     def func(self, terms, t0, y0, args):
         return terms.vf(t0, y0, args)
@@ -74,7 +88,9 @@ def _slopes(terms, y0, args, times, steps):
 
 def compact(solver: Solver | None) -> Solver:
     """The solver, by default RK4, for a program that runs seldom: with its stages in a loop it compiles sooner."""
-    return RK4(scanned=True) if solver is None or isinstance(solver, RK4) else solver
+    if solver is None or isinstance(solver, RK4):
+        return RK4(scanned=True, substeps=1 if solver is None else solver.substeps)
+    return solver
 
 
 def integrate(
@@ -227,7 +243,7 @@ def rollout_minibatch(
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):
     """The states and inputs at the start of every interval as columns: x (d, t·b), u (m, t·b)."""
     starts = jnp.concatenate([x0[None], x[:-1]])
-    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], -1) for a in (starts, u))
+    return (jnp.moveaxis(a, 0, 1).reshape(a.shape[1], a.shape[0] * a.shape[2]) for a in (starts, u))
 
 
 SOLVERS: dict[str, Solver] = {

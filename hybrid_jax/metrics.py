@@ -62,7 +62,7 @@ def over(
     windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
 ) -> Float[Array, " n"]:
     whole = len(windows) // chunk * chunk
-    chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(-1, chunk, *leaf.shape[1:]), windows)
+    chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(whole // chunk, chunk, *leaf.shape[1:]), windows)
     rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
     parts = [jax.lax.map(errors, chunks).ravel()] if whole else []
     return jnp.concatenate([*parts, errors(rest)] if len(rest) else parts)

@@ -98,7 +98,8 @@ def transitions(windows: Trajectories) -> tuple[Float[Array, "s d"], Float[Array
     check(windows, "windows")
     x0, u, x = (jnp.asarray(a) for a in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], x[:, :-1]], axis=1)
-    return before.reshape(-1, x.shape[2]), u.reshape(-1, u.shape[2]), x.reshape(-1, x.shape[2])
+    samples = x.shape[0] * x.shape[1]
+    return before.reshape(samples, x.shape[2]), u.reshape(samples, u.shape[2]), x.reshape(samples, x.shape[2])
 
 
 def defects(field: AbstractVectorField, windows: Trajectories, solver: Solver = None) -> Float[Array, "s d"]:

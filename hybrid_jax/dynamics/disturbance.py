@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.grids import Grid
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
@@ -24,6 +25,7 @@ class ConstantDisturbance(AbstractVectorField):
 
     value: Float[Array, "*k"]  # one number for each disturbed state, or a scalar for every state
     indices: tuple[int, ...] | None = eqx.field(static=True, default=None)  # by default the last `len(value)` states
+    points: int = eqx.field(static=True, default=1)  # of a grid: each number is that of so many states in a row
 
     def __check_init__(self):
         if self.indices is not None and jnp.shape(self.value)[-1:] != (len(self.indices),):
@@ -36,6 +38,8 @@ class ConstantDisturbance(AbstractVectorField):
         """ẋ of any of d states."""
         if self.value.ndim == 0:
             return jnp.broadcast_to(self.value, (d,))
+        if self.points > 1:
+            return jnp.repeat(self.value, self.points)
         if self.indices is None:
             return jnp.concatenate([jnp.zeros(d - len(self.value), self.value.dtype), self.value])
         if not 0 <= min(self.indices) <= max(self.indices) < d:
@@ -53,7 +57,8 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     """The field with a constant disturbance in its physics, of zero if it has none yet.
 
     Args:
-        indices: the disturbed states; by default v̇ and ω̇ of a rigid body, and every state of another system.
+        indices: the disturbed states; by default v̇ and ω̇ of a rigid body, each component of physics on a `Grid` (one
+            number for all points), and every state of another system.
     """
     if disturbance_of(field) is not None:
         return field
@@ -61,8 +66,12 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
     if indices is None and getattr(physics, "rotor_states", 0):
         indices = tuple(range(VELOCITY.start, STATE_SIZE))
+    dtype = jnp.result_type(*dtypes, jnp.float32)
+    if indices is None and isinstance(grid := getattr(physics, "grid", None), Grid):
+        even = ConstantDisturbance(jnp.zeros(grid.components, dtype), points=grid.points)
+        return with_physics(field, Hybrid(physics, even))
     shape = (ACCELERATIONS,) if moves_a_rigid_body(physics) else ()
-    zero = jnp.zeros(shape if indices is None else (len(indices),), jnp.result_type(*dtypes, jnp.float32))
+    zero = jnp.zeros(shape if indices is None else (len(indices),), dtype)
     return with_physics(field, disturbed(physics, zero, indices))
 
 

@@ -11,6 +11,8 @@ from hybrid_jax.export.program import Size, program_of, sizes_of
 if TYPE_CHECKING:
     import casadi
 
+MOST_STATES = 512  # a field on a grid of thousands would be a graph of millions of scalar operations
+
 
 def casadi_function(
     field: AbstractVectorField,
@@ -31,8 +33,8 @@ def casadi_function(
             second derivatives, such as IPOPT, need it.
 
     Raises:
-        ValueError: unknown sizes, a field that does not accept such x and u, or an operation that CasADi does not
-            have, by its name.
+        ValueError: unknown sizes, more than 512 states, a field that does not accept such x and u, or an operation
+            that CasADi does not have, by its name.
         ImportError: casadi is not installed.
     """
     return _function(field, None, state_size, input_size, name, smooth, "xdot")
@@ -83,6 +85,11 @@ def _function(
     except ImportError as error:
         raise ImportError("CasADi functions need casadi: pip install 'hybrid_jax[casadi]'") from error
     sizes = sizes_of(field, state_size, input_size)
+    if sizes[0] > MOST_STATES:
+        raise ValueError(
+            f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write every number out, as of a "
+            "grid; use export_field"
+        )
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")
     symbols = [ca.SX.sym("x", sizes[0]), ca.SX.sym("u", sizes[1])]

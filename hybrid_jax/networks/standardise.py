@@ -10,11 +10,12 @@ from hybrid_jax.dynamics import batching
 from hybrid_jax.dynamics.base import AbstractVectorField, unfreeze
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, RunningStats
 from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
 from hybrid_jax.trajectories import Trajectories
 
-SAMPLES = 10_000  # intervals that are looked at, at most
+SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
 FLOOR = 0.01  # least scale of an input over the size of its mean, and of an output over the size of ẋ
 
 
@@ -33,7 +34,7 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
         if self.seen is None:
             return z
         mean, centred, _ = batching.record_moments(z, self.seen)
-        return mean + centred
+        return batching.expand_trailing(mean, centred) + centred
 
     def outputs(self, y):
         return jnp.zeros_like(y) if self.seen is None else y
@@ -42,8 +43,9 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
     """The field with every `ChannelScaling` that is not set yet, as `residual_network` makes it, set from windows.
 
-    Inputs are brought to mean 0 and standard deviation 1. If there is one output for each state, outputs are brought
-    to the RMS of the derivative that the rest of the field lacks. A scaling that was given or set stays as it is.
+    Inputs are brought to mean 0 and standard deviation 1. If there is one output for each state, or of a `GridNetwork`
+    for each component, outputs are brought to the RMS of the derivative that the rest of the field lacks. A scaling
+    that was given or set stays as it is.
 
     Args:
         windows: those that the field is to be trained on.
@@ -52,14 +54,15 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
         return field
     x0, u, after = (jnp.asarray(part) for part in (windows.x0, windows.u, windows.x))
     before = jnp.concatenate([x0[:, None], after[:, :-1]], axis=1)
-    every = -(-before.shape[0] * before.shape[1] // SAMPLES)
-    x, u, after = (rows.reshape(-1, rows.shape[-1])[::every] for rows in (before, u, after))
+    every = -(-before.shape[0] * before.shape[1] // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
+    samples = before.shape[0] * before.shape[1]
+    x, u, after = (rows.reshape(samples, rows.shape[-1])[::every] for rows in (before, u, after))  # u may be empty
     zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
     probed = unfreeze(eqx.tree_at(_scalings, field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
 
     predicted = rollout_batch(probed, x, u[:, None], windows.dt)[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
-    output = _positive(lacking, FLOOR * rate)
+    grids = [node for node in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(node)]
 
     seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x.T, u.T), strict=True)
     moments = [np.asarray(part) for norm, part in seen if isinstance(norm, _Probe)]
@@ -67,9 +70,23 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     for network, (count, *sums) in zip(networks, moments, strict=True):
         mean, variance = (part / np.maximum(count, 1) for part in sums)
         scale = _positive(np.sqrt(variance), FLOOR * np.abs(mean))
-        whole = len(network.bias_out) == x.shape[1]
-        scalings.append(ChannelScaling(tuple(mean.tolist()), scale, output if whole else None))
+        scalings.append(ChannelScaling(tuple(mean.tolist()), scale, _output(network, grids, lacking, rate)))
     return eqx.tree_at(_scalings, field, scalings)
+
+
+def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -> Channels | None:
+    """The scale of the outputs: of each state, or of each component of a grid, if the network returns one for each."""
+    if len(network.bias_out) == len(rate):
+        return _positive(lacking, FLOOR * rate)
+    if not any(grid.network is network and grid.grid.size == len(rate) for grid in grids):
+        return None
+    components = (np.reshape(part, (len(network.bias_out), -1)) for part in (lacking, rate))
+    missing, whole = (np.sqrt(np.mean(np.square(part), axis=1)) for part in components)
+    return _positive(missing, FLOOR * whole)
+
+
+def _is_grid(node) -> bool:
+    return isinstance(node, GridNetwork)
 
 
 def _unset(field: AbstractVectorField) -> list[ResidualNetwork]:

@@ -1,12 +1,14 @@
-"""Training: `fit` on one machine, one run; losses, objectives, learning-rate groups and stages.
+"""Training: `fit` on one machine, one run, and `fit_gauss_newton`; losses, objectives, learning-rate groups and stages.
 
 A sweep of many runs in one program is in `hybrid_jax.sweep`.
 """
 
 from hybrid_jax.training.channels import Channel, ChannelLoss, channels_from
 from hybrid_jax.training.driver import FitInterrupted, FitResult, History, fit
+from hybrid_jax.training.gauss_newton import GaussNewtonFit, fit_gauss_newton
 from hybrid_jax.training.objective import Objective, Settings, TrajectoryLoss
 from hybrid_jax.training.stages import Stage, fit_in_stages, rates_by_group
 
-__all__ = ["Channel", "ChannelLoss", "FitInterrupted", "FitResult", "History", "Objective", "Settings", "Stage"]
-__all__ += ["TrajectoryLoss", "channels_from", "fit", "fit_in_stages", "rates_by_group"]
+__all__ = ["Channel", "ChannelLoss", "FitInterrupted", "FitResult", "GaussNewtonFit", "History", "Objective"]
+__all__ += ["Settings", "Stage", "TrajectoryLoss", "channels_from", "fit", "fit_gauss_newton", "fit_in_stages"]
+__all__ += ["rates_by_group"]

@@ -14,6 +14,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.grids import Grid
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import mean_over
@@ -119,14 +121,17 @@ def channels_from(
 
 
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
-    """A loss relative to the RMS change over a window of each state, or of each vector in the state of a rigid body."""
-    parts = _parts(windows.x0.shape[-1], moves_a_rigid_body(field)).values()
+    """A loss relative to the RMS change over a window of each state, each vector in the state of a rigid body, or each
+    component of physics on a `Grid`."""
+    parts = _parts(windows.x0.shape[-1], moves_a_rigid_body(field), getattr(physics_of(field), "grid", None)).values()
     x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
     scales = [max(_rms(end[:, part] - x0[:, part]), FLOOR * _rms(end[:, part])) or 1.0 for part in parts]
     return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
 
 
-def _parts(size: int, of_multirotor: bool) -> Mapping[str, slice]:
+def _parts(size: int, of_multirotor: bool, grid: Grid | None = None) -> Mapping[str, slice]:
+    if grid is not None and grid.size == size:
+        return {f"component {i}": slice(i * grid.points, (i + 1) * grid.points) for i in range(grid.components)}
     return MULTIROTOR if of_multirotor else {f"x[{i}]": slice(i, i + 1) for i in range(size)}
 
 

@@ -1,0 +1,120 @@
+"""Figures: fields over time, spectra, errors against the number of trajectories."""
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+
+from experiments.reaction_diffusion import shifted
+from experiments.reaction_diffusion.forecast import LOCAL, POINTWISE
+from experiments.reaction_diffusion.gray_scott import SOLVED
+from experiments.reaction_diffusion.report import SHIFT_WORDS, WAYS, _way
+from experiments.reaction_diffusion.shifted import AUTO
+from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, SOURCE_ONLY, TARGET_ONLY
+from experiments.reporting.plots import COLUMN, PAGE, STYLE, colour, legend_below, subplots, tick_errors
+from experiments.reporting.results import Results
+
+STYLES = {FINE_TUNED: "-o", TARGET_ONLY: "--s", SOURCE_ONLY: ":", LEAST_SQUARES: "-.^", AUTO: "-D"}
+TINTS = {LEAST_SQUARES: "#CC79A7", AUTO: "#009E73"}
+Shown = dict[str, np.ndarray]
+
+
+def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, tuple[Figure, str]]:
+    """The figures and their captions, by name."""
+    found = {}
+    known = [name for name in (POINTWISE, LOCAL) if name in shown]
+    if known:
+        caption = f"u of a test trajectory of FitzHugh–Nagumo: truth, forecast of {known[0]}, and the error"
+        found["fields"] = fields(shown, known[0], (0, 4, 9, 24), dt), caption
+    if len(shown) > 2:
+        found["spectra"] = spectra(shown), "Spectrum of u at 2.5 s: truth, and the error of each model's forecast"
+    own = rows.where(part=shifted.PART)
+    if len(own):
+        found["scores"] = scores(own), "Error of forecasts after a change, against the number of target trajectories"
+    if patterns:
+        caption = "v of Gray–Scott in a new environment: truth, forecast with F and k adapted, and the error"
+        found["gray_scott"] = fields(patterns, SOLVED, (0, 2, 5, 8), 40.0, 1), caption
+    return found
+
+
+@mpl.rc_context(STYLE)
+def fields(shown: Shown, name: str, at: tuple[int, ...], dt: float, component: int = 0) -> Figure:
+    """Truth, forecast and error of one component at some steps."""
+    truth, forecast = (_component(part, component)[0] for part in (shown["truth"], _forecast(shown, name)))
+    error = forecast - truth
+    figure, axes = subplots((PAGE * 0.8, PAGE * 0.8 * 3 / len(at) * 0.98), 3, len(at))
+    low, high, most = truth.min(), truth.max(), np.abs(error[list(at)]).max() or 1.0
+    limits = {"truth": (truth, low, high, "viridis"), "forecast": (forecast, low, high, "viridis")}
+    limits["error"] = (error, -most, most, "RdBu_r")
+    for row, (label, (values, least, largest, colours)) in zip(axes, limits.items(), strict=True):
+        for panel, step in zip(row, at, strict=True):
+            image = panel.imshow(values[step], vmin=least, vmax=largest, cmap=colours, interpolation="nearest")
+            panel.set(xticks=[], yticks=[])
+            if label == "truth":
+                panel.set_title(f"{(step + 1) * dt:.3g} s")
+        row[0].set_ylabel(label)
+        figure.colorbar(image, ax=list(row), shrink=0.9, aspect=12)
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def spectra(shown: Shown) -> Figure:
+    """Power of u by wavenumber at the end, of the truth and of the error of each forecast."""
+    truth = _component(shown["truth"], 0)[:, -1]
+    figure, ((axes,),) = subplots((COLUMN * 1.5, COLUMN * 1.1), 1, 1)
+    wavenumbers, power = _spectrum(truth)
+    axes.loglog(wavenumbers, power, "k", label="truth")
+    for i, name in enumerate(name for name in shown if name not in ("start", "truth")):
+        error = _component(_forecast(shown, name), 0)[:, -1] - truth
+        if np.isfinite(error).all():
+            axes.loglog(*_spectrum(error), color=f"C{i}", linestyle=("-", "--")[i > 5], linewidth=1, label=name)
+    axes.set(xlabel="wavenumber [waves per side]", ylabel="mean power of u")
+    return legend_below(figure, columns=2)
+
+
+@mpl.rc_context(STYLE)
+def scores(rows: Results) -> Figure:
+    """Mean error of each way of learning, a panel for each change; bars reach from the smallest to the largest seed."""
+    groups = rows.group("shift")
+    figure, axes = subplots((PAGE, 3.2), 1, len(groups), sharey=True)
+    for panel, (shift, own) in zip(axes[0], groups.items(), strict=True):
+        sizes = sorted(set(own["n"]) - {0})
+        for model, mode in WAYS:
+            mine = own.where(model=model, mode=mode)
+            tint = TINTS.get(mode, colour(model)) if model == HYBRID else colour(model)
+            if mode == SOURCE_ONLY:
+                panel.axhline(mine.spread("mse").mean, color=tint, linestyle=":", label=_way(model, mode))
+                continue
+            if not len(mine):
+                continue
+            values = [mine.where(n=n).numbers("mse") for n in sizes]
+            means = [value.mean() for value in values]
+            reach = np.array([[m - v.min(), v.max() - m] for m, v in zip(means, values, strict=True)]).T
+            panel.errorbar(
+                sizes, means, reach, fmt=STYLES[mode], color=tint, capsize=2, markersize=4, label=_way(model, mode)
+            )
+        panel.set(xscale="log", yscale="log", title=SHIFT_WORDS[shift], xlabel="target trajectories N")
+        panel.set_xticks(sizes, [str(n) for n in sizes])
+        panel.minorticks_off()
+    axes[0, 0].set_ylabel("mean squared error")
+    tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
+    return legend_below(figure, columns=3)
+
+
+def _forecast(shown: Shown, name: str) -> np.ndarray:
+    return shown[name]
+
+
+def _component(states: np.ndarray, component: int) -> np.ndarray:
+    """One of two components of states (n, t, d), as squares (n, t, side, side)."""
+    side = round((states.shape[-1] / 2) ** 0.5)
+    return states.reshape(*states.shape[:-1], 2, side, side)[..., component, :, :]
+
+
+def _spectrum(squares: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean power by rounded wavenumber, from 1 up."""
+    side = squares.shape[-1]
+    power = np.mean(np.abs(np.fft.fft2(squares) / side**2) ** 2, axis=0)
+    each = np.fft.fftfreq(side, 1 / side)
+    shell = np.rint(np.hypot(each[:, None], each)).astype(int)
+    wavenumbers = np.arange(1, side // 2)
+    return wavenumbers, np.array([max(power[shell == k].mean(), 1e-30) for k in wavenumbers])

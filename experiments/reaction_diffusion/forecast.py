@@ -1,0 +1,117 @@
+"""The first study: learn FitzHugh–Nagumo of which physics knows that there is diffusion, as APHYNITY does."""
+
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import numpy as np
+
+import hybrid_jax as hj
+from experiments.reaction_diffusion.config import Config
+from experiments.reaction_diffusion.jobs import Found, Jobs, error, pieces, predicted, weights
+from experiments.reaction_diffusion.systems import COARSE, STEPS, A, B, fitzhugh_nagumo, plane, reacting
+from experiments.reporting.results import Row
+from hybrid_jax.networks.normalisation import ChannelScaling
+
+PART = "forecast"
+TRAIN, TEST = 10, 11  # first numbers of the seeds of data: no trajectory is in both
+GUESS = (2 * A, B / 2)  # where a and b start
+EVERY = 4  # intervals between the windows of the first stage
+KEPT = 2  # test trajectories whose forecasts are drawn
+
+
+def scaling(kernel: int) -> ChannelScaling:
+    """Of what a network reads: the same for all seeds, so that one program serves them. States lie in −0.7 … 1."""
+    read = 2 * kernel**2
+    return ChannelScaling((0.25,) * read, (0.35,) * read)
+
+
+@dataclass(frozen=True)
+class Case:
+    """A line of the table: a model, what it is penalised by, and what it learns from."""
+
+    name: str
+    kernel: int = 1  # of the residual; 0: none
+    physics: str = "diffusion"  # "diffusion", "complete" or "none"
+    penalty: str | None = None
+    weight: float = 0.0
+    trajectories: int = 1
+    noise: float = 0.0
+    seeds: int = 1  # at most so many of --seeds
+
+
+POINTWISE, CONVOLUTION = "pointwise", "convolution"
+LOCAL = "convolution, neighbours penalised"
+NOISY = {noise: f"pointwise, noise {noise:g}" for noise in (1e-3, 1e-2)}
+CASES = (
+    Case(POINTWISE, seeds=10),
+    Case(NOISY[1e-3], noise=1e-3),
+    Case(NOISY[1e-2], noise=1e-2),
+    Case(CONVOLUTION, 3),
+    Case("convolution, least action", 3, penalty="residual_norm", weight=1e-5),
+    Case("convolution, correlation (paper)", 3, penalty="trajectory_correlation", weight=1e-3),
+    Case(LOCAL, 3, penalty="neighbour_weights", weight=1.0, seeds=10),
+    Case("no physics, convolution", 3, physics="none"),
+    Case("physics alone: diffusion", 0),
+    Case("physics alone: complete", 0, physics="complete"),
+)
+
+
+def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
+    grid, key = plane(config.points), jax.random.key(seed)
+    if case.physics == "complete":
+        return fitzhugh_nagumo(grid, *GUESS, k=0.0)
+    physics = hj.diffusion(grid, GUESS)
+    if not case.kernel:
+        return physics
+    hidden = config.hidden if case.kernel == 1 else config.channels
+    network = hj.grid_network(grid, 0, key, kernel=case.kernel, hidden=hidden, scaling=scaling(case.kernel))
+    return network if case.physics == "none" else hj.Hybrid(physics, network)
+
+
+def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
+    """One interval at a time from a few places of each trajectory first, then whole trajectories."""
+    truth = fitzhugh_nagumo(plane(config.points))
+    data = reacting(truth, case.trajectories, (TRAIN, seed), case.noise)
+    start = untrained(case, config, seed)
+    hj.check_grid(plane(config.points), data, diffusivity=GUESS, substeps=COARSE.substeps, name="training data")
+    if not case.kernel:
+        return hj.fit_least_squares(start, data, COARSE).field
+    options = {"penalty": case.penalty, "weight": case.weight, "solver": COARSE}
+    first = hj.fit_gauss_newton(start, pieces(data, EVERY), max_steps=config.steps, **options).field  # pyright: ignore[reportArgumentType]
+    whole = pieces(data, STEPS // 5, STEPS // 5) if case.kernel > 1 else data
+    return hj.fit_gauss_newton(first, whole, max_steps=config.polish, **options).field  # pyright: ignore[reportArgumentType]
+
+
+def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
+    """A row for each case and seed, and forecasts to draw: of the truth, and of models by the name of their case."""
+    truth = fitzhugh_nagumo(plane(config.points))
+    test = reacting(truth, config.test, (TEST, 0))
+    drawn = test[: min(KEPT, config.test)]
+    rows, shown = [], {"start": np.asarray(drawn.x0), "truth": np.asarray(drawn.x)}
+    for case in CASES:
+        if case.name not in config.cases:
+            continue
+        for seed in range(min(config.seeds, case.seeds)):
+
+            def work(case=case, seed=seed) -> Found:
+                model = trained(case, config, seed)
+                row = {"part": PART, "case": case.name, "seed": seed, "draw": 0, "mse": error(model, test, COARSE)}
+                row |= _found(model) | {"trajectories": case.trajectories, "noise": case.noise}
+                arrays = {"weights": weights(model)}
+                return [row], arrays | {"forecast": np.asarray(predicted(model, drawn, COARSE))}
+
+            found, arrays = jobs(f"{PART}: {case.name}, seed {seed}", work)
+            rows += found
+            if seed == 0:
+                shown[case.name] = arrays["forecast"]
+    return rows, shown
+
+
+def _found(model: Any) -> dict[str, float | None]:
+    """a and b, and the mean of their relative errors [%]; None without physics."""
+    physics = model.physics if isinstance(model, hj.Hybrid) else model
+    if (theta := getattr(physics, "theta", None)) is None:
+        return {"a": None, "b": None, "parameter_error": None}
+    a, b = (float(value) for value in theta()["diffusivity"])
+    return {"a": a, "b": b, "parameter_error": 50 * (abs(a / A - 1) + abs(b / B - 1))}

@@ -1,0 +1,66 @@
+"""The third study: Gray–Scott in the protocol of Neural Context Flows, four environments and then four new ones."""
+
+from typing import Any
+
+import jax
+import numpy as np
+
+import hybrid_jax as hj
+from experiments.reaction_diffusion.config import Config
+from experiments.reaction_diffusion.jobs import Found, Jobs, error, pieces, predicted, weights, with_weights
+from experiments.reaction_diffusion.systems import SCOTT_COARSE, gray_scott, patterns
+from experiments.reporting.results import Row
+from hybrid_jax.networks import zero_output
+from hybrid_jax.networks.normalisation import ChannelScaling
+
+PART = "gray_scott"
+TRAINED_IN = tuple((f, k) for f in (0.030, 0.039) for k in (0.058, 0.062))
+NEW = tuple((f, k) for f in (0.033, 0.036) for k in (0.059, 0.061))
+GUESS = (0.0345, 0.060)  # F and k in all environments at the start
+TRAIN, ADAPT, TEST = 30, 31, 32  # first numbers of the seeds of data
+EVERY = 3  # intervals between the windows that the network is trained on
+STEPS = 25  # most Gauss–Newton steps
+SHARE = 3  # test trajectories of an environment: --test over this
+SCALING = ChannelScaling((0.6, 0.15), (0.3, 0.15), (0.02, 0.02))
+RESIDUAL, SOLVED = "residual", "adapted"
+
+
+def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
+    """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
+    parts = [patterns(gray_scott(TRAINED_IN, reacts=True), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
+    data = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(pieces(part, EVERY) for part in parts))
+    physics = gray_scott([GUESS] * len(TRAINED_IN), reacts=False)
+    hj.check_grid(physics.grid, data, diffusivity=(0.2097, 0.105), substeps=SCOTT_COARSE.substeps)
+    network = hj.grid_network(physics.grid, 0, jax.random.key(0), hidden=config.units, scaling=SCALING)
+    start = hj.Hybrid(physics, zero_output(network))  # or 40 s of a wrong reaction hide the right one
+
+    def train() -> Found:
+        found = hj.fit_gauss_newton(start, data, max_steps=min(STEPS, config.steps), solver=SCOTT_COARSE)
+        return [], {"weights": weights(found.field)}
+
+    source = with_weights(start, jobs(f"{PART}: source in {len(data)} windows", train)[1]["weights"])
+    rows, shown = [], {}
+    for index, environment in enumerate(NEW):
+
+        def adapt(index=index, environment=environment) -> Found:
+            truth = gray_scott([environment], reacts=True)
+            seen, test = (
+                patterns(truth, 0, 1, (ADAPT, index)),
+                patterns(truth, 0, -(-config.test // SHARE), (TEST, index)),
+            )
+            middle = hj.Hybrid(gray_scott([GUESS], reacts=False), source.residual)
+            fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), SCOTT_COARSE).field
+            feed, kill = (float(value[0]) for value in fitted.physics.theta().values())
+            row = {"part": PART, "environment": index, "seed": 0, "draw": 0, "F": environment[0], "k": environment[1]}
+            row |= {"found_F": feed, "found_k": kill, "mse": error(fitted, test, SCOTT_COARSE)}
+            row |= {"mse_before": error(middle, test, SCOTT_COARSE)}
+            return [row], {
+                "start": np.asarray(test.x0[:1]),
+                "truth": np.asarray(test.x[:1]),
+                SOLVED: np.asarray(predicted(fitted, test[:1], SCOTT_COARSE)),
+            }
+
+        found, arrays = jobs(f"{PART}: new environment {index}", adapt)
+        rows += found
+        shown = shown or arrays
+    return rows, shown

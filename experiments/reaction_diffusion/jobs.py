@@ -1,0 +1,81 @@
+"""Jobs whose results are kept in the cache, so that a killed run goes on with the first one that is not done."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+import hybrid_jax as hj
+from experiments.runner.options import Run
+from experiments.runner.stages import FINISHED_BY, Stages
+from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.io.archive import digest, load_archive, save_archive
+from hybrid_jax.io.datasets import versions
+
+FORMAT = "hybrid_jax reaction_diffusion 1"
+RECIPE = 1  # increment when the same options no longer give the same result
+
+Found = tuple[list[dict[str, Any]], dict[str, np.ndarray]]  # rows, and arrays by name
+
+
+@dataclass
+class Jobs:
+    """Runs jobs by name; those that the cache holds for the same options are not run again."""
+
+    config: Run
+    stages: Stages
+    options: dict[str, Any]  # what determines the results
+    reused: list[str] = field(default_factory=list)
+
+    def __call__(self, name: str, work: Callable[[], Found]) -> Found:
+        key = digest([RECIPE, name, self.options, versions(*FINISHED_BY)], {})
+        path = self.config.cache / "reaction_diffusion" / f"{key[:24]}.npz"
+        if path.exists() and not self.config.fresh:
+            self.reused.append(name)
+            about, arrays = load_archive(path, FORMAT)
+            self.stages.seconds[name] = about["seconds"]
+            return about["rows"], dict(arrays)
+        rows, arrays = self.stages.timed(name, work, "compiling and solving")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_archive(path, FORMAT, {"rows": rows, "seconds": self.stages.seconds[name]}, arrays)
+        return rows, arrays
+
+
+def weights(model: hj.AbstractVectorField) -> np.ndarray:
+    """All parameters of a model as a vector."""
+    return np.asarray(ravel_pytree(eqx.filter(model, trainable(model)))[0])
+
+
+def with_weights(model: Any, vector: np.ndarray) -> Any:
+    learned, rest = eqx.partition(model, trainable(model))
+    return eqx.combine(ravel_pytree(learned)[1](jnp.asarray(vector)), rest)
+
+
+@eqx.filter_jit
+def predicted(model, data: hj.Trajectories, solver) -> jax.Array:
+    """Forecasts of all windows, a few at a time."""
+    one = lambda pair: hj.rollout(model, pair[0], pair[1], data.dt, solver)  # noqa: E731
+    return jax.lax.map(one, (jnp.asarray(data.x0), jnp.asarray(data.u)), batch_size=4)
+
+
+def error(model, data: hj.Trajectories, solver) -> float:
+    """Mean squared error over all numbers of all states after the first; inf if a forecast is not finite."""
+    value = float(np.mean(np.square(np.asarray(predicted(model, data, solver), float) - data.x)))
+    return value if np.isfinite(value) else float("inf")
+
+
+def pieces(data: hj.Trajectories, every: int, steps: int = 1) -> hj.Trajectories:
+    """Windows of `steps` intervals from each trajectory in turn, from its start at every so many intervals."""
+    states = np.concatenate([data.x0[:, None], data.x], axis=1)
+    starts = range(0, data.horizon - steps + 1, every)
+
+    def each(part, length):
+        found = np.stack([part[:, i : i + length] for i in starts], axis=1)
+        return found.reshape(len(part) * len(starts), length, part.shape[-1])
+
+    return hj.Trajectories(each(states, 1)[:, 0], each(data.u, steps), each(states[:, 1:], steps), data.dt)

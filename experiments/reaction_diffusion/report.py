@@ -1,0 +1,218 @@
+"""Tables and claims of the three studies."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping
+from itertools import pairwise
+
+from experiments.reaction_diffusion import forecast, gray_scott, shifted
+from experiments.reaction_diffusion.forecast import LOCAL, POINTWISE
+from experiments.reaction_diffusion.shifted import AUTO
+from experiments.reporting.claims import Claim, Part, Undecided, all_of
+from experiments.reporting.names import (
+    FINE_TUNED,
+    HYBRID,
+    LEAST_SQUARES,
+    NO_PHYSICS,
+    SOURCE_ONLY,
+    TARGET_ONLY,
+    label,
+)
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval, ratio_of_stds
+from experiments.reporting.tables import Table, cross_table, over_seeds, spread_text, tabulate
+
+# log10 MSE of forecasts and error of a and b, from Table 1 of Yin et al. 2021 (reaction-diffusion).
+PUBLISHED = (
+    ("published: neural ODE", "−3.76", "–"),
+    ("published: PredRNN++", "−4.60", "–"),
+    ("published: APHYNITY, without its least action", "−4.56", "6.4"),
+    ("published: APHYNITY", "−5.10 ± 0.21", "2.3"),
+    ("published: physics alone, complete", "−9.35", "–"),
+)
+SCOTT_PUBLISHED = {"Neural Context Flows, best": 1.4e-3, "another run": 3.4e-3}
+LIMITS = {LOCAL: (-5.3, 2.0), POINTWISE: (-7.0, 0.2)}  # asked: log10 MSE, error of a and b [%]
+SCOTT_COLUMNS = ("found_F", "found_k", "mse_before", "mse")
+CLEARLY = 1.5  # ratio of errors that counts, as in the paper's claims
+WAYS = (
+    (HYBRID, SOURCE_ONLY), (HYBRID, LEAST_SQUARES), (HYBRID, AUTO), (HYBRID, FINE_TUNED), (HYBRID, TARGET_ONLY),
+    (NO_PHYSICS, SOURCE_ONLY), (NO_PHYSICS, FINE_TUNED), (NO_PHYSICS, TARGET_ONLY),
+)  # fmt: skip
+WORDS = {LEAST_SQUARES: "least squares on a, b"}
+SHIFT_WORDS = {"parameter_shift": "a × 2, b ÷ 2, k × 2", "new_term": "a new term, −0.5 u v"}
+
+
+def log_mse(row: Mapping) -> float:
+    return math.inf if row["mse"] is None else math.log10(row["mse"])
+
+
+def tables(rows: Results) -> list[Table]:
+    found, parts = [], set(rows["part"])
+    if forecast.PART in parts:
+        found.append(_forecasts(rows.where(part=forecast.PART)))
+    if shifted.PART in parts:
+        found += [_shift(name, own) for name, own in rows.where(part=shifted.PART).group("shift").items()]
+        found.append(_choices(rows.where(part=shifted.PART, mode=AUTO)))
+    if gray_scott.PART in parts:
+        found.append(_environments(rows.where(part=gray_scott.PART)))
+    return found
+
+
+def _forecasts(rows: Results) -> Table:
+    groups = rows.group("case")
+    columns: dict[str, Callable[[Results], str]] = {
+        "log10 MSE": lambda own: spread_text(own.spread(log_mse), ".2f"),
+        "error of a, b [%]": lambda own: "–" if own[0]["a"] is None else spread_text(own.spread("parameter_error")),
+        "seeds": lambda own: str(len(own)),
+    }
+    table = tabulate("Forecasts of 2.5 s from one trajectory of FitzHugh–Nagumo", groups, columns)
+    return table._replace(lines=[*table.lines, *((*line, "") for line in PUBLISHED)])
+
+
+def _shift(name: str, rows: Results) -> Table:
+    groups = {_way(*way): own for way in WAYS if len(own := rows.where(model=way[0], mode=way[1]))}
+    columns = {f"N = {n}": {"n": (n, 0)} for n in sorted(set(rows["n"]) - {0})}
+    title = f"{SHIFT_WORDS[name]}: mean squared error of forecasts after N trajectories, {over_seeds(rows)}"
+    return cross_table(title, groups, columns, lambda own: spread_text(own.spread("mse")))
+
+
+def _way(model: str, mode: str) -> str:
+    return f"{label(model)}, {WORDS.get(mode, label(mode))}"
+
+
+def _choices(rows: Results) -> Table:
+    groups = {SHIFT_WORDS[shift]: own for shift, own in rows.group("shift").items()}
+    columns = {f"N = {n}": {"n": n} for n in sorted(set(rows["n"]))}
+
+    def chosen(own: Results) -> str:
+        return ", ".join(f"{name} {len(same)}" for name, same in own.group("chosen").items())
+
+    return cross_table("What `auto` chose, and in how many seeds", groups, columns, chosen, "change")
+
+
+def _environments(rows: Results) -> Table:
+    lines = [(f"F = {row['F']}, k = {row['k']}", *(f"{row[name]:.4g}" for name in SCOTT_COLUMNS)) for row in rows]
+    lines.append(("mean", "", "", *(f"{rows.spread(name).mean:.4g}" for name in SCOTT_COLUMNS[2:])))
+    lines += [(f"published: {name}", "", "", "", f"{value:.4g}") for name, value in SCOTT_PUBLISHED.items()]
+    header = ("environment", "F found", "k found", "MSE before", "MSE adapted")
+    return Table("Gray–Scott: four new environments, F and k adapted to one trajectory of each", header, lines)
+
+
+def claims(rows: Results) -> list[Claim[Results]]:
+    found = [Claim(f"G{i}", *_goal(case)) for i, case in enumerate(LIMITS, 1) if len(rows.where(case=case))]
+    if len(rows.where(part=gray_scott.PART)):
+        found.append(
+            Claim("G3", "Gray–Scott: the mean error in new environments is below the best published, 1.4e-3.", _scott)
+        )
+    for shift in sorted(set(rows.where(part=shifted.PART)["shift"])):
+        found += [Claim(f"{name} {shift}", text, _under(shift, of)) for name, (text, of) in PAPER_CLAIMS.items()]
+    return found
+
+
+def _under(shift: str, parts: Callable[[Results], Iterable[Part]]) -> Callable[[Results], Part]:
+    return lambda rows: all_of(parts(rows.where(shift=shift)))
+
+
+def _goal(case: str):
+    limit, share = LIMITS[case]
+
+    def met(rows: Results) -> Part:
+        own = rows.where(case=case)
+        worst, off = own.numbers(log_mse).max(), own.numbers("parameter_error").max()
+        return bool(worst < limit and off < share), f"worst of {len(own)} seeds: {worst:.2f}, {off:.3g} %"
+
+    return f"{case}, one trajectory: log10 MSE below {limit:g}, a and b within {share:g} % in every seed.", met
+
+
+def _scott(rows: Results) -> Part:
+    mean = rows.where(part=gray_scott.PART).spread("mse").mean
+    return mean < SCOTT_PUBLISHED["Neural Context Flows, best"], f"mean {mean:.2e}"
+
+
+def _sizes(rows: Results) -> list[int]:
+    return sorted(set(rows["n"]) - {0})
+
+
+def _at(rows: Results, model: str, n: int, mode: str = FINE_TUNED) -> Results:
+    return rows.where(model=model, n=n, mode=mode)
+
+
+def _difference(rows: Results, first: tuple, second: tuple, column: str = "mse", times: float = 1.0) -> Interval:
+    return _at(rows, *first).interval(column, minus=_at(rows, *second), times=times)
+
+
+def _lower_error(rows: Results):
+    for n in _sizes(rows):
+        found = _difference(rows, (HYBRID, n), (NO_PHYSICS, n))
+        yield found.below(0), f"N = {n}: difference {found.text('.2g')}"
+
+
+def _higher_rho(rows: Results):
+    for n in _sizes(rows):
+        found = _difference(rows, (HYBRID, n), (NO_PHYSICS, n), "rho")
+        yield found.above(0), f"N = {n}: difference {found.text('.2g')}"
+
+
+def _only_hybrid(rows: Results):
+    n = _sizes(rows)[0]
+    hybrid, plain = (_at(rows, model, n).interval("rho") for model in (HYBRID, NO_PHYSICS))
+    yield hybrid.above(0), f"N = {n}: ρ of hybrid {hybrid.text('.2g')}"
+    yield plain.below(0), f"of no-physics {plain.text('.2g')}"
+
+
+def _less_spread(rows: Results):
+    for n in _sizes(rows):
+        found = ratio_of_stds(*(_at(rows, model, n).numbers("mse") for model in (HYBRID, NO_PHYSICS)))
+        yield found.below(1), f"N = {n}: ratio {found.text('.2g')}"
+
+
+def _falls(rows: Results):
+    if len(_sizes(rows)) < 2:
+        raise Undecided("needs two sizes N")
+    for model in (HYBRID, NO_PHYSICS):
+        for few, more in pairwise(_sizes(rows)):
+            found = _difference(rows, (model, more), (model, few))
+            yield found.below(0), f"{label(model)} {few} to {more}: {found.text('.2g')}"
+
+
+def _beats_source(rows: Results):
+    for n in _sizes(rows):
+        found = _at(rows, HYBRID, n).interval("rho")
+        yield found.above(0), f"N = {n}: ρ = {found.text('.2g')}"
+
+
+def _pretraining_helps(rows: Results):
+    if len(_sizes(rows)) < 2:
+        raise Undecided("needs two sizes N")
+    few, many = _sizes(rows)[0], _sizes(rows)[-1]
+    for n in (few, many):
+        alone, tuned = (HYBRID, n, TARGET_ONLY), (HYBRID, n)
+        most = _difference(rows, alone, tuned, times=CLEARLY)
+        ratio = _at(rows, *alone).spread("mse").mean / _at(rows, *tuned).spread("mse").mean
+        yield most.above(0) if n == few else most.below(0), f"N = {n}: ratio {ratio:.3g}"
+
+
+def _few_are_enough(rows: Results):
+    if len(_sizes(rows)) < 2:
+        raise Undecided("needs two sizes N")
+    few, many = _sizes(rows)[0], _sizes(rows)[-1]
+    excess = _difference(rows, (HYBRID, few), (HYBRID, many), times=CLEARLY)
+    ratio = _at(rows, HYBRID, few).spread("mse").mean / _at(rows, HYBRID, many).spread("mse").mean
+    yield excess.below(0), f"N = {few} over N = {many}: ratio {ratio:.3g}"
+
+
+PAPER_CLAIMS = {
+    "C1": ("At every N the mean error of the fine-tuned hybrid is below that of fine-tuned no-physics.", _lower_error),
+    "C2": ("At every N the mean ρ of the fine-tuned hybrid is above that of fine-tuned no-physics.", _higher_rho),
+    "C3": ("At the smallest N mean ρ of no-physics is below 0, that of the hybrid above 0.", _only_hybrid),
+    "C4": ("At every N the error of the hybrid varies less over seeds than that of no-physics.", _less_spread),
+    "C5": ("The mean error after fine-tuning falls strictly from each N to the next, for both models.", _falls),
+    "C6": ("Fine-tuning beats source-only: mean ρ of the hybrid is above 0 at every N.", _beats_source),
+    "C7": (
+        f"Error of target-only over that of fine-tuned: at least {CLEARLY} at the smallest N, less at the largest.",
+        _pretraining_helps,
+    ),
+    "C8": (
+        f"The error of the hybrid with the smallest N is at most {CLEARLY} times that with the largest.",
+        _few_are_enough,
+    ),
+}

@@ -1,0 +1,162 @@
+"""Fields on periodic grids: a state x of d numbers as `components` × grid points, its Laplacian, diffusion as physics.
+
+Central differences of second order; explicit steps are stable up to a bound, see `Grid.largest_step`.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import product
+from math import prod
+from typing import ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.trajectories import Trajectories, check
+
+REAL_AXIS = 2.785  # RK4 is stable for z = λ dt from −2.785 to 0 (Hairer and Wanner, Solving ODEs II, Sec. IV.2)
+SEAM = 3.0  # times the usual step between neighbours that one across the edge may be; 1 in periodic data
+
+
+@dataclass(frozen=True)
+class Grid:
+    """A periodic grid of equal spacing [m], and how many quantities live on it.
+
+    A state is their values, one quantity after the other, each in row-major order; further axes are samples.
+
+    Raises:
+        ValueError: a side of fewer than three points, a spacing that is not positive, no components.
+    """
+
+    shape: tuple[int, ...]
+    spacing: float = 1.0
+    components: int = 1
+
+    def __post_init__(self):
+        if not isinstance(self.shape, tuple) or not self.shape:
+            raise ValueError(f"shape must be a tuple such as (32, 32), got {checks.short_repr(self.shape)}")
+        for side in self.shape:
+            checks.count("shape: each side", side, least=3)
+        checks.positive("spacing", self.spacing)
+        checks.count("components", self.components)
+
+    @property
+    def points(self) -> int:
+        return prod(self.shape)
+
+    @property
+    def size(self) -> int:
+        """d, the numbers in a state."""
+        return self.components * self.points
+
+    @property
+    def axes(self) -> range:
+        """The axes of space in what `fields` returns."""
+        return range(1, 1 + len(self.shape))
+
+    def fields(self, x: Float[Array, " d *b"]) -> Float[Array, " c *cells"]:
+        """The state as arrays over the grid (components, *shape, *b); ValueError if it is of another size."""
+        if x.shape[0] != self.size:
+            sides = " × ".join(map(str, (self.components, *self.shape)))
+            raise ValueError(f"a grid of {sides} needs states of {self.size} numbers, got {x.shape[0]}")
+        return x.reshape(self.components, *self.shape, *x.shape[1:])
+
+    def laplacian(self, fields: Float[Array, " c *cells"]) -> Float[Array, " c *cells"]:
+        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing²; an error of O(spacing²)."""
+        padded = self.padded(fields, 1)
+        inside = {axis: slice(1, -1) for axis in self.axes}
+
+        def moved(axis: int, to: slice):
+            return padded[tuple((inside | {axis: to}).get(i, slice(None)) for i in range(padded.ndim))]
+
+        near = [moved(axis, to) for axis in self.axes for to in (slice(2, None), slice(None, -2))]
+        return (sum(near[1:], near[0]) - len(near) * fields) / self.spacing**2
+
+    def padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
+        """With `reach` more points at each edge, those of the opposite edge."""
+        return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
+
+    def patches(self, fields: Float[Array, " c *cells"], kernel: int) -> Float[Array, " k *cells"]:
+        """At each point the values at its kernel × … × kernel neighbours, itself among them: c · kernelⁿ components."""
+        if kernel == 1:
+            return fields
+        padded, at = self.padded(fields, kernel // 2), product(range(kernel), repeat=len(self.shape))
+        shifts = (tuple(slice(i, i + n) for i, n in zip(place, self.shape, strict=True)) for place in at)
+        return jnp.concatenate([padded[(slice(None), *shift)] for shift in shifts])
+
+    def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
+        """The longest step [s] for which RK4 is stable with these diffusivities [m²/s], by linear theory.
+
+        The Laplacian's most negative eigenvalue is −4 n / spacing² in n dimensions, so the bound is 2.785 spacing² /
+        (4 n D), as that of Courant, Friedrichs and Lewy for advection is a bound on the step.
+        """
+        most = float(np.max(np.abs(np.asarray(diffusivity))))
+        return REAL_AXIS * self.spacing**2 / (4 * len(self.shape) * most) if most else float("inf")
+
+
+def check_grid(
+    grid: Grid,
+    windows: Trajectories,
+    *,
+    diffusivity: float | Sequence[float] | np.ndarray | Array = 0.0,
+    substeps: int = 1,
+    name: str = "windows",
+) -> None:
+    """Refuse windows that are not of the grid, not periodic, or sampled too slowly for the solver's steps.
+
+    Data count as not periodic if steps across an edge are more than three times as large as those between neighbours.
+
+    Raises:
+        ValueError: one of these, in one line; it names the bound and how many substeps would do.
+    """
+    size = check(windows, name).x0.shape[-1]
+    if size != grid.size:
+        sides = " × ".join(map(str, (grid.components, *grid.shape)))
+        raise ValueError(f"{name}: states of {grid.size} numbers expected for a grid of {sides}, got {size}")
+    states = np.concatenate([windows.x0, windows.x[:, -1]]).T
+    fields = np.asarray(grid.fields(states))  # type: ignore[arg-type]
+    for axis in grid.axes:
+        steps = np.square(np.diff(fields, axis=axis, append=fields.take([0], axis)))
+        inside, seam = np.sqrt(np.mean(steps.take(range(grid.shape[axis - 1] - 1), axis))), steps.take([-1], axis)
+        if (across := np.sqrt(np.mean(seam))) > SEAM * inside:
+            raise ValueError(
+                f"{name}: not periodic along axis {axis - 1}: the step across the edge is {across:.3g}, between "
+                f"neighbours {inside:.3g}; the grid's derivatives join opposite edges"
+            )
+    checks.count("substeps", substeps)
+    step, bound = windows.dt / substeps, grid.largest_step(diffusivity)
+    if step > bound:
+        raise ValueError(
+            f"{name}: a step of {step:.3g} s is unstable, RK4 needs at most {bound:.3g} s for these diffusivities and "
+            f"this grid; use RK4(substeps={int(np.ceil(windows.dt / bound))}) or more"
+        )
+
+
+class Diffusion(AbstractVectorField):
+    """ẋ = D Δx on a grid, with one diffusivity [m²/s] for each component, held as its logarithm."""
+
+    accepts_batch: ClassVar[bool] = True
+
+    log_diffusivity: Float[Array, " c"]
+    grid: Grid = eqx.field(static=True)
+
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        spread = self.grid.laplacian(self.grid.fields(x))
+        return (jnp.exp(self.log_diffusivity).reshape(-1, *(1,) * (spread.ndim - 1)) * spread).reshape(x.shape)
+
+    def theta(self) -> dict[str, Float[Array, " c"]]:
+        """The diffusivities [m²/s]."""
+        return {"diffusivity": jnp.exp(self.log_diffusivity)}
+
+
+def diffusion(grid: Grid, diffusivity: Sequence[float]) -> Diffusion:
+    """`Diffusion` from a diffusivity [m²/s] for each component; ValueError if one is not positive, or some lack."""
+    if len(diffusivity) != grid.components:
+        raise ValueError(f"diffusivity: {grid.components} expected, one for each component, got {len(diffusivity)}")
+    for value in diffusivity:
+        checks.positive("diffusivity", value)
+    return Diffusion(jnp.log(jnp.asarray(diffusivity, float)), grid)

@@ -1,0 +1,91 @@
+"""Networks on periodic grids: the same small network at every point, which reads the point alone or its neighbours."""
+
+from typing import ClassVar
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, train_batch, update_running_stats
+from hybrid_jax.dynamics.grids import Grid
+from hybrid_jax.networks.mlp import ResidualNetwork, residual_network
+from hybrid_jax.networks.normalisation import AbstractScaling
+
+
+class GridNetwork(AbstractVectorField):
+    """ẋ at each point = network(values at the kernel × … × kernel points around it, u).
+
+    A kernel of 1 is a reaction: what happens at a point depends on that point alone. A kernel of 3 is a convolution of
+    3 × 3, then one of 1 × 1; it can express derivatives in space, the Laplacian among them, where a kernel of 1 cannot.
+
+    The neighbours are gathered, and one product serves all points: on a CPU the derivative of a convolution of XLA
+    takes ten times as long. In training mode the hidden units are computed again for the gradient rather than kept
+    (`jax.checkpoint`): measured, that takes half the time and a twentieth of the memory.
+    """
+
+    accepts_batch: ClassVar[bool] = True
+
+    network: ResidualNetwork
+    grid: Grid = eqx.field(static=True)
+    kernel: int = eqx.field(static=True, default=1)
+
+    def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
+        return self.network(*self.points(x, u)).reshape(x.shape)
+
+    def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
+        """What the network reads, a column for each point of each sample: neighbours (k, n), input (m, n)."""
+        near = self.grid.patches(self.grid.fields(x), self.kernel)
+        u = u[: self.network.weight_in.shape[1] - len(near)]
+        held = jnp.broadcast_to(jnp.expand_dims(u, (*self.grid.axes,)), (len(u), *near.shape[1:]))
+        return near.reshape(len(near), -1), held.reshape(len(u), near[0].size)
+
+    def neighbour_weights(self) -> Float[Array, "h k"]:
+        """The first layer's weights for the values at all points but the one itself."""
+        read = self.grid.components * self.kernel ** len(self.grid.shape)
+        blocks = self.network.weight_in[:, :read].reshape(len(self.network.weight_in), -1, self.grid.components)
+        middle = blocks.shape[1] // 2
+        return jnp.concatenate([blocks[:, :middle], blocks[:, middle + 1 :]], axis=1).reshape(len(blocks), -1)
+
+    def train_batch(self, x, u):
+        @jax.checkpoint
+        def evaluate(network, x, u):
+            return train_batch(network, *self.points(x, u)).reshape(x.shape)
+
+        return evaluate(self.network, x, u)
+
+    def update_running_stats(self, x, u):
+        moved = update_running_stats(self.network, *self.points(x, u))
+        return eqx.tree_at(lambda field: field.network, self, moved)
+
+
+def grid_network(
+    grid: Grid,
+    input_size: int,
+    key: PRNGKeyArray,
+    *,
+    kernel: int = 1,
+    hidden: int = 32,
+    activation: str = "tanh",
+    norm: str = "none",
+    scaling: AbstractScaling | None = None,
+) -> GridNetwork:
+    """A network that is the same at every point of a grid.
+
+    Args:
+        input_size: m, the numbers in u; every point reads all of them. With 0 the network does not depend on u.
+        kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
+        hidden: units at each point.
+        activation, norm, scaling: as in `residual_network`; by default a smooth network without batch normalisation.
+
+    Raises:
+        ValueError: a kernel that is even or wider than the grid, or what `residual_network` refuses.
+    """
+    checks.count("kernel", kernel)
+    if kernel % 2 == 0 or kernel > min(grid.shape):
+        raise ValueError(f"kernel must be odd and at most {min(grid.shape)}, the grid's shortest side, got {kernel}")
+    read = grid.components * kernel ** len(grid.shape)
+    options = {"hidden": hidden, "activation": activation, "norm": norm, "scaling": scaling}
+    network = residual_network(read, input_size, key, outputs=grid.components, **options)  # pyright: ignore[reportArgumentType]
+    return GridNetwork(network, grid, kernel)

@@ -1,0 +1,192 @@
+"""Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
+
+Levenberg–Marquardt (Levenberg 1944; Marquardt 1963). A step solves min ‖J δ + r‖² + μ ‖D δ‖², with D the lengths of the
+columns of J. J is computed in the field's precision one window at a time; JᵀJ is summed, and the step solved, in double
+precision by NumPy, since squaring J would leave nothing of float32 for the directions that matter least.
+"""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float, PyTree
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.integrate import RK4, Solver, checked, integrate
+from hybrid_jax.networks.grids import GridNetwork
+from hybrid_jax.training.driver import ready
+from hybrid_jax.trajectories import Trajectories, check
+
+MOST = 1000  # parameters: the cost of a step grows with their square
+FIRST = 1e-2  # μ at the start
+TRIALS = 10.0 ** np.arange(-2, 3)  # times the last μ: the best is taken
+LEAST, LARGEST = 1e-12, 1e6  # of μ
+SLOW = 1e-3  # stop after two steps that lower the loss by less than this share
+
+Rows = Callable[[Hybrid, Float[Array, "t d"], Trajectories, Solver], Float[Array, " r"]]
+
+
+class GaussNewtonFit(eqx.Module):
+    """The result of `fit_gauss_newton`."""
+
+    field: AbstractVectorField
+    loss: float  # L_MSE on the windows plus λ times the penalty
+    steps: int  # evaluations of J
+    converged: bool  # whether it stopped before `max_steps`, at a finite loss
+
+
+def least_action(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
+    """f_d along the predicted trajectory: its mean square is `residual_norm` of loss.py (Yin et al. 2021)."""
+    x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
+    parts = jax.vmap(field.residual)(x, jnp.asarray(u))
+    return parts.ravel() / len(u) ** 0.5
+
+
+def correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
+    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2: its square is `trajectory_correlation` of loss.py (Osaka et al. 2025, Eq. 7)."""
+    physics = integrate(field.physics, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, solver)
+    a, b = (y.ravel() / jnp.sqrt(jnp.sum(jnp.square(y)) + 1e-12) for y in (physics, predicted))
+    return (a - b) / 2**0.5
+
+
+def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
+    """The weights of a `GridNetwork` for all points but the one itself: small if f_d is a reaction.
+
+    Along nearly steady states a reaction and diffusion cancel, so that a small f_d is not the true one; what tells them
+    apart is that a reaction does not depend on neighbours.
+    """
+    networks = [n for n in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(n)]
+    return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
+
+
+def _is_grid(node) -> bool:
+    return isinstance(node, GridNetwork)
+
+
+PENALTIES: dict[str, Rows] = {
+    "residual_norm": least_action,
+    "trajectory_correlation": correlation,
+    "neighbour_weights": neighbour_weights,
+}
+
+
+def fit_gauss_newton(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    *,
+    penalty: str | None = None,
+    weight: float = 0.0,
+    max_steps: int = 50,
+    solver: Solver | None = None,
+    scale: Float[Array, " d"] | None = None,
+) -> GaussNewtonFit:
+    """Minimise L_MSE + λ L_reg over all parameters of a field by Gauss–Newton; a batch norm stays as it is.
+
+    For networks of up to a thousand parameters and little data with little noise; there is no early stopping.
+
+    Args:
+        windows: all are used in each step. A network without a scaling is scaled by them first, as in `fit`.
+        penalty: L_reg, of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
+            "neighbour_weights", the squared weights of a `GridNetwork` for all points but the one itself.
+        weight: λ.
+        solver: by default `RK4`.
+        scale: divides the error of each state, as in `fit_least_squares`.
+
+    Raises:
+        ValueError: malformed windows or others than the field's; no parameters, or too many; an unknown penalty, or
+            one of a field that is no `Hybrid`; a weight that is negative.
+    """
+    check(windows, "windows")
+    checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
+    checks.not_negative("weight", weight)
+    checks.count("max_steps", max_steps)
+    if penalty is not None and ([penalty] != [n for n in PENALTIES if n == penalty] or not isinstance(field, Hybrid)):
+        known = ", ".join(PENALTIES)
+        raise ValueError(f"penalty must be one of {known}, of a Hybrid, got {penalty!r} of {type(field).__name__}")
+    size = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(field, trainable(field))))
+    if not 0 < size <= MOST:
+        raise ValueError(f"field: 1 to {MOST} parameters expected for Gauss-Newton, got {size}; use fit")
+    field = ready(field, windows)
+    learned, rest = eqx.partition(field, trainable(field))
+    rows = None if penalty is None else PENALTIES[penalty]
+    if scale is not None:
+        scale = checks.floating("scale", scale)
+        if scale.shape != windows.x0.shape[1:] or not (scale > 0).all():
+            raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
+    data, penalised = jax.tree.map(jnp.asarray, windows), jnp.asarray(weight, float)
+    problem = _Problem(learned, rest, data, penalised, scale, rows, RK4() if solver is None else solver)
+    return _descend(problem, max_steps)
+
+
+class _Problem(eqx.Module):
+    """r(θ) of one window, such that the loss is the mean over windows of ‖r‖²."""
+
+    learned: PyTree
+    rest: PyTree
+    windows: Trajectories
+    weight: Float[Array, ""]
+    scale: Float[Array, " d"] | None
+    penalty: Rows | None = eqx.field(static=True)
+    solver: Solver = eqx.field(static=True)
+
+    def field(self, theta: Float[Array, " p"]) -> AbstractVectorField:
+        return eqx.combine(ravel_pytree(self.learned)[1](theta), self.rest)
+
+    def rows(self, theta: Float[Array, " p"], window: Trajectories) -> Float[Array, " r"]:
+        candidate = self.field(theta)
+        predicted = integrate(candidate, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, self.solver)
+        errors = predicted - window.x if self.scale is None else (predicted - window.x) / self.scale
+        found = errors.ravel() / len(window.u) ** 0.5
+        if self.penalty is not None:
+            held = self.penalty(candidate, predicted, window, self.solver)  # type: ignore[arg-type]
+            found = jnp.concatenate([found, jnp.sqrt(self.weight) * held])
+        return found.astype(theta.dtype)
+
+    @eqx.filter_jit
+    def losses(self, thetas: Float[Array, "k p"]) -> Float[Array, " k"]:
+        def one(theta):
+            return jnp.mean(jax.lax.map(lambda window: jnp.sum(jnp.square(self.rows(theta, window))), self.windows))
+
+        return jax.lax.map(one, thetas)
+
+    @eqx.filter_jit
+    def linearised(
+        self, theta: Float[Array, " p"], index: int | Array
+    ) -> tuple[Float[Array, "p r"], Float[Array, " r"]]:
+        """Jᵀ and r of a window. One direction after the other: on a CPU several at once leave the cache."""
+        window = self.windows[index]
+        r, push = jax.linearize(lambda theta: self.rows(theta, window), theta)
+        return jax.lax.map(push, jnp.eye(theta.size, dtype=theta.dtype)), r
+
+
+def _descend(problem: _Problem, max_steps: int) -> GaussNewtonFit:
+    theta = ravel_pytree(problem.learned)[0]
+    loss, damping, steps, slow = float(problem.losses(theta[None])[0]), FIRST, 0, 0
+    while steps < max_steps and slow < 2 and 0 < loss < np.inf:
+        gram, score = _normal_equations(problem, theta)
+        lengths = np.sqrt(np.maximum(np.diag(gram), 1e-12 * np.diag(gram).max()))
+        values, vectors = scipy.linalg.eigh(gram / np.outer(lengths, lengths))
+        along = vectors.T @ (score / lengths)
+        dampings = np.clip(damping * TRIALS, LEAST, LARGEST)
+        moves = [vectors @ (along / (np.maximum(values, 0) + each)) / lengths for each in dampings]
+        tried = theta - jnp.asarray(np.array(moves), theta.dtype)
+        found = np.nan_to_num(np.asarray(problem.losses(tried), float), nan=np.inf)
+        best, steps = int(np.argmin(found)), steps + 1
+        better = found[best] < loss
+        slow = 0 if better and found[best] < (1 - SLOW) * loss else slow + 1
+        damping = dampings[best] if better else min(damping * TRIALS[-1] * 10, LARGEST)
+        theta, loss = (tried[best], float(found[best])) if better else (theta, loss)
+    return GaussNewtonFit(problem.field(theta), loss, steps, bool(np.isfinite(loss)) and (slow >= 2 or loss == 0))
+
+
+def _normal_equations(problem: _Problem, theta) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+    gram, score = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+    for index in range(len(problem.windows)):
+        columns, r = (np.asarray(part, float) for part in problem.linearised(theta, jnp.asarray(index)))
+        gram, score = gram + columns @ columns.T, score + columns @ r
+    return gram, score

@@ -1,0 +1,177 @@
+"""Fields on periodic grids: the Laplacian, networks on them, and what they refuse."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.adaptation import METHODS
+from hybrid_jax.dynamics.base import train_batch
+from hybrid_jax.dynamics.disturbance import disturbance_of, with_disturbance
+from hybrid_jax.export import casadi_function, export_field, load_program
+from hybrid_jax.training.channels import scaled_loss
+
+KEY = jax.random.key(0)
+GRID = hj.Grid((6, 8), 0.25, 2)
+
+
+def waves(grid, mode, component=0):
+    """The values of cos(2π mode · place) in one component, and their eigenvalue under the continuous Laplacian."""
+    places = np.meshgrid(*(np.arange(n) / n for n in grid.shape), indexing="ij")
+    fields = np.zeros((grid.components, *grid.shape))
+    fields[component] = np.cos(2 * np.pi * sum(m * place for m, place in zip(mode, places, strict=True)))
+    lengths = np.array(grid.shape) * grid.spacing
+    return fields.astype(np.float32), -sum(
+        (2 * np.pi * m / length) ** 2 for m, length in zip(mode, lengths, strict=True)
+    )
+
+
+@pytest.mark.parametrize("shape", [(16,), (12, 16), (8, 8, 10)])
+def test_the_laplacian_of_a_wave_is_its_discrete_eigenvalue(shape):
+    grid = hj.Grid(shape, 0.5, 2)
+    mode = (*(0 for _ in shape[1:]), 1)
+    fields, _ = waves(grid, mode, component=1)
+    eigenvalue = -4 / 0.5**2 * np.sin(np.pi / shape[-1]) ** 2
+    np.testing.assert_allclose(grid.laplacian(jnp.asarray(fields)), eigenvalue * fields, atol=1e-5)
+
+
+def test_the_laplacian_is_of_second_order():
+    errors = []
+    for points in (16, 32):
+        grid = hj.Grid((points, points), 1 / points)
+        fields, eigenvalue = waves(grid, (1, 2))
+        errors.append(np.abs(grid.laplacian(jnp.asarray(fields)) - eigenvalue * fields).max())
+    assert 3.7 < errors[0] / errors[1] < 4.3
+
+
+@pytest.mark.parametrize("kernel", [1, 3, 5])
+@pytest.mark.parametrize("input_size", [0, 1])
+def test_a_network_on_a_grid_moves_with_the_state(kernel, input_size):
+    """A shifted state has the shifted derivative, for one sample and in a minibatch; only kernels above 1 see far."""
+    network = hj.grid_network(GRID, input_size, KEY, kernel=kernel, hidden=4)
+    x, u = jax.random.normal(KEY, (GRID.size, 3)), jnp.ones((2, 3))
+
+    def shifted(states):
+        return jnp.roll(GRID.fields(states), (2, -3), (1, 2)).reshape(states.shape)
+
+    u = u[:input_size] if input_size else u  # one that reads none accepts any
+    slope = train_batch(network, x, u)
+    np.testing.assert_allclose(train_batch(network, shifted(x), u), shifted(slope), atol=1e-5)
+    np.testing.assert_allclose(network(x[:, 1], u[:, 1]), slope[:, 1], atol=1e-5)
+    effect = jax.jacobian(network)(x[:, 0], u[:, 0])[: GRID.points, : GRID.points]
+    assert int((jnp.abs(effect[0]) > 0).sum()) == kernel**2
+
+
+def test_a_kernel_of_three_is_a_convolution():
+    network = hj.grid_network(GRID, 0, KEY, kernel=3, hidden=5)
+    x = jax.random.normal(KEY, (GRID.size,))
+    inner = network.network
+    kernels = inner.weight_in.reshape(5, 3, 3, 2)
+    padded = GRID.padded(GRID.fields(x), 1)
+    hidden = jax.lax.conv_general_dilated(padded[None], kernels.transpose(0, 3, 1, 2), (1, 1), "VALID")[0]
+    active = jnp.tanh(hidden + inner.norm.shift[:, None, None])
+    expected = jnp.tensordot(inner.weight_out, active, 1) + inner.bias_out[:, None, None]
+    np.testing.assert_allclose(network(x, jnp.zeros(0)), expected.ravel(), atol=1e-5)
+    assert network.neighbour_weights().shape == (5, 16)
+    centre = inner.weight_in[:, 8:10]
+    assert float(jnp.sum(inner.weight_in**2) - jnp.sum(centre**2)) == pytest.approx(
+        float(jnp.sum(network.neighbour_weights() ** 2)), rel=1e-5
+    )
+
+
+def decays(count=6, steps=8, dt=0.1, extra=1.0):
+    """Windows of diffusion and a linear decay, which the model below does not know."""
+    truth = lambda x, u: hj.diffusion(GRID, (0.02, 0.01))(x, u) - extra * x  # noqa: E731
+    x0 = np.random.default_rng(0).normal(size=(count, GRID.size)).astype(np.float32)
+    u = np.zeros((count, steps, 0), np.float32)
+    return hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(truth, x0, u, dt)), dt)
+
+
+def hybrid(kernel=1):
+    return hj.Hybrid(hj.diffusion(GRID, (0.03, 0.006)), hj.grid_network(GRID, 0, KEY, kernel=kernel, hidden=3))
+
+
+def test_scaling_is_by_component_and_fields_need_no_input():
+    scaling = hj.with_scaling(hybrid(), decays()).residual.network.scaling
+    assert [len(part) for part in (scaling.offset, scaling.scale, scaling.output)] == [2, 2, 2]
+    assert len(scaled_loss(hybrid(), decays()).channels) == 2
+
+
+def test_every_method_adapts_a_field_without_inputs():
+    source, windows = hj.with_scaling(hybrid(), decays()), decays(extra=1.2)
+    quick = {"min_epochs": 1, "max_epochs": 2}
+    for name in ("auto", "least_squares", "fine_tune", "linear_residual"):
+        method = replace(METHODS[name], **quick) if name == "fine_tune" else METHODS[name]
+        result = hj.adapt(source, windows, method=method, learned_from=decays())
+        assert np.isfinite(result.mse_after), name
+    assert disturbance_of(with_disturbance(source)).value.shape == (2,)
+
+
+def test_batch_norm_runs_over_points():
+    field = hj.Hybrid(hj.diffusion(GRID, (0.02, 0.01)), hj.grid_network(GRID, 0, KEY, norm="batch", hidden=3))
+    result = hj.fit(field, decays(), decays(), KEY, max_epochs=2)
+    assert float(jnp.abs(result.field.residual.network.norm.running.mean).max()) > 0
+
+
+@pytest.mark.parametrize("kernel", [1, 3])
+def test_programs_of_grids_are_the_field(kernel, tmp_path):
+    pytest.importorskip("flatbuffers")
+    field = hj.with_scaling(hybrid(kernel), decays())
+    export_field(tmp_path / "f.bin", field, state_size=GRID.size, input_size=0)
+    x = jax.random.normal(KEY, (GRID.size,))
+    np.testing.assert_allclose(load_program(tmp_path / "f.bin")(x, jnp.zeros(0)), field(x, jnp.zeros(0)), atol=1e-5)
+
+
+def test_casadi_refuses_a_grid_in_one_line():
+    pytest.importorskip("casadi")
+    large = hj.diffusion(hj.Grid((32, 32), 1.0, 2), (0.1, 0.1))
+    with pytest.raises(ValueError, match="state_size must be at most 512, got 2048") as refused:
+        casadi_function(large, state_size=2048, input_size=0)
+    assert "\n" not in str(refused.value)
+
+
+def test_a_model_on_a_grid_is_saved(tmp_path):
+    hj.save(tmp_path / "m.npz", hj.with_scaling(hybrid(3), decays()))
+    found = hj.load(tmp_path / "m.npz").field
+    assert eqx.tree_equal(found, hj.with_scaling(hybrid(3), decays()))
+
+
+@pytest.mark.parametrize(
+    ("call", "message"),
+    [
+        (lambda: hj.Grid((2, 8)), "shape: each side must be an integer of at least 3"),
+        (lambda: hj.Grid(8), "shape must be a tuple"),
+        (lambda: hj.diffusion(GRID, (0.1,)), "2 expected, one for each component, got 1"),
+        (lambda: hj.grid_network(GRID, 0, KEY, kernel=2), "kernel must be odd and at most 6"),
+        (lambda: hj.check_grid(hj.Grid((6, 6), 1.0, 2), decays()), "states of 72 numbers expected"),
+        (lambda: hj.check_grid(GRID, decays(), diffusivity=2.0), r"unstable, RK4 needs at most 0.0109 s .*substeps=10"),
+        (lambda: hj.rollout(hybrid(), np.ones(50), np.zeros((1, 0)), 0.1), "needs states of 96 numbers, got 50"),
+    ],
+)  # fmt: skip
+def test_bad_input_ends_in_one_line(call, message):
+    with pytest.raises(ValueError, match=message) as refused:
+        call()
+    assert "\n" not in str(refused.value)
+
+
+def test_data_with_an_edge_are_refused():
+    windows = decays()
+    ramp = np.broadcast_to(np.linspace(0, 5, 8, dtype=np.float32), (2, 6, 8)).ravel()
+    with pytest.raises(ValueError, match="not periodic along axis 1"):
+        hj.check_grid(GRID, eqx.tree_at(lambda w: (w.x0, w.x), windows, (windows.x0 * 0 + ramp, windows.x * 0 + ramp)))
+
+
+def test_the_largest_step_is_where_rk4_becomes_unstable():
+    checkers = jnp.asarray(np.indices(GRID.shape).sum(axis=0) % 2 * 2.0 - 1)
+    x0 = jnp.tile(checkers.ravel(), 2)
+    bound = GRID.largest_step(0.01)
+    field = hj.diffusion(GRID, (0.01, 0.01))
+    for share, grows in ((0.98, False), (1.02, True)):
+        end = hj.rollout(field, x0, jnp.zeros((60, 0)), bound * share)[-1]
+        assert bool(jnp.abs(end).max() > 1) is grows
+    steady = hj.rollout(field, x0, jnp.zeros((60, 0)), bound * 1.5, hj.RK4(substeps=2))[-1]
+    assert float(jnp.abs(steady).max()) < 1

@@ -1,0 +1,130 @@
+"""Reaction-diffusion equations: the generator, the jobs, the smallest preset, and what the command refuses."""
+
+import json
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import experiments, refused, unbegun
+
+import hybrid_jax as hj
+from experiments.reaction_diffusion.forecast import CASES, POINTWISE
+from experiments.reaction_diffusion.jobs import pieces
+from experiments.reaction_diffusion.report import claims, tables
+from experiments.reaction_diffusion.systems import (
+    COARSE,
+    DT,
+    FINE,
+    fitzhugh_nagumo,
+    gray_scott,
+    plane,
+    reacting,
+    trajectories,
+)
+from experiments.reporting.claims import evaluate
+from experiments.reporting.results import Results
+
+
+def smooth(points):
+    """A smooth start on [−1, 1]², which every grid resolves."""
+    place = np.arange(points) / points * 2 * np.pi
+    wave = np.sin(place)[:, None] * np.cos(place)
+    return np.stack([0.5 + 0.3 * wave, 0.2 - 0.3 * wave.T]).reshape(1, -1).astype(np.float32)
+
+
+def test_the_generator_converges_with_the_grid_and_the_step():
+    ends = {}
+    for points in (16, 32, 64):
+        field = fitzhugh_nagumo(plane(points), a=0.02, b=0.05)
+        end = trajectories(field, smooth(points), DT, 5, hj.RK4(substeps=50)).x[0, -1]
+        ends[points] = end.reshape(2, points, points)[:, :: points // 16, :: points // 16]
+    coarse, fine = (np.abs(ends[n] - ends[2 * n]).max() for n in (16, 32))
+    assert 3 < coarse / fine < 5  # second order
+    field, start = fitzhugh_nagumo(plane(32)), np.random.default_rng(0).random((1, 2048)).astype(np.float32)
+    exact, own, models = (trajectories(field, start, DT, 3, s).x for s in (hj.RK4(substeps=40), FINE, COARSE))
+    assert np.abs(own - exact).max() < 1e-6
+    assert np.mean(np.square(models - exact)) < 1e-8
+
+
+def test_the_derivative_is_the_equation():
+    grid = plane(8)
+    x = np.random.default_rng(0).random(grid.size).astype(np.float32)
+    u, v = x.reshape(2, 8, 8)
+    around = [sum(np.roll(w, s, axis) for axis in (0, 1) for s in (1, -1)) - 4 * w for w in (u, v)]
+    bend = [part / 0.25**2 for part in around]
+    expected = [1e-3 * bend[0] + u - u**3 - v - 5e-3 - 0.5 * u * v, 5e-3 * bend[1] + u - v]
+    found = fitzhugh_nagumo(grid, coupling=-0.5)(jnp.asarray(x), jnp.zeros(0))
+    np.testing.assert_allclose(found, np.ravel(expected), atol=1e-5)
+
+
+def test_a_steady_state_of_gray_scott_without_catalyst():
+    field = gray_scott([(0.03, 0.06), (0.04, 0.05)], reacts=True)
+    rest = jnp.concatenate([jnp.ones(1024), jnp.zeros(1024)])
+    np.testing.assert_allclose(field(rest, jnp.array([0.0, 1.0])), 0, atol=1e-7)
+
+
+def test_training_and_test_data_are_disjoint_and_pieces_touch():
+    field = fitzhugh_nagumo(plane(8))
+    one, other = (reacting(field, 2, (seed, 0)) for seed in (10, 11))
+    assert not np.array_equal(one.x0, other.x0)
+    windows = pieces(one, 3, 3)
+    assert len(windows) == 16
+    np.testing.assert_array_equal(windows.x[0, -1], windows.x0[1])  # in the order of time, one trajectory after another
+    np.testing.assert_array_equal(windows.x0[8], one.x0[1])
+    noisy = reacting(field, 2, (10, 0), noise=0.01)
+    assert np.std(noisy.x - one.x) == pytest.approx(0.01, rel=0.1)
+
+
+def row(model, mode, n, seed, mse, rho):
+    return {"part": "shifted", "shift": "new_term", "model": model, "mode": mode, "n": n, "seed": seed, "draw": 0} | {
+        "mse": mse, "rho": rho, "chosen": None,
+    }  # fmt: skip
+
+
+def test_claims_are_decided_by_the_rows():
+    rows = []
+    for seed in range(3):
+        for n in (1, 2):
+            noise = 1 + 0.01 * seed
+            rows += [
+                row("hybrid", "fine_tuned", n, seed, 1e-3 * noise / n, 0.9),
+                row("hybrid", "auto", n, seed, 1e-3, 0.9),
+            ]
+            rows += [row("hybrid", "target_only", n, seed, 3e-3 * noise / n**2, 0.5)]
+            rows += [row("no_physics", "fine_tuned", n, seed, 5e-2 * (1 + 0.1 * seed) / n, -0.5)]
+    forecast = [
+        {"part": "forecast", "case": POINTWISE, "seed": s, "draw": 0, "mse": 10**-7.2, "a": 1e-3, "parameter_error": e}
+        for s, e in enumerate((0.1, 0.3))
+    ]
+    results = Results([*forecast, *rows])
+    verdicts = {each.id.split()[0]: each.holds for each in evaluate(claims(results), results)}
+    assert all(verdicts[name] for name in ("C1", "C2", "C3", "C6"))
+    assert verdicts["G2"] is False  # one seed is off by 0.3 %
+    assert verdicts["C8"] is False  # twice the error
+    assert len(tables(results)) == 3
+
+
+@pytest.mark.slow
+def test_the_smallest_preset_reports(tmp_path):
+    (run,) = experiments("reaction_diffusion", "reaction_diffusion", folder=tmp_path)
+    assert run.returncode == 0, run.stderr
+    report = json.loads((tmp_path / "out/reaction_diffusion/report.json").read_text())
+    assert {each["part"] for each in report["rows"]} == {"forecast", "shifted", "gray_scott"}
+    assert set(report["figures"]) == {"fields.png", "spectra.png", "scores.png", "gray_scott.png"}
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (("--points", "4"), "--points must be at least 8"),
+        (("--sizes", "2", "1"), "--sizes must be in ascending order"),
+        (("--sizes", "1", "1"), "--sizes must be at least one, each different"),
+        (("--steps", "0"), "--steps must be an integer of at least 1"),
+    ],
+)
+def test_bad_options_are_refused_in_one_line(options, message):
+    assert message in refused(unbegun("reaction_diffusion", *options), "reaction_diffusion")
+
+
+def test_every_case_has_a_name_of_its_own():
+    assert len({case.name for case in CASES}) == len(CASES)
