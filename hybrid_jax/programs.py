@@ -213,6 +213,16 @@ def _environment() -> tuple:
     return tuple((name, version(name)) for name in LIBRARIES), runtime.machine()
 
 
+@functools.cache
+def _is_ours_or_a_library(package: str) -> bool:
+    """False for another's package of the name of one of ours, which may call what its own source does not show."""
+    if package not in OWN:
+        return True
+    spec = find_spec(package)
+    folders = [] if spec is None else list(spec.submodule_search_locations or ())
+    return folders == [str(Path(__file__).parents[1] / package)]
+
+
 class _Description(pickle.Pickler):
     """Pickles by name only what belongs to KNOWN packages; notes which of OWN."""
 
@@ -228,7 +238,7 @@ class _Description(pickle.Pickler):
         if not callable(obj) or not isinstance(name, str) or not isinstance(module, str):
             return NotImplemented
         package, found = module.partition(".")[0], _by_name(module, name)
-        if package in KNOWN and (found is obj or inspect.unwrap(found) is obj):
+        if package in KNOWN and _is_ours_or_a_library(package) and (found is obj or inspect.unwrap(found) is obj):
             self.packages.update({package} & set(OWN))
             # Pickle names classes and plain functions itself, but not what a decorator returned or was given.
             plain = found is obj and isinstance(obj, type | types.FunctionType)

@@ -40,7 +40,7 @@ def kept(folder):
 
 def forget(path):
     """Delete a program from JAX's own cache."""
-    for entry in Path(os.environ.get(runtime.PROGRAMS, path.parent)).glob(f"jit_{path.name.partition('-')[0]}*"):
+    for entry in Path(os.environ.get(runtime.PROGRAMS) or path.parent).glob(f"jit_{path.name.partition('-')[0]}*"):
         entry.unlink()
 
 
@@ -116,6 +116,13 @@ def test_what_names_do_not_describe_is_not_kept(folder):
 
 def identity(x):
     return x
+
+
+def test_another_package_named_as_one_of_ours_is_not_kept(folder, monkeypatch):
+    assert programs._is_ours_or_a_library("experiments")
+    monkeypatch.setattr(programs, "OWN", (*programs.OWN, "json"))
+    programs._is_ours_or_a_library.cache_clear()
+    assert not programs._is_ours_or_a_library("json")
 
 
 def test_it_transforms_as_filter_jit_does(folder):
