@@ -7,7 +7,17 @@ import numpy as np
 import pytest
 from smoke import experiments, refused, unbegun
 
-from experiments.excitation import CLAIMS, DESIGNED, FLIGHTS, RANDOM, Evidence, conclusion, margins, ratio, tables
+from experiments.excitation.results import (
+    CLAIMS,
+    DESIGNED,
+    FLIGHTS,
+    RANDOM,
+    Evidence,
+    conclusion,
+    margins,
+    ratio,
+    tables,
+)
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.identification import FlightBounds

@@ -1,0 +1,180 @@
+"""What the flights told: claims, tables and figures."""
+
+import math
+from collections.abc import Mapping
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from experiments.reporting.claims import Claim, Part, all_of
+from experiments.reporting.names import HYBRID
+from experiments.reporting.plots import COLOURS, PAGE, STYLE, name_lines, subplots, tick_errors
+from experiments.reporting.results import Results
+from experiments.reporting.statistics import Interval, mean_interval
+from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
+from hybrid_jax.identification import Excitation, FlightBounds
+from hybrid_jax.rotation import heading
+from hybrid_jax.sim.flight import DT
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+
+RANDOM, DESIGNED = "random", "designed"
+FLIGHTS = ("hover", "figure-8", RANDOM, DESIGNED)
+GOAL = 0.5  # the worst parameter's interval after the designed flight, over that after random flight, at most
+WIDEST = 1000.0  # %: wider intervals say nothing
+Flown = tuple[Float[np.ndarray, "n+1 13"], Float[np.ndarray, "n rotors"]]  # true states, rotor speeds
+
+
+class Evidence(NamedTuple):
+    rows: Results
+    margins: Mapping[str, tuple[float, float]]  # of each limit: how far the flown flight went, and the limit
+
+
+def margins(bounds: FlightBounds, states: Float[np.ndarray, "n 13"]) -> dict[str, tuple[float, float]]:
+    """How far the vehicle went towards each limit, and the limit, from the middle of the box."""
+    place = states[:, POSITION] - (np.array(bounds.low) + np.array(bounds.high)) / 2
+    half = (np.array(bounds.high) - np.array(bounds.low)) / 2
+    upright = 1 - 2 * (states[:, QUATERNION.start + 1] ** 2 + states[:, QUATERNION.start + 2] ** 2)
+    found = {f"{axis} [m]": (np.abs(place[:, i]).max(), half[i]) for i, axis in enumerate("xyz")}
+    found["speed [m/s]"] = np.linalg.norm(states[:, VELOCITY], axis=1).max(), bounds.speed
+    found["tilt [rad]"] = np.arccos(np.clip(upright, -1, 1)).max(), bounds.tilt
+    found["yaw [rad]"] = np.abs(heading(jnp.asarray(states[:, QUATERNION]))).max(), bounds.yaw
+    return {name: (float(used), float(limit)) for name, (used, limit) in found.items()}
+
+
+def worst(rows: Results, column: str) -> dict[int, float]:
+    """The widest interval of each seed, in %."""
+    return {seed: float(own.numbers(column).max()) for seed, own in rows.group("seed").items()}
+
+
+def ratio(rows: Results, name: str, column: str = "half_width") -> Interval:
+    """The worst interval after the designed flight over that after another: geometric mean over seeds."""
+    ours, theirs = (worst(rows.where(flight=flight), column) for flight in (DESIGNED, name))
+    with np.errstate(divide="ignore"):  # nothing beside an infinite interval
+        logs = [float(np.log(ours[seed] / theirs[seed])) for seed in ours]
+    return Interval(*map(math.exp, mean_interval(logs, list(ours))))
+
+
+def _halves(evidence: Evidence) -> Part:
+    found = ratio(evidence.rows, RANDOM)
+    return found.below(GOAL), f"{found.text('.2f')} of that after random flight"
+
+
+def _stays_inside(evidence: Evidence) -> Part:
+    found = evidence.margins.items()
+    return all_of((used <= limit, f"{name} {used:.2f} of {limit:.2g}") for name, (used, limit) in found)
+
+
+CLAIMS = (
+    Claim(
+        "X1",
+        "The widest interval of a parameter after the designed flight is at most half of that after random flight of "
+        "the same length (interval over seeds).",
+        _halves,
+    ),
+    Claim("X2", "The vehicle, flown by the controller, stays inside the limits of the design.", _stays_inside),
+)
+
+
+def conclusion(rows: Results) -> list[str]:
+    def times(name: str, column: str = "half_width") -> str:
+        share = ratio(rows, name, column).value
+        return f"{1 / share:.2g} times" if share > 1 / WIDEST else f"more than {WIDEST:g} times"
+
+    own = rows.where(flight=DESIGNED)
+    wide = np.mean(list(worst(own, "half_width").values()))
+    others = ", ".join(f"{times(name)} narrower than after {name}" for name in FLIGHTS[::-1] if name != DESIGNED)
+    return [
+        f"After the designed flight the widest interval is ±{wide:.2g} %, {others}.",
+        f"If the model were exact, it would be {times(RANDOM, 'predicted')} narrower than after random; the rest "
+        "probably comes with drag and ground effect, which the model lacks.",
+        f"{np.mean(own['inside']):.0%} of the designed flight's 95 % intervals hold the truth.",
+    ]
+
+
+def tables(rows: Results) -> list[Table]:
+    def mean(column: str, form: str = ".3g"):
+        def text(own: Results) -> str:
+            found = float(own.numbers(column).mean())
+            return f"{found:{form}}" if abs(found) <= WIDEST else f"> {WIDEST:g}"
+
+        return text
+
+    columns = {name: {"parameter": name} for name in rows.unique("parameter")}
+    title = f"Half-width of the 95 % interval [%], {over_seeds(rows)}"
+    widths = cross_table(title, rows.group("flight"), columns, mean("half_width"), "flight")
+    more = {
+        "half-width [%]": mean("half_width"),
+        "predicted [%]": mean("predicted"),
+        "error, RMS [%]": lambda own: f"{np.sqrt(np.mean(np.square(own.numbers('error')))):.3g}",
+        "bias [%]": mean("error", "+.2f"),
+        "hold the truth [%]": lambda own: f"{100 * np.mean(own['inside']):.0f}",
+    }
+    head = ("flight", "parameter")
+    return [
+        widths._replace(best="column"),
+        tabulate("Intervals, their prediction and errors", rows.group(*head), more, head),
+    ]
+
+
+def margin_table(design: Excitation, evidence: Evidence) -> Table:
+    planned = {name: f"{left:.0%}" for name, left in design.margins.items()}
+    lines = [
+        (name, f"{limit:.2g}", planned.get(name.split(" ")[0], ""), f"{used:.2f}")
+        for name, (used, limit) in evidence.margins.items()
+    ]
+    return Table("Limits", ("limit", "value", "left by the plan", "used in flight"), lines)
+
+
+def described(design: Excitation) -> dict[str, Any]:
+    return {
+        "parameters": design.parameters,
+        "information": design.information.tolist(),
+        "standard_errors": design.standard_errors,
+        "margins": design.margins,
+        "log_det": design.log_det,
+    }
+
+
+@mpl.rc_context(STYLE)
+def interval_figure(rows: Results) -> Figure:
+    """A panel per parameter, a line per flight."""
+    names = rows.unique("parameter")
+    figure, panels = subplots((PAGE, 2.1), 1, len(names), sharex=True, sharey=True)
+    for axes, name in zip(panels[0], names, strict=True):
+        for y, flight in enumerate(FLIGHTS):
+            found = np.minimum(rows.where(parameter=name, flight=flight).numbers("half_width"), WIDEST)
+            tint = COLOURS[HYBRID] if flight == DESIGNED else "0.35"
+            axes.plot(
+                found, y + np.linspace(-0.25, 0.25, len(found) + 2)[1:-1], "o", color=tint, alpha=0.5, markersize=3
+            )
+            axes.plot([found.mean()] * 2, [y - 0.35, y + 0.35], color=tint, linewidth=2)
+        axes.set(title=name, xscale="log", xlabel="half-width [%], log scale")
+    name_lines(panels[0][0], FLIGHTS)
+    tick_errors(panels[0][0].xaxis, *panels[0][0].get_xlim())
+    return figure
+
+
+@mpl.rc_context(STYLE)
+def flight_figure(design: Excitation, flown: Flown) -> Figure:
+    """Position, tilt, body rates and rotor speeds over time."""
+    figure, panels = subplots((PAGE, 4.2), 2, 2, sharex=True)
+    states, inputs = flown
+    shown = {
+        "position [m]": (design.states[:, POSITION], states[:, POSITION], "xyz"),
+        "velocity [m/s]": (design.states[:, VELOCITY], states[:, VELOCITY], "xyz"),
+        "body rates [rad/s]": (design.states[:, BODY_RATES], states[:, BODY_RATES], "xyz"),
+        "rotor speeds [rad/s]": (design.inputs, inputs, ("0", "1", "2", "3")),
+    }
+    for axes, (title, (planned, actual, labels)) in zip(panels.flat, shown.items(), strict=True):
+        for i, label in enumerate(labels):
+            (line,) = axes.plot(DT * np.arange(len(actual)), actual[:, i], linewidth=1, label=label)
+            axes.plot(DT * np.arange(len(planned)), planned[:, i], "--", color=line.get_color(), linewidth=0.7)
+        axes.set_title(title, loc="left")
+        axes.legend(ncols=len(labels), loc="lower right", bbox_to_anchor=(1, 0.98), handlelength=1, columnspacing=1)
+    for axes in panels[1]:
+        axes.set_xlabel("time [s]")
+    return figure
