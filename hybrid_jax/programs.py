@@ -139,6 +139,7 @@ class _Kept:
 
 
 def _keep(path: Path, compiled, inputs: int, skeleton, rest: Sequence) -> None:
+    """Write the program to its file, unless JAX or pickle cannot serialise it, or the disk is full."""
     try:
         executable = serialize_executable.serialize(compiled)[0]
         content = pickle.dumps((executable, _devices(compiled), inputs, skeleton, rest))

@@ -170,6 +170,8 @@ def test_a_new_process_adapts_as_the_first_one_did(tmp_path):
     # It calls LAPACK, which a process that lowered nothing has not set up.
     first, again = (script("-c", ADAPT, tmp_path).rpartition("\n[") for _ in range(2))
     assert again[0] == first[0]
+    assert "solution" in first[2]
+    assert again[2].strip() == "]"  # nothing of this name was traced
 
 
 def test_programs_that_nobody_used_for_a_month_are_deleted(folder):
