@@ -32,8 +32,8 @@ Partial differential equations on a periodic grid of 32 × 32 points, 2048 state
   network has three layers of 3 × 3 and is trained by Adam, ours has one of 3 × 3, one of 1 × 1, and is trained by
   Gauss–Newton; 25 steps from t = 0.
 - *neighbours penalised*: with a penalty on the squared weights of neighbours, which says that reactions are local:
-  a stronger prior than least action, λ‖f_d‖², which is biased here. Where a pattern is nearly steady reaction and
-  diffusion cancel, so that the smallest f_d goes with too small a and b.
+  a stronger prior than least action, λ‖f_d‖², with which the errors of a and b stay large here. A reaction and
+  diffusion may cancel, so that a small f_d need not be the true one; the reason was not looked for.
 - **Shifted**: the equations change, and models adapt to N trajectories. *fine-tuned*: all parameters, by Gauss–Newton
   from the source; *target-only*: the same from random weights; *least squares*: a and b alone; *auto*: as `hj.adapt`.
 - **Gray–Scott** in the protocol of Neural Context Flows (Nzoyem et al. 2025): one trajectory in each of four

@@ -57,8 +57,8 @@ def correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
     """The weights of a `GridNetwork` for all points but the one itself: small if f_d is a reaction.
 
-    Along nearly steady states a reaction and diffusion cancel, so that a small f_d is not the true one; what tells them
-    apart is that a reaction does not depend on neighbours.
+    A small f_d need not be the true one, since a reaction and diffusion may cancel; what tells them apart is that a
+    reaction does not depend on neighbours.
     """
     networks = [n for n in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(n)]
     return jnp.concatenate([jnp.zeros(0), *(network.neighbour_weights().ravel() for network in networks)])
