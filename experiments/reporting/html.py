@@ -13,6 +13,7 @@ from experiments.reporting.tables import Table, best_cells, number_in
 from hybrid_jax.io.files import json_text
 
 LARGEST_SVG = 1_000_000  # bytes; a larger drawing is shown as its PNG
+UNBROKEN = 28  # characters of a number with its deviation; a longer cell may take several lines
 TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif"}
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; --link: #0072b2; --good: #009e73; --bad: #d55e00 }
@@ -92,7 +93,7 @@ def _table(table: Table) -> str:
 
 def _cell(text: str, best: bool) -> str:
     number = number_in(text)
-    value = "" if number is None else f' data-value="{number!r}" class="number"'
+    value = "" if number is None else f' data-value="{number!r}"' + ' class="number"' * (len(text) <= UNBROKEN)
     kind = ' class="holds"' if text.startswith("✓") else ' class="fails"' if text.startswith("✗") else value
     shown = html.escape(text)
     return f"<td{kind}>{f'<strong>{shown}</strong>' if best else shown}</td>"
