@@ -13,6 +13,7 @@ from experiments.reporting.tables import Table, best_cells, number_in
 from hybrid_jax.io.files import json_text
 
 LARGEST_SVG = 1_000_000  # bytes; a larger drawing is shown as its PNG
+VERDICTS = {"✓": "holds", "✗": "fails", "– undecided": "undecided"}
 UNBROKEN = 28  # characters of a number with its deviation; a longer cell may take several lines
 TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif"}
 STYLE = """
@@ -25,7 +26,7 @@ h1 { margin-bottom: .2rem } h2 { margin-top: 2rem; font-size: 1.15rem }
 th, td { text-align: left; vertical-align: top; padding: .25rem .7rem; border-bottom: 1px solid var(--line) }
 th { cursor: pointer } th:hover { text-decoration: underline }
 th[aria-sort=ascending]::after { content: " ↑" } th[aria-sort=descending]::after { content: " ↓" }
-td.number, .holds, .fails { white-space: nowrap }
+td.number, .holds, .fails, .undecided { white-space: nowrap }
 .holds { color: var(--good) } .fails { color: var(--bad); font-weight: bold }
 figure { margin: 1.5rem 0 } figcaption { font-style: italic }
 figure img { max-width: 100%; background: white; cursor: zoom-in }
@@ -94,7 +95,7 @@ def _table(table: Table) -> str:
 def _cell(text: str, best: bool) -> str:
     number = number_in(text)
     value = "" if number is None else f' data-value="{number!r}"' + ' class="number"' * (len(text) <= UNBROKEN)
-    kind = ' class="holds"' if text.startswith("✓") else ' class="fails"' if text.startswith("✗") else value
+    kind = next((f' class="{name}"' for start, name in VERDICTS.items() if text.startswith(start)), value)
     shown = html.escape(text)
     return f"<td{kind}>{f'<strong>{shown}</strong>' if best else shown}</td>"
 
