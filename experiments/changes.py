@@ -150,8 +150,9 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
 
         return [row(seed, i) for seed in seeds for i in range(len(names))]
 
-    found = stages.parts(f"adapt {domain.name}", [partial(of_draw, draw) for draw in range(config.draws)])
-    return [row for rows in found for row in rows] + compared(fields, config, stages, target)
+    jobs = [partial(of_draw, draw) for draw in range(config.draws)]
+    found = stages.kept_parts(f"adapt {domain.name}", jobs, (config.described(), fields, target))
+    return found + compared(fields, config, stages, target)
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:

@@ -25,7 +25,7 @@ from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
-from hybrid_jax.adaptation.selection import BLOCKS, blocks_of
+from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
 from hybrid_jax.adaptation.uncertainty import covariance_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
@@ -46,7 +46,7 @@ HEAD = f"""# {NAME}
 
 Hybrids that were trained on source flight, with different seeds, adapt to the same N windows of one flight, as
 `adapt(method="auto")` does without changing the network. The interval of each of θ_p is pooled over the sources by
-`hybrid_jax.pool`: the variance of a fit, with blocks of a second as clusters, and the variance between the sources.
+`hybrid_jax.pool`: the variance of a fit, with blocks of two seconds as clusters, and the variance between the sources.
 Coverage: the share of flights whose pooled 95 % interval contains the truth. A parameter that was not fitted has no
 interval and does not count; where rotors lost thrust, their efficiencies take the place of k. One source: the share of
 intervals that are not pooled.
@@ -123,7 +123,8 @@ def experiment(config: CoverageConfig, console: Console) -> None:
 def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:
     """A row for each flight and parameter: whether the pooled interval, and those of single sources, hold the truth."""
     splits = {"train": target_splits(config)["train"]}
-    pool = flown(domain, splits, config, stages).splits["train"]
+    flights = flown(domain, splits, config, stages)
+    pool = flights.splits["train"]
     drawn, truth = windows_of(METHOD, config.sizes[0], config)[0], nominal(domain.vehicle)
 
     def of_draw(draw: int) -> list[Row]:
@@ -136,13 +137,14 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
         ]
 
     name = f"intervals {domain.name}, noise {config.noise:g}"
-    return [row for rows in stages.parts(name, [partial(of_draw, d) for d in range(config.draws)]) for row in rows]
+    jobs = [partial(of_draw, draw) for draw in range(config.draws)]
+    return stages.kept_parts(name, jobs, (config.described(), fields, flights))
 
 
 @partial(kept_jit, compiler_options=FAST_COMPILE)
 def _fits(fields: Any, windows: Trajectories, shared: Settings):
     """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
-    cluster = blocks_of(windows.x0.shape[1], BLOCKS)[0].shape[1]  # windows of one flight are correlated
+    cluster = blocks_of(windows.x0.shape[1], CLUSTERS)[0].shape[1]  # windows of one flight are correlated
 
     def one(run):
         field, windows = run
@@ -160,9 +162,9 @@ def _compared(logs: np.ndarray, stds: np.ndarray, true: float) -> Row:
     columns = ("inside", "error", "half_width", "alone")
     if not np.isfinite(stds).all():
         return dict.fromkeys(columns)
-    centre, away = combined(logs, stds**2, degrees=BLOCKS - 1)
+    centre, away = combined(logs, stds**2, degrees=CLUSTERS - 1)
     reach = [
-        combined(np.full(2, log), np.full(2, std**2), degrees=BLOCKS - 1)[1]
+        combined(np.full(2, log), np.full(2, std**2), degrees=CLUSTERS - 1)[1]
         for log, std in zip(logs, stds, strict=True)
     ]
     alone = float(np.mean(np.abs(logs - true) <= reach))

@@ -1,22 +1,27 @@
 """Training sweeps with a cache: a finished sweep is loaded, an interrupted one is resumed, any other is run."""
 
+import json
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 from rich.console import Console
 
+from experiments.reporting.results import Row
 from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
 from experiments.runner.run_record import PACKAGES, require_same
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import backup_path
+from hybrid_jax.io.files import backup_path, json_value, write_atomic
 from hybrid_jax.io.models import describe
+from hybrid_jax.programs import source_digest
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import Progress, sweep
 from hybrid_jax.training.fitting import FitState, RunConfig
@@ -122,6 +127,33 @@ class Stages:
                 line.show_parts(len(results), len(jobs))
         return results
 
+    def kept_parts(self, name: str, jobs: Sequence[Callable[[], list[Row]]], inputs: Sequence[Any]) -> list[Row]:
+        """The rows of jobs, as `parts`; those of finished jobs are kept in the cache, one line of a file for each.
+
+        `inputs` is what determines them beside the code of these packages: JSON, datasets and fields.
+        """
+        path = self._folder / f"{_stem(name)}-{_identity_of_parts(inputs)[:16]}.jsonl"
+        if self._fresh and path.exists() and hosts.is_main_process():
+            self._say(f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}")
+        kept = _lines(path)[: len(jobs)]
+        if kept:
+            self.reused.append(f"{len(kept)} of {len(jobs)} parts of {name}")
+
+        def run(index: int) -> list[Row]:
+            seconds, rows = kept[index] if index < len(kept) else (0.0, None)
+            if rows is not None:
+                self.seconds[name] = self.seconds.get(name, 0.0) + seconds
+                return rows
+            began = time.perf_counter()
+            text = json.dumps(jobs[index](), default=lambda number: number.item())
+            if hosts.is_main_process():
+                path.parent.mkdir(parents=True, exist_ok=True)
+                with path.open("a") as file:
+                    file.write(f"[{time.perf_counter() - began:.3f}, {text}]\n")
+            return json.loads(text)
+
+        return [row for rows in self.parts(name, [partial(run, i) for i in range(len(jobs))]) for row in rows]
+
     def knows(self, name: str) -> bool:
         """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
         return any(self._folder.glob(f"{_stem(name)}-*"))
@@ -144,6 +176,37 @@ class Stages:
 def stages_of(config: Run, console: Console) -> Stages:
     """The stages of an experiment, cached in its cache folder."""
     return Stages(config.cache / "sweeps", console, config.saving, config.fresh)
+
+
+def _lines(path: Path) -> list[tuple[float, list[Row]]]:
+    """Seconds and rows of each line; what follows a line that a kill cut short is deleted with it."""
+    found, text = [], path.read_bytes() if path.exists() else b""
+    whole = text[: text.rfind(b"\n") + 1]
+    if whole != text and hosts.is_main_process():
+        write_atomic(path, whole)
+    for i, line in enumerate(whole.splitlines(), 1):
+        try:
+            seconds, rows = json.loads(line)
+        except ValueError as error:
+            raise ValueError(f"{path}: line {i} is damaged; delete the file, or begin with --fresh") from error
+        found.append((float(seconds), rows))
+    return found
+
+
+def _identity_of_parts(inputs: Sequence[Any]) -> str:
+    sources = [source_digest(package) for package in ("hybrid_jax", "experiments")]
+    fixed: list[Any] = [RECIPE, *sources, versions(*FINISHED_BY)]
+    arrays: dict[str, Any] = {}
+    for value in inputs:
+        match value:
+            case AbstractVectorField():
+                fixed.append(describe(value))
+                arrays |= named_leaves(value)
+            case Dataset():
+                fixed.append(content_hash(value))
+            case _:
+                fixed.append(json_value(value))
+    return digest(fixed, arrays)
 
 
 def summary(states: FitState) -> str:

@@ -22,6 +22,7 @@ from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 BLOCKS = 10
+CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
 TOLERANCE = 0.1  # relative difference of errors that does not count
 JOINED = 10  # windows that touch, at most so many, are predicted as one
 
@@ -126,9 +127,9 @@ def predict_block(
 
 
 def correlated(windows: Trajectories) -> int:
-    """How many consecutive windows to take as one cluster: a block where some touch, as those of one flight do."""
+    """How many consecutive windows to take as one cluster: a fifth where some touch, as those of one flight do."""
     touching = (np.asarray(windows.x0)[1:] == np.asarray(windows.x)[:-1, -1]).all(axis=1)
-    return blocks_of(len(windows), BLOCKS)[0].shape[1] if touching.any() else 1
+    return blocks_of(len(windows), CLUSTERS)[0].shape[1] if touching.any() else 1
 
 
 def longest_chain(windows: Trajectories, blocks: int) -> int:

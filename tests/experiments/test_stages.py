@@ -2,6 +2,7 @@
 
 import signal
 from dataclasses import replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -125,3 +126,46 @@ def test_a_damaged_file_is_named(tmp_path, whole):
     path.write_bytes(path.read_bytes()[:-100])
     with pytest.raises(ValueError, match=path.name):
         run(tmp_path)
+
+
+def parts(folder, done, inputs=(1,), fresh=False, stop=None):
+    """Four rows, one from each job; `done` has the jobs that ran."""
+
+    def job(index):
+        if index == stop:
+            raise KeyboardInterrupt
+        done.append(index)
+        return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}]
+
+    stages = Stages(folder, Console(quiet=True), fresh=fresh)
+    return stages.kept_parts("some parts", [partial(job, i) for i in range(4)], inputs)
+
+
+def test_finished_parts_are_kept(tmp_path):
+    whole = parts(tmp_path / "whole", [])
+    with pytest.raises(KeyboardInterrupt):
+        parts(tmp_path, [], stop=2)
+    (file,) = tmp_path.glob("*.jsonl")
+    file.write_text(file.read_text() + "[0.1, [{")  # a kill while the third was written
+    done = []
+    assert parts(tmp_path, done) == whole
+    assert done == [2, 3]
+    assert parts(tmp_path, done) == whole
+    assert done == [2, 3]
+
+
+@pytest.mark.parametrize(("inputs", "fresh"), [((2,), False), ((DATA,), False), ((1,), True)])
+def test_parts_of_other_inputs_run(tmp_path, inputs, fresh):
+    parts(tmp_path, [])
+    done = []
+    parts(tmp_path, done, inputs, fresh)
+    assert done == [0, 1, 2, 3]
+
+
+def test_a_damaged_line_is_named(tmp_path):
+    parts(tmp_path, [])
+    (file,) = tmp_path.glob("*.jsonl")
+    first, second, *rest = file.read_text().splitlines()
+    file.write_text("\n".join([first, second[:-4], *rest]) + "\n")
+    with pytest.raises(ValueError, match=r"jsonl: line 2 is damaged; delete the file"):
+        parts(tmp_path, [])
