@@ -38,9 +38,10 @@ Partial differential equations on a periodic grid of 32 × 32 points, 2048 state
   from the source; *target-only*: the same from random weights; *least squares*: a and b alone; *auto*: as `hj.adapt`.
 - **Gray–Scott** in the protocol of Neural Context Flows (Nzoyem et al. 2025): one trajectory in each of four
   environments, then one in each of four new ones. Physics knows D_u, D_v, feed and kill terms, with F and k unknown in
-  each environment; a pointwise network, shared by all, learns the reaction. F and k alone are adapted. What differs:
-  Neural Context Flows know none of that; their Laplacian has nine points, ours five; trajectories are our own. F and k
-  that are found count from what the network took: it may hold a part that all environments share.
+  each environment, and that v gains what u loses by the reaction; its rate r(u, v) at a point is a network that all
+  environments share. F and k alone are adapted. What differs: Neural Context Flows know none of that; their Laplacian
+  has nine points, ours five; trajectories are our own. The recipe was chosen by an environment between the four, which
+  is none of the new ones; errors in the new ones had been seen with an earlier network, of two outputs.
 """
 
 

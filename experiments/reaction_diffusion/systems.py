@@ -102,6 +102,20 @@ class GrayScott(hj.AbstractVectorField):
         return {"F": jnp.exp(self.rates[:, 0]), "k": jnp.exp(self.rates[:, 1])}
 
 
+class Conversion(hj.AbstractVectorField):
+    """At each point v gains what u loses: ẋ = (−r, r), with a network for the rate r(u, v) of the reaction."""
+
+    accepts_batch: ClassVar[bool] = True
+
+    rate: hj.AbstractVectorField  # of two numbers, without inputs, to one
+    grid: hj.Grid = eqx.field(static=True)
+
+    def __call__(self, x, u):
+        fields = self.grid.fields(x)
+        rate = self.rate(fields.reshape(2, -1), jnp.zeros((0, fields[0].size), x.dtype))
+        return jnp.concatenate([-rate, rate]).reshape(x.shape)
+
+
 def gray_scott(environments, reacts: bool) -> GrayScott:
     """Of (F, k) of each environment."""
     grid = hj.Grid((SCOTT_POINTS, SCOTT_POINTS), 1.0, 2)
