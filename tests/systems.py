@@ -24,7 +24,7 @@ ODD = replace(  # a vehicle without any symmetry
     rotor_positions=((0.2, -0.1), (-0.15, 0.2), (0.1, 0.3), (-0.2, -0.25)), spin=(1.0, 1.0, -1.0, -1.0),
 )  # fmt: skip
 STEPS = 10
-GRID = 64
+GRID = 32
 
 
 @dataclass(frozen=True)
@@ -231,7 +231,7 @@ def _dense() -> System:
 def _convolution() -> System:
     first, second = jax.random.split(jax.random.key(1))
     options = {"kernel_size": 5, "padding": "SAME", "padding_mode": "CIRCULAR"}
-    return _ring(Convolution(eqx.nn.Conv1d(1, 8, **options, key=first), eqx.nn.Conv1d(8, 1, **options, key=second)))
+    return _ring(Convolution(eqx.nn.Conv1d(1, 3, **options, key=first), eqx.nn.Conv1d(3, 1, **options, key=second)))
 
 
 SYSTEMS: dict[str, Callable[[], System]] = {

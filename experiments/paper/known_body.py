@@ -2,6 +2,7 @@
 
 import itertools
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Literal
 
 import jax
@@ -22,6 +23,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.programs import kept_jit
+from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -166,7 +168,7 @@ def _parts(config: KnownBody) -> list[PRNGKeyArray]:
     return [keys[np.arange(begin, begin + size) % config.repeats] for begin in range(0, config.repeats, size)]
 
 
-@kept_jit
+@partial(kept_jit, compiler_options=FASTEST_COMPILE)
 def _repeats(
     config: KnownBody, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray
 ) -> dict[str, Array]:

@@ -148,6 +148,7 @@ def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta
     return theta, lambda theta: with_physics(field, eqx.combine(unravel(theta), rest))
 
 
+@eqx.filter_jit
 def prediction_errors(
     field: AbstractVectorField, window: Trajectories, solver: Solver = None, scale: Scale = None
 ) -> Float[Array, "t d"]:
