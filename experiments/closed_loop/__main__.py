@@ -33,7 +33,7 @@ from experiments.runner import command
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
-from hybrid_jax.control import Controller
+from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sweep import hosts
@@ -50,7 +50,7 @@ HEAD = """# closed_loop
 
 A model predictive controller flies the simulated quadrotor after a change: other moments of inertia (parameter shift),
 or a side wind of 4 N with a sine of 1 N (external force). Every 0.01 s the controller plans 1 s ahead with its
-prediction model; nothing else differs between the flights of a column. It knows the true state without noise.
+prediction model; nothing else differs between the flights of a column. {knows}
 
 - **nominal physics**: the rigid body of the data sheet, not trained
 - **physics**: the same with Ix, Iy, k fitted to N target trajectories of 0.1 s
@@ -75,6 +75,19 @@ rows.csv). Actual cost: of the same inputs run open loop for 1 s in the true sys
 (actual − predicted) / predicted (`excess`). Calls every 0.5 s are compared. Models that were not adapted also fly the
 unchanged vehicle, on which the source networks were trained.
 """
+
+EXACT = "It knows the true state without noise."
+
+
+def head(config: ClosedLoopConfig) -> str:
+    """The introduction of the report, with the hardware that was flown with."""
+    hardware = config.hardware()
+    if hardware == Hardware():
+        return HEAD.format(knows=EXACT).strip()
+    noise, latency, lag = config.noise, 1e3 * config.latency, 1e3 * config.rotor_lag
+    known = "controller and observer predict both"
+    knows = f"Noise of the sensors: {noise:g} times that of motion capture and a gyroscope. Latency {latency:g} ms, lag"
+    return HEAD.format(knows=f"{knows} of the rotors {lag:g} ms; {known}.").strip()
 
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
@@ -109,7 +122,7 @@ def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: C
     sets = {SOURCE.name: models.model_set(SOURCE, trained, ()), **changed}
     home = scenarios(config, sets, [(name, 0.0) for name in config.references])
     away = scenarios(config, changed, [(name, config.away) for name in config.flown_away])
-    return fly_all(config, Controller(IRIS), [*home, *away], console)
+    return fly_all(config, config.controller(), [*home, *away], console)
 
 
 def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training) -> list[Flown]:
@@ -120,7 +133,7 @@ def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training)
     found = []
     for unit in (True, False) if "quaternion" in config.ablation else (True,):
         sets = {domain.name: models.variants(config.ablation, domain, trained, own, unit) for domain in DOMAINS}
-        found += fly_all(config, Controller(IRIS, unit_quaternion=unit), scenarios(config, sets, places), console)
+        found += fly_all(config, config.controller(unit), scenarios(config, sets, places), console)
     return found
 
 
@@ -131,7 +144,8 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
 
 
 def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
-    return flights.flown(own, controller, config.seconds, config.cache / NAME, console, config.fresh)
+    cache = config.cache / NAME
+    return flights.flown(own, controller, config.seconds, cache, console, config.fresh, config.hardware())
 
 
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
@@ -140,7 +154,7 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     fields = {Agent("nominal").name: rigid_body(IRIS)}
     for model in ("hybrid", "invariant"):
         fields[Agent(model, few).name] = lane(trained[model].adapted[PARAMETER_SHIFT.name, few], 0)
-    return on_one_core(fields, Controller(IRIS), config.calls, config.cache)
+    return on_one_core(fields, config.controller(), config.calls, config.cache)
 
 
 def write(
@@ -173,7 +187,7 @@ def write(
         figures=save_figures(out, drawn, config.paper),
         notes=[*missing, *notes],
         extra={"ablation": ablated.rows, "speed": timed},
-        head=HEAD.strip(),
+        head=head(config),
         conclusion=conclusion(rows, few),
         tables=[*titled, speed_table(timed)],
         more_rows=ablated,

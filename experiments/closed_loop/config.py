@@ -3,8 +3,11 @@
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
+from experiments.online.config import NOISE
 from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
-from experiments.runner.options import Count, Positive, distinct
+from experiments.runner.options import Count, NotNegative, Positive, distinct
+from hybrid_jax.control import Controller, Hardware
+from hybrid_jax.vehicle import IRIS
 
 Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
 Option = Literal["networks", "offset", "statistics", "quaternion"]
@@ -28,6 +31,12 @@ class ClosedLoopConfig(Config):
     """References flown there, of --references; by default hover, figure_eight and low_pass, if they are among these."""
     bandwidth: Positive = 10.0
     """Of the disturbance observer [rad/s]."""
+    noise: NotNegative = 0.0
+    """White noise on the states that controller and observer see; 1 is typical of motion capture and a gyroscope."""
+    latency: NotNegative = 0.0
+    """From a sample to its command, a multiple of 0.01 [s]. Controller and observer know it."""
+    rotor_lag: NotNegative = 0.0
+    """Time constant with which rotors follow their commands [s]. Controller and observer know it."""
     invariant_inputs: ResidualInputs = "near_ground"
     """Inputs of the translation- and yaw-invariant residual (see --residual-inputs)."""
     invariant_outputs: Literal["accelerations", "wrench", "rotors"] = "rotors"
@@ -76,6 +85,15 @@ class ClosedLoopConfig(Config):
         if self.residual_outputs != "all":
             why = "no_physics must write all derivatives; see --invariant-outputs"
             raise ValueError(f"--residual-outputs {self.residual_outputs}: {why}")
+        self.hardware().delay(self.controller().period)
+
+    def hardware(self) -> Hardware:
+        """Between controller and vehicle."""
+        m, quaternion, speed, rate = (self.noise * size for size in NOISE)
+        return Hardware(self.latency, self.rotor_lag, (m, quaternion, speed, rate))
+
+    def controller(self, unit_quaternion: bool = True) -> Controller:
+        return Controller(IRIS, unit_quaternion=unit_quaternion, rotor_lag=self.rotor_lag)
 
     @property
     def flown_away(self) -> tuple[Reference, ...]:

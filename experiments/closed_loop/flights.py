@@ -22,7 +22,7 @@ from experiments.closed_loop.results import NUMBERS, TAGS, Agent, away
 from experiments.reporting.results import Results
 from experiments.runner.progress import Line, clock
 from hybrid_jax import control
-from hybrid_jax.control import Controller, sample
+from hybrid_jax.control import Controller, Hardware, sample
 from hybrid_jax.control.cost import Scalar
 from hybrid_jax.control.references import Path as Reference
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -74,6 +74,7 @@ class Flight(NamedTuple):
     path: Int[Any, ""]  # index into PATHS
     home: Float[Any, "3"]  # offset of the reference [m, world]
     bandwidth: Float[Any, ""]  # of the disturbance observer [rad/s]; 0 for none
+    seed: Int[Any, ""]  # of the noise, the same for all agents
 
     def structure(self) -> tuple:
         """What flights must have in common to be stacked: the tree of the model, and its shapes and dtypes."""
@@ -107,7 +108,8 @@ class Scenario:
         path = np.asarray(list(PATHS).index(self.reference), np.int32)
         for agent, seed in self.keys():
             bandwidth = np.asarray(self.bandwidth * agent.observer, np.float32)
-            yield Flight(lane(self.models[agent], seed), vehicle, shares, path, home, bandwidth)
+            noise = np.asarray(seed, np.int32)
+            yield Flight(lane(self.models[agent], seed), vehicle, shares, path, home, bandwidth, noise)
 
 
 @dataclass(frozen=True)
@@ -140,12 +142,20 @@ def results_of(scenarios: Sequence[Flown]) -> Results:
 
 
 def flown(
-    scenarios: list[Scenario], controller: Controller, seconds: float, folder: Path, console: Console, fresh: bool
+    scenarios: list[Scenario],
+    controller: Controller,
+    seconds: float,
+    folder: Path,
+    console: Console,
+    fresh: bool,
+    hardware: Hardware | None = None,
 ) -> list[Flown]:
     """The results of all scenarios in flights of so many seconds, found in the cache `folder` or flown now.
 
-    With `fresh`, results of other versions are moved aside and flown again.
+    The hardware is that of `control.fly`; the controller must have its rotor lag. With `fresh`, results of other
+    versions are moved aside and flown again.
     """
+    hardware = Hardware() if hardware is None else hardware
     references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
     starts = references[:, 0].copy()
     spinning = list(PATHS).index("upset")
@@ -157,10 +167,12 @@ def flown(
     programs = {}
     for key, n in most.items():
         width = min(WIDTH.get(jax.default_backend(), -(-n // jax.device_count())), n)
-        programs[key] = LaneMap(partial(_simulate, controller), width, min_capacity=n)
+        programs[key] = LaneMap(partial(_simulate, controller, hardware), width, min_capacity=n)
     found = []
     for scenario in scenarios:
-        path = folder / f"{scenario.name.replace(' ', '-')}-{_identity(scenario, controller, shared)[:16]}.npz"
+        path = (
+            folder / f"{scenario.name.replace(' ', '-')}-{_identity(scenario, controller, hardware, shared)[:16]}.npz"
+        )
         about, arrays = hosts.from_first(lambda path=path: _cached(path, console, fresh))
         origin = "as found in the cache"
         if about is None:
@@ -175,10 +187,12 @@ def flown(
     return found
 
 
-def _identity(scenario: Scenario, controller: Controller, shared: tuple) -> str:
+def _identity(scenario: Scenario, controller: Controller, hardware: Hardware, shared: tuple) -> str:
+    """What the results depend on; without hardware as it was before there was any, so that they are found again."""
     models = list(scenario.models.values())
     fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(controller), *map(describe, models)]
-    flights = [flight._replace(model=None) for flight in scenario.flights()]
+    fixed += [asdict(hardware)] if hardware != Hardware() else []
+    flights = [flight._replace(model=None, seed=None) for flight in scenario.flights()]
     return digest(fixed, named_leaves({"flights": flights, "models": models, "shared": shared}))
 
 
@@ -220,7 +234,11 @@ def _fly(
 
 
 def _simulate(
-    controller: Controller, flight: Flight, references: Float[Array, "k n 13"], starts: Float[Array, "k 13"]
+    controller: Controller,
+    hardware: Hardware,
+    flight: Flight,
+    references: Float[Array, "k n 13"],
+    starts: Float[Array, "k 13"],
 ) -> dict[str, Array]:
     """Fly one flight: `Performance`, open-loop costs of some calls and their relative error, and states."""
     offset = jnp.zeros(STATE_SIZE).at[POSITION].set(flight.home)
@@ -235,8 +253,10 @@ def _simulate(
     def plant(x, u, t):
         return truth.step(x, u, t, controller.period)
 
-    own = control.fly(plant, flight.model, reference, x0, controller, flight.bandwidth)
-    costs = control.open_loop_costs(plant, own, reference, controller, range(CALL_EVERY, len(own.u), CALL_EVERY))
+    key = jax.random.fold_in(jax.random.key(flight.seed), flight.path) if any(hardware.noise) else None
+    own = control.fly(plant, flight.model, reference, x0, controller, flight.bandwidth, hardware=hardware, key=key)
+    calls = range(CALL_EVERY, len(own.u) - hardware.delay(controller.period), CALL_EVERY)
+    costs = control.open_loop_costs(plant, own, reference, controller, calls, hardware)
     return {
         **vars(control.performance(own, reference, controller)),
         "promised": costs.predicted,

@@ -119,6 +119,8 @@ class RealFlightConfig(Run):
     vehicle file, or else what real multirotors need."""
     hidden: Count = 32
     """Hidden units of the network."""
+    activation: Literal["relu", "softplus", "tanh", "silu"] = "relu"
+    """Their activation. All but ReLU suit solvers of optimal control problems."""
     stride: Count = 5
     """Samples between the starts of two training windows of the source; for the target it is 1."""
     validation: Count = 200

@@ -143,7 +143,9 @@ def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:
     return FrozenRates(body) if recipe.physics == "frozen_rates" else body
 
 
-def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds: int) -> AbstractVectorField:
+def untrained(
+    name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds: int, activation: str = "relu"
+) -> AbstractVectorField:
     """Stack the untrained fields of all seeds; an untrained hybrid equals its physics."""
     hover = InputScaling(model.vehicle.hover_speed, model.vehicle.hover_speed / 10)
     physics = physics_of(model, recipe)
@@ -155,7 +157,7 @@ def untrained(name: str, model: VehicleModel, recipe: Recipe, hidden: int, seeds
         if name == "physics_only":
             return physics
         key = jax.random.fold_in(jax.random.key(seed), NETWORK)
-        network = zero_output(make_residual(key, hidden=hidden, **options))
+        network = zero_output(make_residual(key, hidden=hidden, activation=activation, **options))
         return Hybrid(Kinematics() if name == "no_physics" else physics, network)
 
     return jax.device_get(eqx.filter_jit(eqx.filter_vmap(build))(np.arange(seeds)))

@@ -94,7 +94,8 @@ def train_on_source(
     experiment: Experiment, name: str, model: str, recipe: str, data: TrainingData, seeds: int, best_epochs: Any = ()
 ) -> TrainedModel:
     """Train a model on all windows before the change, one run per seed; `best_epochs` is that of `in_stages`."""
-    fields = models.untrained(model, experiment.before, RECIPES[recipe], experiment.config.hidden, seeds)
+    config = experiment.config
+    fields = models.untrained(model, experiment.before, RECIPES[recipe], config.hidden, seeds, config.activation)
     start = TrainedModel(model, "source_only", recipe, fields, range(seeds), [np.arange(len(data.train))] * seeds)
     frozen = CHANGE if "target" in experiment.logs else ()
     steps = [replace(step, frozen=(*step.frozen, *frozen)) for step in RECIPES[recipe].source]
@@ -125,7 +126,8 @@ def adapt(
     config, how = experiment.config, RECIPES[start.recipe]
     fields, steps = start.fields, how.adaptation
     if mode == "scratch":
-        fields, steps = models.untrained(start.model, experiment.after, how, config.hidden, len(start)), how.scratch
+        anew = config.hidden, len(start), config.activation
+        fields, steps = models.untrained(start.model, experiment.after, how, *anew), how.scratch
     seeds = [seed for _ in sizes for seed in start.seeds]
     sizes = [min(size, len(data.train)) for size in sizes]  # fewer where a flight is left out of few
     subsets = [sampled_indices(data.train.sizes, size, config.draw, s) for size in sizes for s in start.seeds]

@@ -17,8 +17,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
-from hybrid_jax.control.rotor_lag import lag_matrix, rotor_speeds
-from hybrid_jax.control.sensitivities import advance, condensed
+from hybrid_jax.control.sensitivities import advance_lagged, condensed, condensed_lagged
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, Input, State
@@ -212,9 +211,8 @@ class Controller:
 
     def _step(self, model: AbstractVectorField, start: _Start, variables: Float[Array, " rotors"]) -> _Start:
         """State and rotor speeds at the end of an interval."""
-        x, speeds = start
-        mean, speeds = rotor_speeds(speeds, self._speeds(jnp.tanh(variables)), self.rotor_lag, self.interval)
-        return advance(model, x, mean, self.interval, self.unit_quaternion), speeds
+        command = self._speeds(jnp.tanh(variables))
+        return advance_lagged(model, *start, command, self.rotor_lag, self.interval, self.unit_quaternion)
 
     def _cost(self, reference, states: Float[Array, "t 13"], variables: Float[Array, "t rotors"]) -> Scalar:
         return plan_cost(self.weights, reference, states, jnp.tanh(variables))
@@ -258,11 +256,9 @@ class Controller:
         slope = 1 - jnp.square(share)  # of the tanh
         commands, to_speed = self._speeds(share), self._range()[1] * slope
         if self.rotor_lag:
-            kept, mixed = (part.astype(x.dtype) for part in lag_matrix(self.rotor_lag, self.interval, self.steps))
-            speeds, ones = jnp.asarray(kept[:, None] * before + mixed @ commands), jnp.ones_like(commands)
-            slopes = condensed(model, x[:-1], speeds, ones, self.interval, self.unit_quaternion)
-            slopes = slopes.reshape(self.steps, -1, *commands.shape)
-            sensitivities = (jnp.einsum("tskr,kj->tsjr", slopes, mixed) * to_speed).reshape(self.steps, -1, share.size)
+            lagged = self.rotor_lag, self.interval, self.unit_quaternion
+            slopes = condensed_lagged(model, x[:-1], before, commands, *lagged)
+            sensitivities = (slopes * to_speed).reshape(self.steps, -1, share.size)
         else:
             sensitivities = condensed(model, x[:-1], commands, to_speed, self.interval, self.unit_quaternion)
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)

@@ -228,17 +228,36 @@ class OpenLoopCosts(NamedTuple):
 
 
 def open_loop_costs(
-    plant: Plant, flight: Flight, reference: Float[Array, "n 13"], controller: Controller, calls: Sequence[int]
+    plant: Plant,
+    flight: Flight,
+    reference: Float[Array, "n 13"],
+    controller: Controller,
+    calls: Sequence[int],
+    hardware: Hardware | None = None,
 ) -> OpenLoopCosts:
-    """Predicted and actual open-loop cost of the plans of these calls."""
+    """Predicted and actual open-loop cost of the plans of these calls, with the hardware that the flight had.
+
+    A plan begins when its command arrives, so that a call must be earlier than the end by the latency.
+    """
+    hardware = Hardware() if hardware is None else hardware
+    lag, delay = hardware.rotor_lag, hardware.delay(controller.period)
+
+    def following(speeds, command):
+        mean, speeds = rotor_speeds(speeds, command, lag, controller.period)
+        return speeds, (mean, speeds)
+
+    first = controller.speeds(controller.begin())[0].astype(flight.u.dtype)
+    arriving = jnp.concatenate([jnp.tile(first, (delay, 1)), flight.u])
+    rotors = jnp.concatenate([first[None], jax.lax.scan(following, first, arriving)[1][1]])  # at each moment
 
     def advance(x, inputs):
         x = plant(x, *inputs)
         return x, x
 
     def actual_cost(i: Scalar) -> Scalar:
-        plan = jax.tree.map(lambda leaf: leaf[i], flight.plans)
-        speeds = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
+        plan, i = jax.tree.map(lambda leaf: leaf[i], flight.plans), i + delay
+        commands = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
+        speeds = jax.lax.scan(following, rotors[i], commands)[1][0] if lag else commands
         times = controller.period * (i + jnp.arange(len(speeds)))
         states = jax.lax.scan(advance, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
         return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))

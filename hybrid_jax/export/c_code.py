@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, linearize
-from hybrid_jax.export.c_loops import Entry, Tables, needed, stores, used
+from hybrid_jax.export.c_loops import Entry, Tables, declared, needed, stores, used
 from hybrid_jax.export.c_operations import CTranslation, column
 from hybrid_jax.export.c_templates import HEADER, HELPERS, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
@@ -97,10 +97,10 @@ def body_of(
     sizes = [like.shape[0] for like in likes]
     arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip(inputs, sizes, strict=True)]
     results = translation.run(jax.make_jaxpr(function)(*likes), arguments, sizes)
-    kept = needed(translation.statements, frozenset().union(*map(used, results)))
-    lines = [statement.text for statement in kept]
-    lines += [tables.filled(stores(out, one, tables), []) for out, one in zip(outputs, results, strict=True)]
-    return "\n".join(f"    {line}" for text in lines for line in text.splitlines())
+    read = frozenset().union(*map(used, results))
+    end = [tables.filled(stores(out, one, tables), []) for out, one in zip(outputs, results, strict=True)]
+    code = declared(needed(translation.statements, read), read, end)
+    return "\n".join(f"    {line}" for line in code.splitlines())
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:

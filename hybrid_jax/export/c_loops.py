@@ -1,5 +1,7 @@
 """Pieces of C: tables of numbers, loops over arrays, and statements of which those that nothing uses are left out."""
 
+import re
+from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -27,6 +29,7 @@ class Statement:
     defines: str
     uses: frozenset[str]
     text: str
+    array: tuple[str, int] | None = None  # type and size of the array that it defines, which is still to be declared
 
 
 @dataclass(frozen=True)
@@ -202,3 +205,24 @@ def needed(statements: Sequence[Statement], results: frozenset[str]) -> list[Sta
             kept.append(statement)
             wanted |= statement.uses
     return kept[::-1]
+
+
+def declared(statements: Sequence[Statement], results: frozenset[str], end: Sequence[str]) -> str:
+    """The code of statements and of what stands at the end, with arrays declared.
+
+    An array takes the place of one of its type and size that is not read any more: compilers keep each on the stack.
+    """
+    last = {name: i for i, statement in enumerate(statements) for name in statement.uses}
+    kinds = {statement.defines: statement.array for statement in statements if statement.array}
+    places, spare, lines = {}, defaultdict(list), []
+    for i, statement in enumerate(statements):
+        if (kind := statement.array) is not None:
+            if not spare[kind]:
+                lines.append(f"{kind[0]} {statement.defines}[{kind[1]}];")
+                spare[kind].append(statement.defines)
+            places[statement.defines] = spare[kind].pop()
+        lines.append(statement.text)
+        for name in statement.uses - results:
+            if name in kinds and last[name] == i:
+                spare[kinds[name]].append(places[name])
+    return re.sub(r"\ba\d+\b", lambda found: places.get(found[0], found[0]), "\n".join([*lines, *end]))

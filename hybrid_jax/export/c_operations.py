@@ -199,11 +199,9 @@ class CTranslation(Translation[np.ndarray]):
     def _define(self, size: int, code: c_loops.Code, logical: bool = False) -> np.ndarray:
         """A new array that the code fills."""
         name, kind = self.tables.name("a"), "int" if logical else "real"
-        text = f"{kind} {name}[{size}];\n" + self.tables.filled(
-            code.text, [one.text for one in code.operands], out=name
-        )
+        text = self.tables.filled(code.text, [one.text for one in code.operands], out=name)
         uses = code.uses.union(*(one.uses for one in code.operands))
-        self.statements.append(c_loops.Statement(name, uses, text))
+        self.statements.append(c_loops.Statement(name, uses, text, (kind, size)))
         return column(Entry(name, i, logical) for i in range(size))
 
     @staticmethod

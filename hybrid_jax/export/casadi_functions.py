@@ -62,17 +62,19 @@ def acados_model(
     name: str = "model",
     smooth: float | None = None,
 ) -> dict[str, Any]:
-    """The attributes of an `AcadosModel` of acados: name, x, u, xdot, f_expl_expr and f_impl_expr = xdot − f(x, u).
+    """The attributes of an `AcadosModel` of acados: name, x, u, xdot, p, f_expl_expr and f_impl_expr = xdot − f(x, u).
 
     Set them one by one: `model = AcadosModel(); [setattr(model, *one) for one in acados_model(field).items()]`. acados
-    integrates by itself, so there is no step. Arguments and errors as of `casadi_function`.
+    integrates by itself, so there is no step; p is empty, as the parameters are numbers. Arguments and errors as of
+    `casadi_function`.
     """
     function = casadi_function(field, state_size=state_size, input_size=input_size, name=name, smooth=smooth)
     import casadi as ca
 
     x, u = ca.SX.sym("x", function.numel_in(0)), ca.SX.sym("u", function.numel_in(1))
     xdot, slope = ca.SX.sym("xdot", function.numel_out(0)), function(x, u)
-    return {"name": name, "x": x, "u": u, "xdot": xdot, "f_expl_expr": slope, "f_impl_expr": xdot - slope}
+    expressions = {"f_expl_expr": slope, "f_impl_expr": xdot - slope}
+    return {"name": name, "x": x, "u": u, "xdot": xdot, "p": ca.SX.sym("p", 0), **expressions}
 
 
 def _function(

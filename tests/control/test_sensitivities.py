@@ -9,7 +9,8 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.control import advance
-from hybrid_jax.control.sensitivities import advance_with_jacobian
+from hybrid_jax.control.rotor_lag import stage_shares, step_of
+from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed_lagged
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import ForcedBody
@@ -81,3 +82,39 @@ def test_jacobian_of_a_step_equals_autodiff(name, unit_quaternion):
         found, expected = jax.jit(jax.vmap(both, in_axes=(None, 0, 0)))(field, x, u)
         for one, other in zip(found, expected, strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9 * float(jnp.abs(other).max()))
+
+
+@pytest.mark.parametrize("lag", [0.005, 0.03, 0.2, 4.9, 5.1])
+def test_a_step_is_exact_for_a_chain_of_integrators_of_a_lagging_input(lag):
+    start, dt = jnp.array([0.3, -0.2, 0.1]), DT
+    with jax.enable_x64(True):
+        shares = stage_shares(lag, dt)
+        found = step_of(lambda x, f: jnp.stack([x[1], x[2], f]), jnp.asarray(start, float), shares, dt)
+    s = np.linspace(0, dt, 20_001)
+    moments = [np.trapezoid((dt - s) ** k / (1, 1, 2)[k] * np.exp(-s / lag), s) for k in (2, 1, 0)]
+    a, b, c = np.asarray(start, float)
+    expected = np.array([a + b * dt + c * dt**2 / 2, b + c * dt, c]) + moments
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("unit_quaternion", [True, False])
+def test_derivatives_by_commands_of_lagging_rotors_equal_autodiff(unit_quaternion):
+    lag, dt, body = 0.04, 0.05, FIELDS["physics"]()
+
+    def states(commands, x, speeds):
+        def interval(start, command):
+            start = advance_lagged(body, *start, command, lag, dt, unit_quaternion)
+            return start, start[0]
+
+        return jax.lax.scan(interval, (x, speeds), commands)[1]
+
+    @jax.jit
+    def both(commands, x, speeds):
+        path = jnp.concatenate([x[None], states(commands, x, speeds)])
+        found = condensed_lagged(body, path[:-1], speeds, commands, lag, dt, unit_quaternion)
+        return found, jax.jacfwd(states)(commands, x, speeds)
+
+    with jax.enable_x64(True):
+        x, u = map(jnp.asarray, samples())
+        found, expected = both(u, x[0], u[1])
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-6 * np.abs(np.asarray(expected)).max())

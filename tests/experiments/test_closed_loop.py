@@ -17,12 +17,14 @@ from rich.console import Console
 from smoke import command, experiments
 
 import hybrid_jax as hj
+from experiments.closed_loop.__main__ import head
+from experiments.closed_loop.config import ClosedLoopConfig
 from experiments.closed_loop.flights import PATHS, Scenario, flown
 from experiments.closed_loop.models import as_stack, fused, true_field, with_statistics_of
 from experiments.closed_loop.results import TAGS, Agent
 from experiments.closed_loop.timing import use_one_core
 from experiments.reporting.results import Results
-from hybrid_jax.control import Controller, fly, performance, sample
+from hybrid_jax.control import Controller, Hardware, fly, performance, sample
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.networks.normalisation import BatchNorm
@@ -124,6 +126,28 @@ def test_true_model_tracks_better_than_the_nominal_one_and_predicts_its_cost(fli
     # Plans have steps of 0.05 s, the simulation of 0.01 s.
     assert abs(rows["oracle"]["excess"]) < 0.02
     assert not rows["oracle"]["crashed"]
+
+
+@pytest.mark.slow
+def test_sensors_and_rotors_act_with_a_noise_for_each_seed(models, flights, tmp_path):
+    noisy = Hardware(latency=0.01, rotor_lag=0.03, noise=(0.001, 0.002, 0.02, 0.02))
+    own = {Agent("hybrid"): models[0][Agent("hybrid")]}  # two seeds of the same model
+    options = [Scenario(PARAMETER_SHIFT, "figure_eight", 0.0, own, 10.0)], Controller(hj.IRIS, rotor_lag=0.03), SECONDS
+    (found,) = flown(*options, tmp_path, Console(quiet=True), False, noisy)
+    exact, first, second = (each.states(Agent("hybrid"), i) for each, i in ((flights, 0), (found, 0), (found, 1)))
+    assert np.abs(first - exact)[-1].max() > 1e-3
+    assert np.abs(first - second)[-1].max() > 1e-3
+
+
+def test_hardware_is_off_by_default_and_the_controller_knows_it():
+    exact, late = ClosedLoopConfig(), ClosedLoopConfig(noise=2.0, latency=0.02, rotor_lag=0.03)
+    assert (exact.hardware(), exact.controller()) == (Hardware(), CONTROLLER)
+    assert late.hardware() == Hardware(0.02, 0.03, (0.002, 0.004, 0.04, 0.04))
+    assert late.controller().rotor_lag == 0.03
+    assert "without noise" in head(exact)
+    assert "Latency 20 ms, lag of the rotors 30 ms" in head(late)
+    with pytest.raises(ValueError, match="latency must be a multiple"):
+        ClosedLoopConfig(latency=0.015)
 
 
 @pytest.fixture(scope="module")

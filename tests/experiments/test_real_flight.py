@@ -14,7 +14,7 @@ from recorded import CONFIG, DT, LOGS, OTHERS, SAMPLES, samples, windows_of_fold
 from rich.console import Console
 
 import hybrid_jax
-from experiments.real_flight import study
+from experiments.real_flight import study, train
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
 from experiments.real_flight.logs import LogSet, load_logs, make_folds, non_overlapping, sampled_indices
@@ -29,6 +29,7 @@ from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import LogWindows, count_windows, cut_windows, require_common_interval
 from hybrid_jax.integrate import rollout
+from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.training.channels import ChannelLoss, channels_from
 from hybrid_jax.vehicle import IRIS
 
@@ -105,6 +106,17 @@ def test_random_samples_are_nested_and_contiguous_ones_are_runs():
             assert sum(0 < len(run) < size for run, size in zip(runs, sizes, strict=True)) <= 1
     begins = {int(sampled_indices([3, 6, 4], 4, "contiguous", seed)[0]) for seed in range(200)}
     assert begins == {3, 4, 5, 9}  # all that leave room in one flight
+
+
+def test_networks_have_the_activation_of_the_options(monkeypatch):
+    monkeypatch.setattr(train, "in_stages", lambda *given: given[2])  # the models as training would begin
+    experiment = Experiment(replace(CONFIG, activation="tanh"), MODEL, MODEL, {}, DT, None)
+    windows = cut_windows(LOGS, 10, 5)
+    data = TrainingData(windows, windows.windows, None, len(windows))
+    first = train.train_on_source(experiment, "source", "hybrid", "staged", data, 1)
+    for each in (first, train.adapt(experiment, "target", "scratch", first, data, [20])):
+        nodes = jax.tree.leaves(each.fields, is_leaf=lambda node: isinstance(node, ResidualNetwork))
+        assert [node.activation for node in nodes if isinstance(node, ResidualNetwork)] == ["tanh"]
 
 
 def test_non_overlapping_windows_share_no_sample():

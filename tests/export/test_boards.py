@@ -13,7 +13,7 @@ from compiled import C99, Library, needs_compiler, run
 from fields import KEY, samples
 
 import hybrid_jax as hj
-from hybrid_jax.export import export_c
+from hybrid_jax.export import export_adaptation_c, export_c
 
 BOARD = Path(__file__).parent / "board"
 TOOLS = ("arm-none-eabi-gcc", "qemu-system-arm")
@@ -76,3 +76,17 @@ def test_it_fits_and_finds_the_same(processor, paper):
         f"\n{processor}: flash {flash} B, static RAM {sum(ram)} B; a step: {step} instructions, {stack} B of stack; "
         f"with Jacobians: {jacobian} instructions, {stack_of_jacobian} B"
     )
+
+
+def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
+    """Its covariance is corrected 13 times; with an array for each it would take 130 KB."""
+    adaptation = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, 1e-3, disturbance=2.0)
+    source = export_adaptation_c(tmp_path, adaptation)[1]
+    target = ("-mcpu=cortex-m4", f"-mfpu={BOARDS['cortex-m4'][0]}", "-mfloat-abi=hard", "-mthumb", "-O2")
+    compiled = tmp_path / "filter.o"
+    run("arm-none-eabi-gcc", *C99, *target, "-fstack-usage", "-c", source, "-o", compiled)
+    flash, *ram = (int(one) for one in run("arm-none-eabi-size", compiled).splitlines()[1].split()[:3])
+    stack = max(int(line.split("\t")[1]) for line in compiled.with_suffix(".su").read_text().splitlines())
+    print(f"\nfilter of physics: flash {flash} B, static RAM {sum(ram)} B, {stack} B of stack")
+    assert sum(ram) == 0
+    assert stack < 20_000

@@ -75,11 +75,23 @@ def test_a_model_of_acados_has_the_field_explicitly_and_implicitly():
     model, (x, u) = acados_model(field_of("hybrid, norm none"), name="iris"), (part[0] for part in samples())
     assert (model["name"], model["x"].shape, model["u"].shape) == ("iris", (13, 1), (4, 1))
     expected = casadi_function(field_of("hybrid, norm none"))(x, u)
-    explicit = ca.Function("e", [model["x"], model["u"]], [model["f_expl_expr"]])
-    implicit = ca.Function("i", [model["x"], model["xdot"], model["u"]], [model["f_impl_expr"]])
-    close(explicit(x, u), expected)
-    assert abs(implicit(x, expected, u)).full().max() == 0
-    assert abs(implicit(x, expected + 1, u) - 1).full().max() < 1e-9
+    x_, u_, xdot, p, slope = (model[key] for key in ("x", "u", "xdot", "p", "f_expl_expr"))
+    assert p.is_empty()
+    assert all(one.is_valid_input() for one in (x_, u_, xdot))
+    explicit = ca.Function("e", [x_, u_, p], [slope])
+    implicit = ca.Function("i", [x_, xdot, u_, p], [model["f_impl_expr"]])
+    close(explicit(x, u, []), expected)
+    assert abs(implicit(x, expected, u, [])).full().max() == 0
+    assert abs(implicit(x, expected + 1, u, []) - 1).full().max() < 1e-9
+    # Its explicit integrators ask for directions Sx and Su, its implicit ones for Jacobians.
+    seeds = np.random.default_rng(0).normal(size=(13, 17))
+    forward = ca.Function("v", [x_, u_, p], [ca.jtimes(slope, x_, ca.DM(seeds)) + ca.jacobian(slope, u_) @ seeds[:4]])
+    whole = ca.Function("j", [x_, xdot, u_, p], [ca.jacobian(model["f_impl_expr"], one) for one in (x_, xdot, u_)])
+    by_x, by_xdot, by_u = (part.full() for part in whole(x, expected, u, []))
+    np.testing.assert_allclose(forward(x, u, []), -by_x @ seeds - by_u @ seeds[:4], rtol=1e-9, atol=1e-9)
+    np.testing.assert_array_equal(by_xdot, np.eye(13))
+    with jax.enable_x64(True):
+        close(-by_x, jax.jacfwd(double(field_of("hybrid, norm none")))(jnp.asarray(x), jnp.asarray(u)))
 
 
 def test_it_is_the_same_after_a_file(tmp_path):
