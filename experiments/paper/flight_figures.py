@@ -112,7 +112,7 @@ def _draw_predicted_paths(axes: Any, truth: States, models: Mapping[str, States]
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
     axes.locator_params(nbins=4)
-    axes.set_box_aspect(half, zoom=1.1)  # room for the labels
+    axes.set_box_aspect(half, zoom=0.9)  # room for the labels
 
 
 def _draw_space(axes: Any, states: States) -> None:
