@@ -107,8 +107,7 @@ class OnlineAdaptation(AbstractEstimator):
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
         zero, start = jnp.zeros((), x.dtype), jnp.full(p, self.initial**2, x.dtype)
         covariance = jnp.diag(jnp.concatenate([self._variances(x), start]))
-        theta = jnp.zeros(p, x.dtype)
-        sums, long = jnp.zeros((2, p), x.dtype), zero + 1e3
+        theta, sums, long = jnp.zeros(p, x.dtype), jnp.zeros((2, p), x.dtype), zero + 1e3
         return OnlineState(
             x, theta, covariance, theta, start, sums, sums, zero + 1, long, zero, x, none, none, zero, zero
         )
