@@ -11,6 +11,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
+from experiments.online.config import NOISE
 from experiments.runner import command
 from experiments.runner.options import NotNegative, Positive, check_numbers
 from hybrid_jax import AbstractVectorField, Model, OnlineAdaptation, checks, load, rotation
@@ -34,8 +35,8 @@ from hybrid_jax.state import INPUT_SIZE, STATE_NAMES, STATE_SIZE
 NAME = "export"
 COUNT = 10_000  # states over which a smooth model is compared
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
-# Of a rigid body: what motion capture and a gyroscope measure, and what docs/howto/online.md found to work.
-NOISE, PROCESS = (0.001, 0.002, 0.02, 0.02), (0.0, 0.0, 0.003, 0.005)
+# Of a rigid body, as in docs/howto/online.md; NOISE is that of motion capture and a gyroscope.
+PROCESS = (0.0, 0.0, 0.003, 0.005)
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
 
 

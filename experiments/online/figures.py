@@ -135,7 +135,7 @@ def animate(
     everywhere = np.concatenate([place[:, :2] for place, _ in flights.values()] + [wanted[:count, :2]])
     low, high = everywhere.min(axis=0) - 0.3, everywhere.max(axis=0) + 0.3
     above.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    above.legend(loc="upper center", fontsize=7)
+    figure.legend(loc="outside lower left", ncols=3, fontsize=7)
 
     def frame(i: int):
         t = (i - setting.periods) * setting.period

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, get_args
 
 from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS, PHYSICS_ONLY
-from experiments.runner.options import Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
+from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.training.loss import REGULARISERS
 
@@ -117,7 +117,7 @@ class Config(Run):
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
     norm: Literal["batch", "layer", "none"] = "batch"
     """Normalisation of f_d's hidden layer."""
-    activation: Literal["relu", "softplus", "tanh", "silu"] = "relu"
+    activation: Activation = "relu"
     """Activation of f_d's hidden layer. All but ReLU suit solvers of optimal control problems."""
     residual_inputs: ResidualInputs = "all"
     """Inputs of f_d from the state. no_xy: without p_x, p_y. no_xy_yaw: without yaw too. near_ground: also each rotor's

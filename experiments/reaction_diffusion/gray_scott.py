@@ -20,13 +20,13 @@ NEW = tuple((f, k) for f in (0.033, 0.036) for k in (0.059, 0.061))
 GUESS = (0.0345, 0.060)  # F and k in all environments at the start
 TRAIN, ADAPT, TEST = 30, 31, 32  # first numbers of the seeds of data
 EVERY = 3  # intervals between the windows that are trained on
-# Most Gauss–Newton steps, first with F and k held at the guess: they would stand for the reaction that the network does
-# not yet know, and come back slowly.
-STAGES = {"F and k held": 20, "F and k free": 35}
+# Whether F and k are held at the guess, and most Gauss–Newton steps: at first they would stand for the reaction that
+# the network does not yet know, and come back slowly.
+STAGES = ((True, 20), (False, 35))
 UNITS = 16  # of the network, at most --hidden
 SHARE = 3  # test trajectories of an environment: --test over this
 SCALING = ChannelScaling((0.6, 0.15), (0.3, 0.15), (0.02,))
-RESIDUAL, SOLVED = "residual", "adapted"
+SOLVED = "adapted"
 
 
 def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
@@ -36,8 +36,8 @@ def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
     return [], {"weights": weights(hj.Hybrid(start.physics, found.residual) if held else found)}
 
 
-def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
-    """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
+def source_model(config: Config, jobs: Jobs) -> Any:
+    """A hybrid trained on one trajectory in each of the four environments, with F and k of each."""
     parts = [patterns(gray_scott(TRAINED_IN, reacts=True), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
     physics = gray_scott([GUESS] * len(TRAINED_IN), reacts=False)
     data = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(pieces(part, EVERY) for part in parts))
@@ -46,10 +46,16 @@ def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]
     network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)
     # Zero at first, or 40 s of a wrong reaction hide the right one.
     source: Any = hj.Hybrid(physics, Conversion(zero_output(network), physics.grid))
-    for stage, most in STAGES.items():
-        train = partial(trained, source, data, min(most, config.steps), held=stage == "F and k held")
-        found = jobs(f"{PART}: source in {len(data)} windows, {stage}", train)[1]
-        source = with_weights(source, found["weights"])
+    for held, most in STAGES:
+        name = f"{PART}: source in {len(data)} windows, F and k {'held' if held else 'free'}"
+        train = partial(trained, source, data, min(most, config.steps), held)
+        source = with_weights(source, jobs(name, train)[1]["weights"])
+    return source
+
+
+def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
+    """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
+    source = source_model(config, jobs)
     rows, shown = [], {}
     for index, environment in enumerate(NEW):
 

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from experiments.real_flight.models import Model, RecipeName
-from experiments.runner.options import Count, NotNegative, Positive, Run, check_numbers, distinct
+from experiments.runner.options import Activation, Count, NotNegative, Positive, Run, check_numbers, distinct
 from hybrid_jax import checks
 from hybrid_jax.dynamics.vehicle_file import check_learned
 
@@ -119,7 +119,7 @@ class RealFlightConfig(Run):
     vehicle file, or else what real multirotors need."""
     hidden: Count = 32
     """Hidden units of the network."""
-    activation: Literal["relu", "softplus", "tanh", "silu"] = "relu"
+    activation: Activation = "relu"
     """Their activation. All but ReLU suit solvers of optimal control problems."""
     stride: Count = 5
     """Samples between the starts of two training windows of the source; for the target it is 1."""

@@ -16,6 +16,7 @@ Count = Annotated[int, checks.count]
 CountFromZero = Annotated[int, partial(checks.count, least=0)]
 Positive = Annotated[float, checks.positive]
 NotNegative = Annotated[float, checks.not_negative]
+Activation = Literal["relu", "softplus", "tanh", "silu"]
 
 # Options that do not affect the results.
 UNFIXED = ("out", "cache", "fresh", "paper", "saving", "distributed", "coordinator", "processes", "process_id")

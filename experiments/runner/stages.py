@@ -1,4 +1,4 @@
-"""Training sweeps with a cache: a finished sweep is loaded, an interrupted one is resumed, any other is run."""
+"""Sweeps and other jobs with a cache: what is finished is loaded, what was interrupted goes on, any other is run."""
 
 import json
 import time
@@ -179,7 +179,7 @@ def stages_of(config: Run, console: Console) -> Stages:
 
 
 def _lines(path: Path) -> list[tuple[float, list[Row]]]:
-    """Seconds and rows of each line; what follows a line that a kill cut short is deleted with it."""
+    """Seconds and rows of each line; a last line that a kill cut short is deleted."""
     found, text = [], path.read_bytes() if path.exists() else b""
     whole = text[: text.rfind(b"\n") + 1]
     if whole != text and hosts.is_main_process():
@@ -194,6 +194,7 @@ def _lines(path: Path) -> list[tuple[float, list[Row]]]:
 
 
 def _identity_of_parts(inputs: Sequence[Any]) -> str:
+    """Of the inputs and of our code, as inputs do not say what is done with them: any edit makes the parts anew."""
     sources = [source_digest(package) for package in ("hybrid_jax", "experiments")]
     fixed: list[Any] = [RECIPE, *sources, versions(*FINISHED_BY)]
     arrays: dict[str, Any] = {}
