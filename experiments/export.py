@@ -149,7 +149,7 @@ def _adaptation(config: Config, field: AbstractVectorField, dt: float) -> Online
         _of_states("process", options.process or PROCESS * rigid or (0,), d),
     )
     if options.disturbance and not rigid:
-        raise ValueError("--adaptation.disturbance is that of a rigid body, which the model has not")
+        raise ValueError("--adaptation.disturbance is that of a rigid body, and the model is none")
     disturbance = options.disturbance or DISTURBANCE * rigid
     if len(disturbance) not in (0, 1, 6):
         raise ValueError(f"--adaptation.disturbance must be 1 or 6 numbers, got {len(disturbance)}")

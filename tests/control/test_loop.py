@@ -193,7 +193,7 @@ def test_the_guide_s_example_runs(capsys):
 
 def test_a_controller_that_knows_the_lag_predicts_its_costs_and_pays_less():
     """It need not track closer: position costs beside rates and changes of inputs. Without lag and latency, too, the
-    fast figure-8 is flown within 2.4 mm; who ignores them flies within 1.7 mm, by inputs that change more."""
+    position RMSE is 2.4 mm; a controller that ignores them has 1.7 mm, by inputs that change more."""
     late, reference = control.Hardware(latency=0.02, rotor_lag=0.05), reference_of("fast eight")
 
     def flown(own):
