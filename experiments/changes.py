@@ -24,7 +24,7 @@ from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.options import distinct
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Stages, stages_of
+from experiments.runner.stages import Stages, identity_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors
@@ -151,7 +151,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
         return [row(seed, i) for seed in seeds for i in range(len(names))]
 
     jobs = [partial(of_draw, draw) for draw in range(config.draws)]
-    found = stages.kept_parts(f"adapt {domain.name}", jobs, (config.described(), fields, target))
+    found = stages.kept_parts(f"adapt {domain.name}", jobs, identity_of(config.described(), fields, target))
     return found + compared(fields, config, stages, target)
 
 

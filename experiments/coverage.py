@@ -22,7 +22,7 @@ from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Stages, stages_of
+from experiments.runner.stages import Stages, identity_of, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
 from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
@@ -138,7 +138,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
 
     name = f"intervals {domain.name}, noise {config.noise:g}"
     jobs = [partial(of_draw, draw) for draw in range(config.draws)]
-    return stages.kept_parts(name, jobs, (config.described(), fields, flights))
+    return stages.kept_parts(name, jobs, identity_of(config.described(), fields, flights))
 
 
 @partial(kept_jit, compiler_options=FAST_COMPILE)

@@ -7,7 +7,6 @@ from rich.console import Console
 from experiments.reaction_diffusion import forecast, gray_scott, shifted
 from experiments.reaction_diffusion.config import PRESETS, Config
 from experiments.reaction_diffusion.figures import draw
-from experiments.reaction_diffusion.jobs import Jobs
 from experiments.reaction_diffusion.report import claims, tables
 from experiments.reaction_diffusion.systems import DT
 from experiments.reporting.claims import evaluate, verdict_table
@@ -16,7 +15,7 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.run_record import environment
-from experiments.runner.stages import stages_of
+from experiments.runner.stages import identity_of, stages_of
 
 NAME = "reaction_diffusion"
 SELECTIONS = ("preset", "parts", "cases", "shifts", "seeds", "sizes")  # options that say which jobs, not how
@@ -48,18 +47,17 @@ Partial differential equations on a periodic grid of 32 × 32 points, 2048 state
 def experiment(config: Config, console: Console) -> None:
     stages = stages_of(config, console)
     options = {name: value for name, value in config.described().items() if name not in SELECTIONS}
-    jobs = Jobs(config, stages, options)
+    kept = partial(stages.kept, identity=identity_of(options))
     rows, shown, patterns = [], {}, {}
     if "forecast" in config.parts:
-        rows, shown = forecast.study(config, jobs)
+        rows, shown = forecast.study(config, kept)
     if "shifted" in config.parts:
-        rows += shifted.study(config, jobs)
+        rows += shifted.study(config, kept)
     if "gray_scott" in config.parts:
-        more, patterns = gray_scott.study(config, jobs)
+        more, patterns = gray_scott.study(config, kept)
         rows += more
     results, out = Results(rows), config.out / NAME
     verdicts = evaluate(claims(results), results)
-    reused = f"Taken from the cache, with the seconds of the run that made them: {len(jobs.reused)} of the jobs."
     report = Report(
         experiment=NAME,
         config=config.described(),
@@ -67,7 +65,7 @@ def experiment(config: Config, console: Console) -> None:
         rows=results,
         claims=verdicts,
         figures=save_figures(out, draw(results, shown, patterns, DT), config.paper),
-        notes=[reused] * bool(jobs.reused),
+        notes=stages.notes(),
         head=HEAD.strip(),
         tables=[verdict_table(verdicts, "Goals, and the paper's claims for a PDE"), *tables(results)],
     )

@@ -8,9 +8,10 @@ import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
-from experiments.reaction_diffusion.jobs import Found, Jobs, error, pieces, predicted, weights
+from experiments.reaction_diffusion.models import error, pieces, predicted, weights
 from experiments.reaction_diffusion.systems import COARSE, STEPS, A, B, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.results import Row
+from experiments.runner.stages import Found, Kept
 from hybrid_jax.networks.normalisation import ChannelScaling
 
 PART = "forecast"
@@ -83,7 +84,7 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
     return hj.fit_gauss_newton(first, whole, max_steps=config.polish, **options).field  # pyright: ignore[reportArgumentType]
 
 
-def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
+def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
     """A row for each case and seed, and forecasts to draw: of the truth, and of models by the name of their case."""
     truth = fitzhugh_nagumo(plane(config.points))
     test = reacting(truth, config.test, (TEST, 0))
@@ -101,7 +102,7 @@ def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]
                 arrays = {"weights": weights(model)}
                 return [row], arrays | {"forecast": np.asarray(predicted(model, drawn, COARSE))}
 
-            found, arrays = jobs(f"{PART}: {case.name}, seed {seed}", work)
+            found, arrays = kept(f"{PART}: {case.name}, seed {seed}", work)
             rows += found
             if seed == 0:
                 shown[case.name] = arrays["forecast"]

@@ -8,9 +8,10 @@ import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
-from experiments.reaction_diffusion.jobs import Found, Jobs, error, pieces, predicted, weights, with_weights
+from experiments.reaction_diffusion.models import error, pieces, predicted, weights, with_weights
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
+from experiments.runner.stages import Found, Kept
 from hybrid_jax.networks import zero_output
 from hybrid_jax.networks.normalisation import ChannelScaling
 
@@ -36,7 +37,7 @@ def trained(start: Any, data: hj.Trajectories, steps: int, held: bool) -> Found:
     return [], {"weights": weights(hj.Hybrid(start.physics, found.residual) if held else found)}
 
 
-def source_model(config: Config, jobs: Jobs) -> Any:
+def source_model(config: Config, kept: Kept) -> Any:
     """A hybrid trained on one trajectory in each of the four environments, with F and k of each."""
     parts = [patterns(gray_scott(TRAINED_IN, reacts=True), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
     physics = gray_scott([GUESS] * len(TRAINED_IN), reacts=False)
@@ -49,13 +50,13 @@ def source_model(config: Config, jobs: Jobs) -> Any:
     for held, most in STAGES:
         name = f"{PART}: source in {len(data)} windows, F and k {'held' if held else 'free'}"
         train = partial(trained, source, data, min(most, config.steps), held)
-        source = with_weights(source, jobs(name, train)[1]["weights"])
+        source = with_weights(source, kept(name, train)[1]["weights"])
     return source
 
 
-def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]:
+def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
     """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
-    source = source_model(config, jobs)
+    source = source_model(config, kept)
     rows, shown = [], {}
     for index, environment in enumerate(NEW):
 
@@ -77,7 +78,7 @@ def study(config: Config, jobs: Jobs) -> tuple[list[Row], dict[str, np.ndarray]]
                 SOLVED: np.asarray(predicted(fitted, test[:1], SCOTT_COARSE)),
             }
 
-        found, arrays = jobs(f"{PART}: F and k in new environment {index}", adapt)
+        found, arrays = kept(f"{PART}: F and k in new environment {index}", adapt)
         rows += found
         shown = shown or arrays
     return rows, shown

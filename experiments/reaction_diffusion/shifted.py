@@ -6,10 +6,11 @@ import numpy as np
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
 from experiments.reaction_diffusion.forecast import GUESS, scaling
-from experiments.reaction_diffusion.jobs import Found, Jobs, error, pieces, weights, with_weights
+from experiments.reaction_diffusion.models import error, pieces, weights, with_weights
 from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
+from experiments.runner.stages import Found, Kept
 from hybrid_jax.dynamics.disturbance import physics_of, without_disturbance
 
 PART, AUTO = "shifted", "auto"
@@ -41,7 +42,7 @@ def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.Abstrac
     return result.field, result.chosen
 
 
-def study(config: Config, jobs: Jobs) -> list[Row]:
+def study(config: Config, kept: Kept) -> list[Row]:
     """A row for each shift, model, way of learning, number of trajectories and seed."""
     grid, rows = plane(config.points), []
     for seed in range(config.seeds):
@@ -53,7 +54,7 @@ def study(config: Config, jobs: Jobs) -> list[Row]:
             def train(start=start, data=source_data) -> Found:
                 return [], {"weights": weights(learned(start, data, config.steps))}
 
-            found = jobs(f"{PART}: source, {model}, seed {seed}", train)[1]["weights"]
+            found = kept(f"{PART}: source, {model}, seed {seed}", train)[1]["weights"]
             sources[model] = with_weights(start, found)
         for shift in config.shifts:
             truth = fitzhugh_nagumo(grid, *SHIFTS[shift])
@@ -84,7 +85,7 @@ def study(config: Config, jobs: Jobs) -> list[Row]:
                             for mode, mse in errors.items()
                         ], {}
 
-                    rows += jobs(name, adapt)[0]
+                    rows += kept(name, adapt)[0]
     return rows
 
 

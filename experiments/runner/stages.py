@@ -1,6 +1,7 @@
 """Sweeps and other jobs with a cache: what is finished is loaded, what was interrupted goes on, any other is run."""
 
 import json
+import re
 import time
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -9,6 +10,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
 from rich.console import Console
 
 from experiments.reporting.results import Row
@@ -19,7 +21,7 @@ from experiments.runner.run_record import PACKAGES, require_same
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import backup_path, json_value, write_atomic
+from hybrid_jax.io.files import backup_path, json_value
 from hybrid_jax.io.models import describe
 from hybrid_jax.programs import source_digest
 from hybrid_jax.sweep import hosts
@@ -27,11 +29,13 @@ from hybrid_jax.sweep.training import Progress, sweep
 from hybrid_jax.training.fitting import FitState, RunConfig
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 
-FORMAT = "hybrid_jax sweep 1"
+FORMAT, JOB_FORMAT = "hybrid_jax sweep 1", "hybrid_jax job 1"
 RECIPE = 1  # increment when the same start, plan and data no longer give the same result
 FINISHED_BY = ("jax", "hybrid_jax")
 
 Result = TypeVar("Result")
+Found = tuple[Sequence[Row], dict[str, np.ndarray]]  # of a job: rows, and arrays by name
+Kept = Callable[[str, Callable[[], Found]], Found]  # `Stages.kept` of some inputs
 
 
 class Stages:
@@ -127,32 +131,26 @@ class Stages:
                 line.show_parts(len(results), len(jobs))
         return results
 
-    def kept_parts(self, name: str, jobs: Sequence[Callable[[], list[Row]]], inputs: Sequence[Any]) -> list[Row]:
-        """The rows of jobs, as `parts`; those of finished jobs are kept in the cache, one line of a file for each.
+    def kept(self, name: str, work: Callable[[], Found], identity: str) -> Found:
+        """Rows and arrays of a job, as one timed stage; they are kept in the cache, and so run once.
 
-        `inputs` is what determines them beside the code of these packages: JSON, datasets and fields.
+        `identity` says what determines them; see `identity_of`.
         """
-        path = self._folder / f"{_stem(name)}-{_identity_of_parts(inputs)[:16]}.jsonl"
-        if self._fresh and path.exists() and hosts.is_main_process():
-            self._say(f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}")
-        kept = _lines(path)[: len(jobs)]
-        if kept:
-            self.reused.append(f"{len(kept)} of {len(jobs)} parts of {name}")
+        (path,) = self._places(name, identity, 1)
+        if path.exists():
+            self.reused.append(name)
+        return self.timed(name, lambda: self._kept(name, path, work), "compiling and solving")
 
-        def run(index: int) -> list[Row]:
-            seconds, rows = kept[index] if index < len(kept) else (0.0, None)
-            if rows is not None:
-                self.seconds[name] = self.seconds.get(name, 0.0) + seconds
-                return rows
-            began = time.perf_counter()
-            text = json.dumps(jobs[index](), default=lambda number: number.item())
-            if hosts.is_main_process():
-                path.parent.mkdir(parents=True, exist_ok=True)
-                with path.open("a") as file:
-                    file.write(f"[{time.perf_counter() - began:.3f}, {text}]\n")
-            return json.loads(text)
+    def kept_parts(self, name: str, jobs: Sequence[Callable[[], Sequence[Row]]], identity: str) -> list[Row]:
+        """The rows of jobs, as `parts`, each kept in the cache as by `kept`."""
+        paths = self._places(name, identity, len(jobs))
+        if kept := sum(path.exists() for path in paths):
+            self.reused.append(f"{kept} of {len(jobs)} parts of {name}")
 
-        return [row for rows in self.parts(name, [partial(run, i) for i in range(len(jobs))]) for row in rows]
+        def run(path: Path, job: Callable[[], Sequence[Row]]) -> Sequence[Row]:
+            return self._kept(name, path, lambda: (job(), {}))[0]
+
+        return [row for rows in self.parts(name, list(map(partial(partial, run), paths, jobs))) for row in rows]
 
     def knows(self, name: str) -> bool:
         """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
@@ -163,6 +161,28 @@ class Stages:
         reused = f"Taken from the cache, with the seconds of the run that made them: {', '.join(self.reused)}."
         saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
         return [reused] * bool(self.reused) + [saved] * bool(self._ran)
+
+    def _places(self, name: str, identity: str, jobs: int) -> list[Path]:
+        """A file for each of the jobs of a stage; with `fresh`, earlier ones are moved aside."""
+        folder = self._folder / f"{_stem(name)}-{identity[:16]}"
+        if self._fresh and folder.exists() and hosts.is_main_process():
+            self._say(f"{folder}: moved aside to {folder.rename(backup_path(folder, 'before')).name}")
+        return [folder / f"{index}.npz" for index in range(jobs)]
+
+    def _kept(self, stage: str, path: Path, work: Callable[[], Found]) -> Found:
+        """What a file holds, whose seconds are added to the stage's; or else what a job finds, which is then kept."""
+        if path.exists():
+            about, arrays = load_archive(path, JOB_FORMAT)
+            self.seconds[stage] = self.seconds.get(stage, 0.0) + about["seconds"]
+            return json.loads(about["rows"]), arrays
+        began = time.perf_counter()
+        rows, arrays = work()
+        # As text: errors may be infinite, which an archive's own JSON may not be.
+        text = json.dumps(rows, default=lambda number: number.item())
+        if hosts.is_main_process():
+            path.parent.mkdir(parents=True, exist_ok=True)
+            save_archive(path, JOB_FORMAT, {"rows": text, "seconds": time.perf_counter() - began}, arrays)
+        return json.loads(text), arrays
 
     def _back_up(self, finished: Path, begun: Path) -> None:
         stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
@@ -178,23 +198,11 @@ def stages_of(config: Run, console: Console) -> Stages:
     return Stages(config.cache / "sweeps", console, config.saving, config.fresh)
 
 
-def _lines(path: Path) -> list[tuple[float, list[Row]]]:
-    """Seconds and rows of each line; a last line that a kill cut short is deleted."""
-    found, text = [], path.read_bytes() if path.exists() else b""
-    whole = text[: text.rfind(b"\n") + 1]
-    if whole != text and hosts.is_main_process():
-        write_atomic(path, whole)
-    for i, line in enumerate(whole.splitlines(), 1):
-        try:
-            seconds, rows = json.loads(line)
-        except ValueError as error:
-            raise ValueError(f"{path}: line {i} is damaged; delete the file, or begin with --fresh") from error
-        found.append((float(seconds), rows))
-    return found
+def identity_of(*inputs: Any) -> str:
+    """Of jobs: what determines their results, given as JSON, datasets and fields, and the code of these packages.
 
-
-def _identity_of_parts(inputs: Sequence[Any]) -> str:
-    """Of the inputs and of our code, as inputs do not say what is done with them: any edit makes the parts anew."""
+    Inputs do not say what is done with them, so any edit makes jobs anew.
+    """
     sources = [source_digest(package) for package in ("hybrid_jax", "experiments")]
     fixed: list[Any] = [RECIPE, *sources, versions(*FINISHED_BY)]
     arrays: dict[str, Any] = {}
@@ -202,7 +210,7 @@ def _identity_of_parts(inputs: Sequence[Any]) -> str:
         match value:
             case AbstractVectorField():
                 fixed.append(describe(value))
-                arrays |= named_leaves(value)
+                arrays |= {f"{len(fixed)}.{name}": leaf for name, leaf in named_leaves(value).items()}
             case Dataset():
                 fixed.append(content_hash(value))
             case _:
@@ -217,7 +225,7 @@ def summary(states: FitState) -> str:
 
 
 def _stem(name: str) -> str:
-    return name.replace(" ", "-")
+    return re.sub(r"[^\w.,=-]+", "-", name)  # as a file may be called anywhere
 
 
 def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:

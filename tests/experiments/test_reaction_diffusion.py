@@ -9,7 +9,7 @@ from smoke import experiments, refused, unbegun
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.forecast import CASES, POINTWISE
-from experiments.reaction_diffusion.jobs import pieces
+from experiments.reaction_diffusion.models import pieces
 from experiments.reaction_diffusion.report import claims, tables
 from experiments.reaction_diffusion.systems import (
     COARSE,

@@ -15,7 +15,7 @@ from experiments.paper.tables import run_notes
 from experiments.reporting.results import Results
 from experiments.runner.progress import Line
 from experiments.runner.run_record import OtherRun
-from experiments.runner.stages import Stages
+from experiments.runner.stages import Stages, identity_of
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane, stack
@@ -138,20 +138,31 @@ def parts(folder, done, inputs=(1,), fresh=False, stop=None):
         return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}]
 
     stages = Stages(folder, Console(quiet=True), fresh=fresh)
-    return stages.kept_parts("some parts", [partial(job, i) for i in range(4)], inputs)
+    return stages.kept_parts("some parts", [partial(job, i) for i in range(4)], identity_of(*inputs))
 
 
 def test_finished_parts_are_kept(tmp_path):
     whole = parts(tmp_path / "whole", [])
     with pytest.raises(KeyboardInterrupt):
         parts(tmp_path, [], stop=2)
-    (file,) = tmp_path.glob("*.jsonl")
-    file.write_text(file.read_text() + "[0.1, [{")  # a kill while the third was written
     done = []
     assert parts(tmp_path, done) == whole
     assert done == [2, 3]
     assert parts(tmp_path, done) == whole
     assert done == [2, 3]
+
+
+def test_a_job_that_is_kept_gives_the_same_rows_and_arrays(tmp_path):
+    ran = []
+
+    def job():
+        ran.append(1)
+        return [{"error": np.inf, "seed": np.int32(3)}], {"path": np.arange(3.0)}
+
+    found = [Stages(tmp_path, Console(quiet=True)).kept("a: job", job, identity_of(1)) for _ in range(2)]
+    assert len(ran) == 1
+    assert found[0][0] == found[1][0] == [{"error": np.inf, "seed": 3}]
+    assert np.array_equal(found[0][1]["path"], found[1][1]["path"])
 
 
 @pytest.mark.parametrize(("inputs", "fresh"), [((2,), False), ((DATA,), False), ((1,), True)])
@@ -162,10 +173,9 @@ def test_parts_of_other_inputs_run(tmp_path, inputs, fresh):
     assert done == [0, 1, 2, 3]
 
 
-def test_a_damaged_line_is_named(tmp_path):
+def test_a_damaged_part_is_named(tmp_path):
     parts(tmp_path, [])
-    (file,) = tmp_path.glob("*.jsonl")
-    first, second, *rest = file.read_text().splitlines()
-    file.write_text("\n".join([first, second[:-4], *rest]) + "\n")
-    with pytest.raises(ValueError, match=r"jsonl: line 2 is damaged; delete the file"):
+    (file,) = tmp_path.glob("*/1.npz")
+    file.write_bytes(file.read_bytes()[:-30])
+    with pytest.raises(ValueError, match=r"1\.npz: truncated, damaged or not a hybrid_jax job"):
         parts(tmp_path, [])

@@ -1,7 +1,5 @@
-"""Jobs whose results are kept in the cache, so that a killed run goes on with the first one that is not done."""
+"""What the studies share: weights as a vector, forecasts and their error, and windows cut from trajectories."""
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from typing import Any
 
 import equinox as eqx
@@ -11,39 +9,7 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 
 import hybrid_jax as hj
-from experiments.runner.options import Run
-from experiments.runner.stages import FINISHED_BY, Stages
 from hybrid_jax.dynamics.base import trainable
-from hybrid_jax.io.archive import digest, load_archive, save_archive
-from hybrid_jax.io.datasets import versions
-
-FORMAT = "hybrid_jax reaction_diffusion 1"
-RECIPE = 1  # increment when the same options no longer give the same result
-
-Found = tuple[list[dict[str, Any]], dict[str, np.ndarray]]  # rows, and arrays by name
-
-
-@dataclass
-class Jobs:
-    """Runs jobs by name; those that the cache holds for the same options are not run again."""
-
-    config: Run
-    stages: Stages
-    options: dict[str, Any]  # what determines the results
-    reused: list[str] = field(default_factory=list)
-
-    def __call__(self, name: str, work: Callable[[], Found]) -> Found:
-        key = digest([RECIPE, name, self.options, versions(*FINISHED_BY)], {})
-        path = self.config.cache / "reaction_diffusion" / f"{key[:24]}.npz"
-        if path.exists() and not self.config.fresh:
-            self.reused.append(name)
-            about, arrays = load_archive(path, FORMAT)
-            self.stages.seconds[name] = about["seconds"]
-            return about["rows"], dict(arrays)
-        rows, arrays = self.stages.timed(name, work, "compiling and solving")
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_archive(path, FORMAT, {"rows": rows, "seconds": self.stages.seconds[name]}, arrays)
-        return rows, arrays
 
 
 def weights(model: hj.AbstractVectorField) -> np.ndarray:
