@@ -53,11 +53,12 @@ LISTS = ("--horizon", "--n", "--polynomial", "--motor-order", "--topics", "--lea
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiment; without any flights, print how to get some and exit with code 2."""
-    given = list(sys.argv[1:] if arguments is None else arguments)
-    if not any(word.startswith(("--simulated", "--source", "--vehicle", "--help", "-h")) for word in given):
+    given = command.split_lists(sys.argv[1:] if arguments is None else arguments, LISTS)
+    if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
+        command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
         print(GUIDE, file=sys.stderr)
         sys.exit(command.BAD_INPUT)
-    command.run(NAME, ABOUT, run, command.split_lists(given, LISTS), presets=PRESETS)
+    command.run(NAME, ABOUT, run, given, presets=PRESETS)
 
 
 def run(config: RealFlightConfig, console: Console) -> None:

@@ -68,6 +68,12 @@ def run(
             experiment(config, console)
 
 
+def check(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> None:
+    """End the process, as `run` does, if the command line is not one of this experiment."""
+    with _exit_codes(name, "interrupted"):
+        read(name, about, arguments, presets)
+
+
 def call(
     name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
 ) -> None:

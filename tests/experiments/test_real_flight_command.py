@@ -166,11 +166,15 @@ def test_rotor_lag_is_applied_once(learned, tmp_path):
     assert (lines[0] == "rotors follow the log's motors with a time constant of 30.0 ms") == (not learned)
 
 
-def test_guide_is_printed_without_flights(capsys):
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [([], "no logs at hand?"), (["--activation", "sigmoid"], "'sigmoid' for argument '--activation'")],
+)
+def test_guide_is_printed_without_flights_but_a_wrong_option_is_named_first(arguments, message, capsys):
     with pytest.raises(SystemExit) as stop:
-        main([])
+        main(arguments)
     assert stop.value.code == 2
-    assert "--simulated" in capsys.readouterr().err
+    assert message in capsys.readouterr().err.lower()
 
 
 def test_lists_may_be_comma_separated():
