@@ -1,6 +1,7 @@
 """Tests spend most of their time compiling: programs are compiled without optimisation and shared by all processes.
 
-`XLA_FLAGS= pytest` compiles them as users do.
+`XLA_FLAGS= pytest` compiles them as users do. Each process of tests keeps to one core: XLA starts a thread for every
+core that a process may use, and those of two processes wait for each other.
 """
 
 import os
@@ -24,14 +25,29 @@ KEEP_ALL = {
 QUICK = "--xla_backend_optimization_level=0"
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
     QUICK += " --xla_cpu_use_fusion_emitters=false"
+CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # other systems bind no process
 
 
 def pytest_configure(config):
+    worker = os.environ.get("PYTEST_XDIST_WORKER", "")  # gw0, gw1, …
+    if worker and CORES:
+        os.sched_setaffinity(0, {CORES[int(worker.removeprefix("gw")) % len(CORES)]})
     if PROGRAMS not in os.environ:
         folder = os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="hybrid_jax_programs_")
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     for name, value in (KEEP_ALL | {"XLA_FLAGS": QUICK}).items():
         os.environ.setdefault(name, value)
+
+
+@pytest.fixture(scope="module")
+def all_cores():
+    """Subprocesses may use every core, not that of this process alone."""
+    if CORES:
+        own = os.sched_getaffinity(0)
+        os.sched_setaffinity(0, CORES)
+    yield
+    if CORES:
+        os.sched_setaffinity(0, own)
 
 
 @pytest.fixture

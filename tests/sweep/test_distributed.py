@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.usefixtures("all_cores")]
 
 ROOT = Path(__file__).parents[2]
 EXPERIMENT = ["-m", "experiments.param_shift", "--preset", "smoke", "--seeds", "3", "--models", "hybrid"]
