@@ -45,6 +45,8 @@ class Config(Run):
     """Hidden channels of convolutions."""
     units: Count = 12
     """Hidden units of the hybrids that are adapted."""
+    starts: Count = 3
+    """Random networks that learn from single intervals; the one with the least training loss goes on."""
     steps: Count = 35
     """Gauss–Newton steps on single intervals."""
     polish: Count = 8
@@ -66,12 +68,13 @@ PAPER = Config()
 PRESETS = {
     "paper": PAPER,
     "quick": replace(
-        PAPER, preset="quick", seeds=1, sizes=(1, 2), test=20, hidden=12, units=8, channels=6, steps=15, polish=3,
+        PAPER, preset="quick", seeds=1, starts=1, sizes=(1, 2), test=20, hidden=12, units=8, channels=6, steps=15,
+        polish=3,
         parts=("forecast", "shifted"), shifts=("parameter_shift",),
         cases=("pointwise", "convolution, neighbours penalised", "physics alone: diffusion", "physics alone: complete"),
     ),
     "smoke": replace(
-        PAPER, preset="smoke", seeds=1, sizes=(1, 2), test=3, hidden=3, units=3, channels=2, steps=2, polish=1,
-        points=8, cases=("pointwise", "convolution", "physics alone: diffusion"), shifts=("new_term",),
+        PAPER, preset="smoke", seeds=1, starts=2, sizes=(1, 2), test=3, hidden=3, units=3, channels=2, steps=2,
+        polish=1, points=8, cases=("pointwise", "convolution", "physics alone: diffusion"), shifts=("new_term",),
     ),
 }  # fmt: skip

@@ -1,6 +1,7 @@
 """The first study: learn FitzHugh–Nagumo of which physics knows that there is diffusion, as APHYNITY does."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import jax
@@ -18,6 +19,7 @@ PART = "forecast"
 TRAIN, TEST = 10, 11  # first numbers of the seeds of data: no trajectory is in both
 GUESS = (2 * A, B / 2)  # where a and b start
 EVERY = 4  # intervals between the windows of the first stage
+ANOTHER = 1000  # between the seeds of two networks of one trial
 KEPT = 2  # test trajectories whose forecasts are drawn
 
 
@@ -59,6 +61,7 @@ CASES = (
 
 
 def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
+    """Before training; the seed is that of the network's weights."""
     grid, key = plane(config.points), jax.random.key(seed)
     if case.physics == "complete":
         return fitzhugh_nagumo(grid, *GUESS, k=0.0)
@@ -71,17 +74,21 @@ def untrained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
 
 
 def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
-    """One interval at a time from a few places of each trajectory first, then whole trajectories."""
+    """One interval at a time from a few places of each trajectory first, then whole trajectories.
+
+    Some networks end in a poor local minimum, which their training loss shows. So several begin, and the best goes on.
+    """
     truth = fitzhugh_nagumo(plane(config.points))
     data = reacting(truth, case.trajectories, (TRAIN, seed), case.noise)
-    start = untrained(case, config, seed)
+    starts = [untrained(case, config, seed + ANOTHER * i) for i in range(config.starts)]
     hj.check_grid(plane(config.points), data, diffusivity=GUESS, substeps=COARSE.substeps, name="training data")
     if not case.kernel:
-        return hj.fit_least_squares(start, data, COARSE).field
-    options = {"penalty": case.penalty, "weight": case.weight, "solver": COARSE}
-    first = hj.fit_gauss_newton(start, pieces(data, EVERY), max_steps=config.steps, **options).field  # pyright: ignore[reportArgumentType]
+        return hj.fit_least_squares(starts[0], data, COARSE).field
+    fit = partial(hj.fit_gauss_newton, penalty=case.penalty, weight=case.weight, solver=COARSE)
+    first = [fit(start, pieces(data, EVERY), max_steps=config.steps) for start in starts]
+    best = min(first, key=lambda found: found.loss if np.isfinite(found.loss) else np.inf)
     whole = pieces(data, STEPS // 5, STEPS // 5) if case.kernel > 1 else data
-    return hj.fit_gauss_newton(first, whole, max_steps=config.polish, **options).field  # pyright: ignore[reportArgumentType]
+    return fit(best.field, whole, max_steps=config.polish).field
 
 
 def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
