@@ -17,7 +17,7 @@ from hybrid_jax.io.files import json_text, read_json, write_atomic
 Benchmark = Literal[
     "training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest", "grids"
 ]  # fmt: skip
-PEERS = "training_peers", "environment_peers"
+PEERS = "training_peers", "environment_peers", "grid_peers"
 
 
 @dataclass(frozen=True)
@@ -36,8 +36,9 @@ class Options:
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
-    """Also run training_peers and environment_peers, which compare with other libraries on one core: about eight
-    minutes more, mostly in `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
+    """Also run training_peers, environment_peers and grid_peers, which compare with other libraries on one core: about
+    eight minutes more, mostly in `torch.compile`. Libraries that are not installed are skipped:
+    pip install -e '.[peers]'."""
 
 
 def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:

@@ -83,7 +83,7 @@ def measure_batch(batch: int, preset: environment.Preset) -> dict[str, Any]:
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    table = Table("flights", "", "steps/s", "compile [s]", "differs by", title=f"steps of {DT} s per second")
+    table = Table("flights", "", "steps/s", r"compile \[s]", "differs by", title=f"steps of {DT} s per second")
     for row in rows:
         compared = {BY_HAND: f"{row['difference']:.0e}", CRAZYFLOW: "another vehicle: not compared"}
         for name, speed in row["steps_per_second"].items():

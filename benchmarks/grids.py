@@ -82,17 +82,23 @@ def plain_step(field, adam, windows):
     return jax.tree.map(lambda p, d: p - RATE * d, field, direction), adam, value
 
 
-def measured(kernel: int, preset: Preset) -> dict[str, Any]:
+def subject(kernel: int, preset: Preset) -> tuple[Any, Any, Any, hj.Trajectories, hj.Settings]:
+    """A field, the state of Adam, the plan of a run, one window, and settings: the arguments of a gradient step."""
     field: Any = hybrid(kernel, preset)
     grid = field.physics.grid
     x0 = np.random.default_rng(0).random((1, grid.size)).astype(np.float32)
     u = np.zeros((1, preset.intervals, 0), np.float32)
     x = np.asarray(hj.rollout_batch(hybrid(1, preset), x0, u, DT, hj.RK4(substeps=SUBSTEPS))) * np.float32(0.9)
     windows, settings = hj.Trajectories(x0, u, x, DT), hj.Settings(batch_size=1, solver=hj.RK4(substeps=SUBSTEPS))
-    state, plan = start(field, jax.random.key(0)), make_run_config(RATE, np.arange(1), 1, 1, 1, 1, 0.0)
+    plan = make_run_config(RATE, np.arange(1), 1, 1, 1, 1, 0.0)
+    return field, start(field, jax.random.key(0)).adam, plan, windows, settings
+
+
+def measured(kernel: int, preset: Preset) -> dict[str, Any]:
+    field, adam, plan, windows, settings = subject(kernel, preset)
     step = partial(gradient_step, settings=settings)
-    ours, _, our_memory = compiled_with_memory(step, field, state.adam, plan, windows)
-    plain, _, memory = compiled_with_memory(plain_step, field, state.adam, windows)
+    ours, _, our_memory = compiled_with_memory(step, field, adam, plan, windows)
+    plain, _, memory = compiled_with_memory(plain_step, field, adam, windows)
     own, theirs = ((result[2], result[1].mu) for result in (ours(), plain()))
     assert all(jax.tree.leaves(trainable(field)))
     difference = agree(f"steps of kernel {kernel}", own, theirs, AGREEMENT)

@@ -23,6 +23,7 @@ import tyro
 from jaxtyping import PyTree
 from matplotlib.figure import Figure
 from rich.console import Console
+from rich.markup import escape
 from rich.table import Table
 
 from hybrid_jax import checks
@@ -229,7 +230,7 @@ def _end(name: str, error: Exception, code: int):
 
 def table(title: str, rows: Sequence[Any], columns: Mapping[str, Callable[[Any], str]]) -> Table:
     """Rows for reading; each column is named by its head and made of a row."""
-    made = Table(*columns, title=title)
+    made = Table(*map(escape, columns), title=title)  # or [ms] would be taken for a style
     for row in rows:
         made.add_row(*(cell(row) for cell in columns.values()))
     return made
@@ -249,4 +250,4 @@ def ratio_table(ratios: Sequence[Ratio]) -> Table:
         "reach": reach,
         " ": lambda ratio: verdicts[ratio.holds],
     }
-    return table(f"on {cores()} cores", ratios, columns)
+    return table(f"on {cores()} core{'s' * (cores() > 1)}", ratios, columns)

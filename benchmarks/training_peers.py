@@ -172,7 +172,7 @@ def row_of(name: str, steps: Steps, differences: dict[str, float], times: Times,
 
 
 def table_of(rows: list[dict[str, Any]], absent: list[dict[str, Any]]) -> Table:
-    table = Table("", "ms", "windows/s", "× ours", "compile [s]", "differs by", title="a gradient step, one core")
+    table = Table("", "ms", "windows/s", "× ours", r"compile \[s]", "differs by", title="a gradient step, one core")
     for row in rows:
         speed = f"{1e3 * row['seconds']:.2f}", f"{row['windows_per_second']:,.0f}", f"{row['times_ours']:.2f}"
         difference = "" if row["difference"] is None else f"{row['difference']:.0e}"

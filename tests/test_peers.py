@@ -9,6 +9,7 @@ import pytest
 from pendulum import pendulum
 from smoke import benchmarks
 
+from benchmarks import grid_peers
 from benchmarks.__main__ import PEERS
 from benchmarks.peers import installed
 from benchmarks.subjects import make_flights, untrained
@@ -35,7 +36,7 @@ def test_every_rival_is_timed_or_named_with_what_would_install_it(peers):
         name for row in rows if "batch" in row for name in row["steps_per_second"]
     }
     assert timed & skipped.keys() == set()
-    assert timed | skipped.keys() >= {*RIVALS, "crazyflow", "ours", "by hand"}
+    assert timed | skipped.keys() >= {*RIVALS, grid_peers.RIVAL, "crazyflow", "ours", "by hand"}
     for rival, remedy in skipped.items():
         assert "pip install" in remedy
         assert f"{rival}: {remedy}" in " ".join(printed.split())
