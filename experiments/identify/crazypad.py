@@ -20,14 +20,14 @@ from hybrid_jax import runtime
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.corrected_body import CorrectedBody
 from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.flights.log import IDLE, RESTING, runs_of
+from hybrid_jax.flights.airborne import airborne
 from hybrid_jax.flights.reading import read_recording
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.measured import Layout
 from hybrid_jax.vehicle import Vehicle
 
-WHOLE, SECONDS, MARGIN = 47.0, 3.0, 0.5  # mm of a propeller; s that are learned from; s left out beside the ground
+WHOLE, SECONDS = 47.0, 3.0  # mm of a propeller; s that are learned from
 MEASURED = ("attitude", "specific_force")
 VEHICLE = Vehicle(
     mass=0.036,
@@ -64,14 +64,6 @@ def flights(folder: Path, vehicle: str = "E8") -> tuple[list[Flight], list[Fligh
     return normal, sorted(cut, key=lambda each: -each.length)
 
 
-def in_flight(recording: Recording) -> list[tuple[float, float]]:
-    """Start and end [s] of each time in the air."""
-    command = recording.signals["command"]
-    power = (np.asarray(command.values) ** 2).sum(axis=1)
-    found = [command.t[part] for part in runs_of(power > IDLE * np.quantile(power, 0.9))]
-    return [(t[0] + MARGIN, t[-1] - MARGIN) for t in found if t[-1] - t[0] > 2 * MARGIN + RESTING]
-
-
 def cut_out(recording: Recording, begin: float, end: float) -> Recording:
     """The part of a recording between two times."""
 
@@ -94,7 +86,7 @@ def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.nda
     k = np.asarray(theta.get("k_rotors", VEHICLE.thrust_coefficient) * theta.get("efficiency", 1.0))
     t = (edges[1:] + edges[:-1]) / 2
     error = np.interp(t, force.t, np.asarray(force.values)[:, -1]) - (k * speeds**2).sum(axis=1) / VEHICLE.mass
-    inside = np.any([(t >= begin) & (t <= end) for begin, end in in_flight(recording)], axis=0)
+    inside = np.any([(t >= begin) & (t <= end) for begin, end in airborne(recording)], axis=0)
     return error[inside & (t >= after)]
 
 
@@ -110,9 +102,9 @@ def source(normal: list[Flight]):
 
 
 def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, float]:
-    """The first seconds in the air, with the take-off before them, and when they end."""
-    begin, _ = in_flight(flight.recording)[0]
-    return cut_out(flight.recording, begin - MARGIN, begin + seconds), begin + seconds
+    """The first seconds in the air, and when they end."""
+    begin, _ = airborne(flight.recording)[0]
+    return cut_out(flight.recording, begin, begin + seconds), begin + seconds
 
 
 def damage(field: Any, flight: Flight) -> tuple[np.ndarray, Any, float]:
@@ -121,7 +113,7 @@ def damage(field: Any, flight: Flight) -> tuple[np.ndarray, Any, float]:
     All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
     """
     part, end = first_seconds(flight)
-    short = replace(LAYOUT, steps=15, most=16, margin=0.0)
+    short = replace(LAYOUT, steps=15, most=16)
     body = CorrectedBody(field.body, jnp.zeros(VEHICLE.rotors), jnp.zeros(3))
     start = replace(field, body=body)
     found = identify(start, [part], short, MEASURED, free=("log_efficiency",))

@@ -13,7 +13,7 @@ import numpy as np
 from rich.console import Console
 
 import hybrid_jax as hj
-from experiments.identify.crazypad import ACTUATOR, VEHICLE, cut_out, force_errors, in_flight, rms
+from experiments.identify.crazypad import ACTUATOR, VEHICLE, cut_out, force_errors, rms
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
@@ -22,6 +22,7 @@ from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.flights.airborne import airborne
 from hybrid_jax.flights.column_map import load_column_map
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.reading import read_recording
@@ -52,7 +53,7 @@ def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated
 def flight_of(recording: Recording, field: Actuated) -> FlightLog:
     """The flight with rotor speeds that follow from commands and voltage, every 10 ms in the air."""
     command, voltage = recording.signals["command"], recording.signals["voltage"]
-    begin, end = in_flight(recording)[0][0], in_flight(recording)[-1][1]
+    begin, end = airborne(recording)[0][0], airborne(recording)[-1][1]
     t = np.arange(begin, end, DT)
     u = np.asarray(command.values)
     if field.reads_voltage:
@@ -94,13 +95,13 @@ def main(folder: Path) -> None:
     for i, left in enumerate(b):
         others = b[:i] + b[i + 1 :]
         fitted, gain = thrust_of(others, start=aware), thrust_of(others, voltage=False, start=constant)
-        begin = in_flight(others[0])[0][0]
-        few = thrust_of([cut_out(others[0], begin - 0.5, begin + SECONDS)], start=aware, free=("curve",))
+        begin = airborne(others[0])[0][0]
+        few = thrust_of([cut_out(others[0], begin, begin + SECONDS)], start=aware, free=("curve",))
         forces.append([rms(force_errors(each, left)) for each in (aware, fitted, few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
         test, plain = windows_of([left], fitted), windows_of([left], gain)
         simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
-        ten = [cut_out(others[0], begin - 0.5, begin + SECONDS)]
+        ten = [cut_out(others[0], begin, begin + SECONDS)]
         models = {
             "hold the state": (HoldState(), test),
             "frozen rates": (FrozenRates(simple[1]), test),

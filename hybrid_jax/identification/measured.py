@@ -11,13 +11,12 @@ from jaxtyping import Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.measurement import MEASURED, TANGENT
-from hybrid_jax.flights.log import IDLE, RESTING, runs_of
+from hybrid_jax.flights.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 Initial = Literal["estimated", "sample"]
 UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of what nothing measures: m/s, rad, rad/s
-MARGIN = 0.5  # s that are left out beside time on the ground
 WARM = 0.3  # s of commands before a window that the rotors' speeds at its start follow from
 PADDING = 1024
 BREAK = 10.0  # s between two recordings on the common clock
@@ -33,7 +32,6 @@ class Layout:
     span: float = 0.1  # s of samples before a window that its initial state is estimated from
     initial: Initial = "estimated"  # or the nearest sample before it, taken as exact
     warm: float = WARM
-    margin: float = MARGIN
     # First guess of the constant disturbances of a window; 0 for none: m/s² in x, y, z, rad/s² about x, y, z.
     disturbance: tuple[float, ...] = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
 
@@ -131,7 +129,7 @@ def _windows(recording: Recording, layout: Layout, told: str, names, begin: floa
     before = max(layout.span, layout.warm)
     first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
     starts = np.arange(first + before, last - length, length)
-    starts = starts[_clear(recording, told, names, starts - before, starts + length, layout.margin)]
+    starts = starts[_clear(recording, told, names, starts - before, starts + length)]
     edges = starts[:, None] + layout.dt * np.arange(-layout.ahead, layout.steps + 1)
     y, there = {}, {}
     for name in names:
@@ -142,15 +140,10 @@ def _windows(recording: Recording, layout: Layout, told: str, names, begin: floa
     return Windows(edges + begin, volts, y, there, start, spread, np.full(len(starts), number))
 
 
-def _clear(recording: Recording, told: str, names, begin, end, margin: float) -> Bool[np.ndarray, " n"]:
+def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:
     """Whether each span is in flight and meets no gap."""
-    inputs = recording.signals[told]
-    power = (np.asarray(inputs.values) ** 2).sum(axis=1)
-    clear = np.ones(len(begin), bool)
-    for rest in runs_of(power < IDLE * np.quantile(power, 0.9)):
-        left, right = inputs.t[rest][0], inputs.t[rest][-1]
-        if right - left >= RESTING:
-            clear &= (end + margin < left) | (begin - margin > right)
+    flights = airborne(recording, told)
+    clear = np.any([(begin >= first) & (end <= last) for first, last in flights] or [np.zeros(len(begin))], axis=0)
     for name in (told, *names):
         for left, right in recording.signals[name].gaps():
             clear &= (end < left) | (begin > right)
