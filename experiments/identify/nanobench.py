@@ -1,7 +1,7 @@
 """From one airframe to another: python -m experiments.identify.nanobench FOLDER
 
 FOLDER is the data set NanoBench: flights of an airframe A, and of B, which replaced it. Each flight of B is left out in
-turn; the others, or ten seconds of one, are learned from.
+turn; the others, or ten seconds of one of them, are learned from.
 """
 
 import sys
@@ -51,10 +51,10 @@ def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated
 
 
 def flight_of(recording: Recording, field: Actuated) -> FlightLog:
-    """The flight with rotor speeds that follow from commands and voltage, every 10 ms in the air."""
+    """The time in the air, every 10 ms, with rotor speeds that follow from commands and voltage."""
     command, voltage = recording.signals["command"], recording.signals["voltage"]
-    begin, end = airborne(recording)[0][0], airborne(recording)[-1][1]
-    t = np.arange(begin, end, DT)
+    flights = airborne(recording)
+    t = np.arange(flights[0][0], flights[-1][1], DT)
     u = np.asarray(command.values)
     if field.reads_voltage:
         u = np.column_stack([u, np.interp(command.t, voltage.t, np.asarray(voltage.values)[:, 0])])
@@ -67,7 +67,14 @@ def flight_of(recording: Recording, field: Actuated) -> FlightLog:
 
     x = np.concatenate([at("position"), at("attitude"), at("velocity"), at("rates")], axis=1)
     x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
-    return FlightLog(t, x, speeds, recording.name)
+    inside = np.any([(t >= begin) & (t <= end) for begin, end in flights], axis=0)
+    return FlightLog(t, x, speeds, recording.name)[inside]
+
+
+def ten_seconds(recording: Recording) -> Recording:
+    """The first in the air."""
+    begin = airborne(recording)[0][0]
+    return cut_out(recording, begin, begin + SECONDS)
 
 
 def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajectories:
@@ -95,20 +102,20 @@ def main(folder: Path) -> None:
     for i, left in enumerate(b):
         others = b[:i] + b[i + 1 :]
         fitted, gain = thrust_of(others, start=aware), thrust_of(others, voltage=False, start=constant)
-        begin = airborne(others[0])[0][0]
-        few = thrust_of([cut_out(others[0], begin, begin + SECONDS)], start=aware, free=("curve",))
-        forces.append([rms(force_errors(each, left)) for each in (aware, fitted, few)])
+        tens = [ten_seconds(each) for each in others]
+        few = [thrust_of([each], start=aware, free=("curve",)) for each in tens]
+        errors_few = np.concatenate([force_errors(each, left) for each in few])
+        forces.append([*(rms(force_errors(each, left)) for each in (aware, fitted)), rms(errors_few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
         test, plain = windows_of([left], fitted), windows_of([left], gain)
         simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
-        ten = [cut_out(others[0], begin, begin + SECONDS)]
         models = {
             "hold the state": (HoldState(), test),
             "frozen rates": (FrozenRates(simple[1]), test),
             "physics, constant gain": (simple[0], plain),
             "physics, voltage": (simple[1], test),
             "adapted from A": (fitted_to(of_a, others, fitted), test),
-            "adapted from A, ten seconds": (fitted_to(of_a, ten, few, 5), windows_of([left], few)),
+            "adapted from A, ten seconds": (fitted_to(of_a, tens[:1], few[0], 5), windows_of([left], few[0])),
         }
         for name, (model, windows) in models.items():
             scores.setdefault(name, []).append(errors(model, windows))
