@@ -1,7 +1,9 @@
 """Which rotor is damaged, and by how much: python -m experiments.identify.crazypad FOLDER
 
 FOLDER is `motor_data` of the data set CrazyPAD: a vehicle whose propeller M3 was cut in steps. The effectiveness of
-each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust and trim.
+each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust and trim. In all flights
+the thrust of a command grows in the seconds after take-off. So damage is found against the same seconds of normal
+flights, and what is left of each rotor then predicts with what whole normal flights tell.
 """
 
 import re
@@ -12,6 +14,7 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 from rich.console import Console
 
 from experiments.reporting.tables import Table, print_tables
@@ -94,11 +97,11 @@ def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def source(normal: list[Flight]):
+def source(normal: list[Recording]) -> Any:
     """What normal flights tell: effectiveness of each rotor, and lag."""
     learn = multirotor(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
-    return identify(field, [each.recording for each in normal], LAYOUT, MEASURED)
+    return identify(field, normal, LAYOUT, MEASURED).field
 
 
 def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, float]:
@@ -107,35 +110,40 @@ def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, 
     return cut_out(flight.recording, begin, begin + seconds), begin + seconds
 
 
-def damage(field: Any, flight: Flight) -> tuple[np.ndarray, Any, float]:
-    """Thrust that each rotor has lost, as a share, with intervals, by the first seconds; the field; when they end.
+def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
+    """Thrust that each rotor has lost, as a share, with intervals, by the first seconds; log efficiencies; their end.
 
     All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
     """
     part, end = first_seconds(flight)
     short = replace(LAYOUT, steps=15, most=16)
-    body = CorrectedBody(field.body, jnp.zeros(VEHICLE.rotors), jnp.zeros(3))
-    start = replace(field, body=body)
+    start = changed(fresh, np.zeros(VEHICLE.rotors))
     found = identify(start, [part], short, MEASURED, free=("log_efficiency",))
     efficiencies = [found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)]
     lost = [[1 - float(each[j]) for j in (0, 2, 1)] for each in efficiencies]
     worst = int(np.argmax(np.array(lost)[:, 0]))
-    alone = identify(start, [part], short, ("specific_force",), free=(f"log_efficiency[{worst}]",))
-    return np.array(lost), alone.field, end
+    alone: Any = identify(start, [part], short, ("specific_force",), free=(f"log_efficiency[{worst}]",)).field
+    return np.array(lost), np.asarray(alone.body.log_efficiency), end
+
+
+def changed(field: Any, log_efficiency) -> Any:
+    """The field with rotors that give other shares of their thrust."""
+    return replace(field, body=CorrectedBody(field.body, jnp.asarray(log_efficiency), jnp.zeros(3)))
 
 
 def main(folder: Path) -> None:
     console = Console(width=120)
     normal, cut = flights(folder)
-    here: Any = source(normal[:3]).field
+    whole = [each.recording for each in normal[:3]]
+    here, fresh = source(whole), source([first_seconds(each)[0] for each in normal[:3]])
     console.print("normal:", {name: np.asarray(value).tolist() for name, value in here.theta().items()})
     lines, shares, found = [], {}, []
     for flight in cut:
-        lost, field, end = damage(here, flight)
+        lost, efficiency, end = damage(fresh, flight)
         worst = int(lost[:, 0].argmax())
-        alone = 1 - float(np.exp(field.body.log_efficiency[worst]))
+        alone = 1 - float(np.exp(efficiency[worst]))
         shares.setdefault(flight.length, []).append(alone)
-        found.append([rms(force_errors(each, flight.recording, end)) for each in (here, field)])
+        found.append([rms(force_errors(each, flight.recording, end)) for each in (here, changed(here, efficiency))])
         value, low, high = lost[worst]
         cells = f"M{worst + 1}", f"{value:.3f}", f"{low:.3f} … {high:.3f}", f"{alone:.3f}"
         lines.append((f"{WHOLE - flight.length:g}", *cells, *(f"{each:.2f}" for each in found[-1])))
@@ -143,9 +151,8 @@ def main(folder: Path) -> None:
         others = {length: float(np.mean(part)) for length, part in shares.items() if length != flight.length}
         lengths = sorted({WHOLE, *others})
         lost = np.interp(flight.length, lengths, [others.get(length, 0.0) for length in lengths])
-        efficiency = jnp.zeros(VEHICLE.rotors).at[2].set(np.log1p(-lost))
-        changed = replace(here, body=CorrectedBody(here.body, efficiency, jnp.zeros(3)))
-        row.append(rms(force_errors(changed, flight.recording, first_seconds(flight)[1])))
+        efficiency = np.log1p(-lost * (np.arange(VEHICLE.rotors) == 2))
+        row.append(rms(force_errors(changed(here, efficiency), flight.recording, first_seconds(flight)[1])))
     lines = [(*line, f"{row[2]:.2f}") for line, row in zip(lines, found, strict=True)]
     pooled = np.sqrt(np.mean(np.square(found), axis=0))
     lines.append(("all", "", "", "", "", *(f"{each:.3f}" for each in pooled)))
