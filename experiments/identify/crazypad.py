@@ -48,6 +48,7 @@ _GRAMS = np.linspace(5, 50, 50)
 _CURVE = np.polynomial.polynomial.polyfit((0.088 * _GRAMS - 0.0006239 * _GRAMS**2) / FULL, _GRAMS * 9.81e-3 / 4, 2)
 ACTUATOR = Actuator(tuple(map(float, _CURVE)), "thrust", (0.06, 0.06), FULL, 1.0)
 LAYOUT = Layout(dt=0.01, steps=20, span=0.1, disturbance=(0.0,) * 3 + (0.5,) * 3)
+SHORT = replace(LAYOUT, steps=15)
 
 
 class Flight(NamedTuple):
@@ -97,11 +98,11 @@ def rms(errors: np.ndarray) -> float:
     return float(np.sqrt(np.mean(errors**2)))
 
 
-def source(normal: list[Recording]) -> Any:
+def source(normal: list[Flight]) -> Any:
     """What normal flights tell: effectiveness of each rotor, and lag."""
     learn = multirotor(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
-    return identify(field, normal, LAYOUT, MEASURED).field
+    return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
 
 
 def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, float]:
@@ -110,20 +111,24 @@ def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, 
     return cut_out(flight.recording, begin, begin + seconds), begin + seconds
 
 
+def take_off(field: Any, normal: list[Flight]) -> Any:
+    """The field with what normal flights tell of each rotor in the seconds after take-off."""
+    parts = [first_seconds(each)[0] for each in normal]
+    return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("log_efficiency",)).field
+
+
 def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
     """Thrust that each rotor has lost, as a share, with intervals, by the first seconds; log efficiencies; their end.
 
     All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
     """
-    part, end = first_seconds(flight)
-    short = replace(LAYOUT, steps=15, most=16)
-    start = changed(fresh, np.zeros(VEHICLE.rotors))
-    found = identify(start, [part], short, MEASURED, free=("log_efficiency",))
-    efficiencies = [found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)]
-    lost = [[1 - float(each[j]) for j in (0, 2, 1)] for each in efficiencies]
-    worst = int(np.argmax(np.array(lost)[:, 0]))
-    alone: Any = identify(start, [part], short, ("specific_force",), free=(f"log_efficiency[{worst}]",)).field
-    return np.array(lost), np.asarray(alone.body.log_efficiency), end
+    (part, end), whole = first_seconds(flight), np.asarray(fresh.body.log_efficiency)
+    found = identify(fresh, [part], SHORT, MEASURED, free=("log_efficiency",))
+    efficiencies = np.array([found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)])
+    lost = 1 - efficiencies[:, [0, 2, 1]] / np.exp(whole)[:, None]
+    worst = f"log_efficiency[{lost[:, 0].argmax()}]"
+    alone: Any = identify(fresh, [part], SHORT, ("specific_force",), free=(worst,)).field
+    return lost, np.asarray(alone.body.log_efficiency) - whole, end
 
 
 def changed(field: Any, log_efficiency) -> Any:
@@ -134,8 +139,8 @@ def changed(field: Any, log_efficiency) -> Any:
 def main(folder: Path) -> None:
     console = Console(width=120)
     normal, cut = flights(folder)
-    whole = [each.recording for each in normal[:3]]
-    here, fresh = source(whole), source([first_seconds(each)[0] for each in normal[:3]])
+    here = source(normal[:3])
+    fresh = take_off(here, normal[:3])
     console.print("normal:", {name: np.asarray(value).tolist() for name, value in here.theta().items()})
     lines, shares, found = [], {}, []
     for flight in cut:
@@ -145,7 +150,7 @@ def main(folder: Path) -> None:
         shares.setdefault(flight.length, []).append(alone)
         found.append([rms(force_errors(each, flight.recording, end)) for each in (here, changed(here, efficiency))])
         value, low, high = lost[worst]
-        cells = f"M{worst + 1}", f"{value:.3f}", f"{low:.3f} … {high:.3f}", f"{alone:.3f}"
+        cells = f"M{worst + 1}" if low > 0 else "none", f"{value:.3f}", f"{low:.3f} … {high:.3f}", f"{alone:.3f}"
         lines.append((f"{WHOLE - flight.length:g}", *cells, *(f"{each:.2f}" for each in found[-1])))
     for row, flight in zip(found, cut, strict=True):
         others = {length: float(np.mean(part)) for length, part in shares.items() if length != flight.length}
