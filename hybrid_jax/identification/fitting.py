@@ -191,7 +191,11 @@ def _first_scale(windows: Windows, name: str) -> Array:
 
 
 def _fit(field, theta, changes, problem: Problem, layout: Layout, max_steps: int, moves):
-    """Levenberg–Marquardt with the damping relative to the diagonal (Marquardt 1963)."""
+    """Levenberg–Marquardt with the damping relative to the diagonal (Marquardt 1963).
+
+    Optimistix would take a dense Jacobian of all errors with the 18 unknowns of each window, more than a gigabyte for
+    300 windows; here only the parameters are left of the normal equations.
+    """
     damping, at = 1e-3, normal_equations(field, theta, changes, problem, layout)
     for _ in range(max_steps):
         equations, offset, slope, _ = at
