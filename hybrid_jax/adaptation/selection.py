@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_free, ravel_parameters
-from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverse, masked, normal_equations
+from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverses, masked, normal_equations
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.programs import kept_jit
@@ -95,8 +95,7 @@ def left_out_steps(
     weight = counted[..., None]
     gram = jnp.sum(gram[places] * weight[..., None], axis=1)
     score = jnp.sum(score[places] * weight, axis=1)
-    inverses = jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram + held)
-    return -jnp.einsum("bpq,bq->bp", inverses, jnp.sum(score, axis=0) - score)
+    return -jnp.einsum("bpq,bq->bp", inverses(jnp.sum(gram, axis=0) - gram + held), jnp.sum(score, axis=0) - score)
 
 
 def predict_block(

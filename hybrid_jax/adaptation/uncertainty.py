@@ -117,9 +117,7 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
         clusters, of = -(-n // cluster), np.arange(n) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
         # What leaving a cluster out does to θ_p.
-        moves = jnp.einsum(
-            "gpq,gq->gp", jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram), score - jnp.mean(score, axis=0)
-        )
+        moves = jnp.einsum("gpq,gq->gp", inverses(jnp.sum(gram, axis=0) - gram), score - jnp.mean(score, axis=0))
         moves = moves - jnp.mean(moves, axis=0)
         return (clusters - 1) / clusters * moves.T @ moves
     half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
@@ -236,6 +234,11 @@ def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
     return jnp.linalg.inv(matrix / scales) / scales
 
 
+def inverses(matrices: Float[Array, "n p p"]) -> Float[Array, "n p p"]:
+    """The inverse of each, one after the other: two batches at once can wait for each other, see `matrices.solve`."""
+    return jax.lax.map(inverse, matrices)
+
+
 class DisturbanceSelection(eqx.Module):
     """The fit that was kept, with a disturbance of zero if none is needed, and why."""
 
@@ -288,7 +291,6 @@ def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
     Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
     """
     gram, score, square = equations
-    inverses = jax.vmap(inverse)(jnp.sum(gram, axis=0) - gram)
-    steps = -jnp.einsum("npq,nq->np", inverses, jnp.sum(score, axis=0) - score)
+    steps = -jnp.einsum("npq,nq->np", inverses(jnp.sum(gram, axis=0) - gram), jnp.sum(score, axis=0) - score)
     bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
     return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

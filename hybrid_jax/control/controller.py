@@ -19,6 +19,7 @@ from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
 from hybrid_jax.control.sensitivities import advance_lagged, condensed, condensed_lagged
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
+from hybrid_jax.matrices import solve
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, Input, State
 from hybrid_jax.vehicle import Vehicle
@@ -229,7 +230,7 @@ class Controller:
             return start, start[0]
 
         def attempt(damping):
-            step = _solve(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
+            step = solve(matrix + damping * jnp.eye(len(gradient), dtype=gradient.dtype), gradient)
             gain = step @ gradient + damping * step @ step  # decrease of the quadratic model
             variables = plan.variables - step.reshape(plan.variables.shape)
             variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
@@ -266,13 +267,3 @@ class Controller:
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)
         between = changes[:, None, :, None] * jnp.eye(self.vehicle.rotors)[:, None, :] * slope[:, :, None, None] * slope
         return slopes.T @ slopes + between.reshape(variables.size, variables.size), gradient
-
-
-@jax.custom_batching.sequential_vmap
-def _solve(matrix: Float[Array, "n n"], vector: Float[Array, " n"]) -> Float[Array, " n"]:
-    """matrix⁻¹ vector by Cholesky, one matrix after the other.
-
-    On a CPU a batch of factorisations uses the thread pool that also runs the devices; two devices that do so at once
-    deadlock.
-    """
-    return jax.scipy.linalg.cho_solve(jax.scipy.linalg.cho_factor(matrix), vector)

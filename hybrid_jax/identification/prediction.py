@@ -19,6 +19,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT, difference, measure, moved
 from hybrid_jax.identification.measured import Inputs, Layout, Windows
 from hybrid_jax.integrate import RK4, integrate
+from hybrid_jax.matrices import solve
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
@@ -109,11 +110,12 @@ def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
         start = change / unit
         inner = of_start.T @ of_start + jnp.eye(len(unit))
         score = of_start.T @ r + start
-        solved = jnp.linalg.solve(inner, jnp.concatenate([score[:, None], of_start.T @ of_theta], axis=1))
-        gram = of_theta.T @ of_theta - (of_theta.T @ of_start) @ solved[:, 1:]
-        reduced = of_theta.T @ r - (of_theta.T @ of_start) @ solved[:, 0]
+        right = jnp.concatenate([score[:, None], of_start.T @ of_theta, jnp.eye(len(unit))], axis=1)
+        step, by_theta, inverse = jnp.split(solve(inner, right), [1, 1 + p], axis=1)
+        gram = of_theta.T @ of_theta - (of_theta.T @ of_start) @ by_theta
+        reduced = of_theta.T @ r - (of_theta.T @ of_start) @ step[:, 0]
         cost = r @ r + start @ start
-        known = jnp.diagonal(jnp.linalg.inv(inner)) * unit**2
-        return NormalEquations(gram, reduced, cost), solved[:, 0] * unit, solved[:, 1:] * unit[:, None], known
+        known = jnp.diagonal(inverse) * unit**2
+        return NormalEquations(gram, reduced, cost), step[:, 0] * unit, by_theta * unit[:, None], known
 
     return jax.lax.map(one, ((problem.windows, problem.spread), changes), batch_size=CHUNK)
