@@ -150,7 +150,8 @@ class Stages:
         def run(path: Path, job: Callable[[], Sequence[Row]]) -> Sequence[Row]:
             return self._kept(name, path, lambda: (job(), {}))[0]
 
-        return [row for rows in self.parts(name, list(map(partial(partial, run), paths, jobs))) for row in rows]
+        runs = [partial(run, path, job) for path, job in zip(paths, jobs, strict=True)]
+        return [row for rows in self.parts(name, runs) for row in rows]
 
     def knows(self, name: str) -> bool:
         """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
