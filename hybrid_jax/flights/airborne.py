@@ -1,6 +1,6 @@
 """When the vehicle of a recording is in the air: motors that turn do not yet carry it.
 
-On the ground an accelerometer measures gravity whatever the thrust is, and near it the rotors' wake is held up.
+On the ground an accelerometer measures gravity whatever the thrust is. Near it the ground effect adds to the thrust.
 """
 
 import numpy as np
@@ -17,8 +17,8 @@ def airborne(recording: Recording, told: str = "command") -> list[tuple[float, f
     """Start and end [s] of each time in the air.
 
     Motors that idle for half a second end a flight. A flight that began with such a rest counts while the vehicle is
-    `CLEAR` above the height at which it stood; if no height is measured, it counts from `MARGIN` after the rest on and
-    as soon as the power has reached that of half of the flight, which carries the vehicle.
+    `CLEAR` above the height at which it stood. If no height is measured, it counts once `MARGIN` has passed since the
+    rest and the power has reached its median over the flight, which carries the vehicle.
 
     Args:
         told: the quantity that drives the rotors, "command" or "rotor_speed".
