@@ -76,7 +76,7 @@ def experiment(config: Config, console: Console) -> None:
 
 ABOUT = (
     "A partial differential equation from one trajectory: forecasts and parameters against published numbers, and "
-    "adaptation after a change. About 20 minutes on two idle cores; quick: 2 minutes."
+    "adaptation after a change. About 80 minutes on one busy core; quick: 2 minutes on two."
 )
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
