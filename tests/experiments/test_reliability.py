@@ -82,7 +82,7 @@ def whole(place):
 
 
 def kill(place, due, delay=0.0, flights=False):
-    """Start the command on a clean place and kill -9 it this long after `due()`; whether its run was unfinished then."""
+    """Start the command on a clean place and kill -9 it this long after `due()`; whether its run had not finished."""
     place.clear(flights)
     with place.begin() as process:
         while process.poll() is None and not due():
