@@ -24,7 +24,7 @@ from experiments.reporting.results import Results, Row
 from experiments.runner import command
 from experiments.runner.options import distinct
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Stages, identity_of, stages_of
+from experiments.runner.stages import Found, Stages, identity_of, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors
@@ -137,7 +137,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
 
     flights, seeds = pool[drawn[:: config.seeds]], range(config.seeds)
 
-    def of_draw(draw: int) -> list[Row]:
+    def of_draw(draw: int) -> Found:
         own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
         names, found = jax.device_get(_candidates(fields, own, flights, test, settings(config)))
         inside = [_share_inside(found["ends"][seed], np.delete(found["flown"][seed], draw, 0)) for seed in seeds]
@@ -148,11 +148,11 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
             numbers = {name: found[name][seed, i] for name in ("test_mse", "left_out")}
             return tags | numbers | {INSIDE: inside[seed] if taken else None}
 
-        return [row(seed, i) for seed in seeds for i in range(len(names))]
+        return [row(seed, i) for seed in seeds for i in range(len(names))], {}
 
-    jobs = [partial(of_draw, draw) for draw in range(config.draws)]
-    found = stages.kept_parts(f"adapt {domain.name}", jobs, identity_of(config.described(), fields, target))
-    return found + compared(fields, config, stages, target)
+    jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
+    found = stages.kept(f"adapt {domain.name}", jobs, identity_of(config.described(), fields, target))
+    return rows_of(found) + compared(fields, config, stages, target)
 
 
 def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages, target: Dataset) -> list[Row]:

@@ -22,7 +22,7 @@ from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
 from experiments.runner.options import Count
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Stages, identity_of, stages_of
+from experiments.runner.stages import Found, Stages, identity_of, rows_of, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
 from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
@@ -127,18 +127,19 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
     pool = flights.splits["train"]
     drawn, truth = windows_of(METHOD, config.sizes[0], config)[0], nominal(domain.vehicle)
 
-    def of_draw(draw: int) -> list[Row]:
+    def of_draw(draw: int) -> Found:
         windows = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
         logs, stds = jax.device_get(_fits(fields, windows, settings(config)))
         tags = {"domain": domain.name, "draw": draw}
-        return [
+        rows = [
             {**tags, "parameter": name, **_compared(logs[:, i], stds[:, i], np.log(truth[name] / nominal(IRIS)[name]))}
             for i, name in enumerate(LEARNED)
         ]
+        return rows, {}
 
     name = f"intervals {domain.name}, noise {config.noise:g}"
-    jobs = [partial(of_draw, draw) for draw in range(config.draws)]
-    return stages.kept_parts(name, jobs, identity_of(config.described(), fields, flights))
+    jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
+    return rows_of(stages.kept(name, jobs, identity_of(config.described(), fields, flights)))
 
 
 @partial(kept_jit, compiler_options=FAST_COMPILE)

@@ -38,7 +38,7 @@ class Config(Run):
     points: Count = 32
     """Grid points along each axis."""
     test: Count = 100
-    """Test trajectories of FitzHugh–Nagumo; of Gray–Scott a third."""
+    """Test trajectories of forecasts; after a shift, and of Gray–Scott, a third."""
     hidden: Count = 24
     """Hidden units of the pointwise residual of forecasts."""
     channels: Count = 8

@@ -12,7 +12,7 @@ from experiments.reaction_diffusion.config import Config
 from experiments.reaction_diffusion.models import error, pieces, predicted, weights
 from experiments.reaction_diffusion.systems import COARSE, STEPS, A, B, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.results import Row
-from experiments.runner.stages import Found, Kept
+from experiments.runner.stages import Found, Kept, rows_of
 from hybrid_jax.networks.normalisation import ChannelScaling
 
 PART = "forecast"
@@ -96,24 +96,19 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]
     truth = fitzhugh_nagumo(plane(config.points))
     test = reacting(truth, config.test, (TEST, 0))
     drawn = test[: min(KEPT, config.test)]
-    rows, shown = [], {"start": np.asarray(drawn.x0), "truth": np.asarray(drawn.x)}
-    for case in CASES:
-        if case.name not in config.cases:
-            continue
-        for seed in range(min(config.seeds, case.seeds)):
+    cases = [case for case in CASES if case.name in config.cases]
+    runs = [(case, seed) for case in cases for seed in range(min(config.seeds, case.seeds))]
 
-            def work(case=case, seed=seed) -> Found:
-                model = trained(case, config, seed)
-                row = {"part": PART, "case": case.name, "seed": seed, "draw": 0, "mse": error(model, test, COARSE)}
-                row |= _found(model) | {"trajectories": case.trajectories, "noise": case.noise}
-                arrays = {"weights": weights(model)}
-                return [row], arrays | {"forecast": np.asarray(predicted(model, drawn, COARSE))}
+    def work(case: Case, seed: int) -> Found:
+        model = trained(case, config, seed)
+        row = {"part": PART, "case": case.name, "seed": seed, "draw": 0, "mse": error(model, test, COARSE)}
+        row |= _found(model) | {"trajectories": case.trajectories, "noise": case.noise}
+        return [row], {"weights": weights(model), "forecast": np.asarray(predicted(model, drawn, COARSE))}
 
-            found, arrays = kept(f"{PART}: {case.name}, seed {seed}", work)
-            rows += found
-            if seed == 0:
-                shown[case.name] = arrays["forecast"]
-    return rows, shown
+    found = kept(PART, {f"{case.name}, seed {seed}": partial(work, case, seed) for case, seed in runs})
+    shown = {"start": np.asarray(drawn.x0), "truth": np.asarray(drawn.x)}
+    first = {case.name: found[f"{case.name}, seed {seed}"] for case, seed in runs if seed == 0}
+    return rows_of(found), shown | {name: arrays["forecast"] for name, (_, arrays) in first.items()}
 
 
 def _found(model: Any) -> dict[str, float | None]:

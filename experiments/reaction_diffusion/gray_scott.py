@@ -11,7 +11,7 @@ from experiments.reaction_diffusion.config import Config
 from experiments.reaction_diffusion.models import error, pieces, predicted, weights, with_weights
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
-from experiments.runner.stages import Found, Kept
+from experiments.runner.stages import Found, Kept, rows_of
 from hybrid_jax.networks import zero_output
 from hybrid_jax.networks.normalisation import ChannelScaling
 
@@ -48,37 +48,34 @@ def source_model(config: Config, kept: Kept) -> Any:
     # Zero at first, or 40 s of a wrong reaction hide the right one.
     source: Any = hj.Hybrid(physics, Conversion(zero_output(network), physics.grid))
     for held, most in STAGES:
-        name = f"{PART}: source in {len(data)} windows, F and k {'held' if held else 'free'}"
+        name = f"source in {len(data)} windows, F and k {'held' if held else 'free'}"
         train = partial(trained, source, data, min(most, config.steps), held)
-        source = with_weights(source, kept(name, train)[1]["weights"])
+        source = with_weights(source, kept(f"{PART} {name}", {name: train})[name][1]["weights"])
     return source
 
 
 def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
     """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
     source = source_model(config, kept)
-    rows, shown = [], {}
-    for index, environment in enumerate(NEW):
 
-        def adapt(index=index, environment=environment) -> Found:
-            truth = gray_scott([environment], reacts=True)
-            seen, test = (
-                patterns(truth, 0, 1, (ADAPT, index)),
-                patterns(truth, 0, -(-config.test // SHARE), (TEST, index)),
-            )
-            middle = hj.Hybrid(gray_scott([GUESS], reacts=False), source.residual)
-            fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), SCOTT_COARSE).field
-            feed, kill = (float(value[0]) for value in fitted.physics.theta().values())
-            row = {"part": PART, "environment": index, "seed": 0, "draw": 0, "F": environment[0], "k": environment[1]}
-            row |= {"found_F": feed, "found_k": kill, "mse": error(fitted, test, SCOTT_COARSE)}
-            row |= {"mse_before": error(middle, test, SCOTT_COARSE)}
-            return [row], {
-                "start": np.asarray(test.x0[:1]),
-                "truth": np.asarray(test.x[:1]),
-                SOLVED: np.asarray(predicted(fitted, test[:1], SCOTT_COARSE)),
-            }
+    def adapt(index: int, environment: tuple[float, float]) -> Found:
+        truth = gray_scott([environment], reacts=True)
+        seen, test = (
+            patterns(truth, 0, 1, (ADAPT, index)),
+            patterns(truth, 0, -(-config.test // SHARE), (TEST, index)),
+        )
+        middle = hj.Hybrid(gray_scott([GUESS], reacts=False), source.residual)
+        fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), SCOTT_COARSE).field
+        feed, kill = (float(value[0]) for value in fitted.physics.theta().values())
+        row = {"part": PART, "environment": index, "seed": 0, "draw": 0, "F": environment[0], "k": environment[1]}
+        row |= {"found_F": feed, "found_k": kill, "mse": error(fitted, test, SCOTT_COARSE)}
+        row |= {"mse_before": error(middle, test, SCOTT_COARSE)}
+        return [row], {
+            "start": np.asarray(test.x0[:1]),
+            "truth": np.asarray(test.x[:1]),
+            SOLVED: np.asarray(predicted(fitted, test[:1], SCOTT_COARSE)),
+        }
 
-        found, arrays = kept(f"{PART}: F and k in new environment {index}", adapt)
-        rows += found
-        shown = shown or arrays
-    return rows, shown
+    jobs = {f"environment {index}": partial(adapt, index, environment) for index, environment in enumerate(NEW)}
+    found = kept(f"{PART} F and k", jobs)
+    return rows_of(found), next(iter(found.values()))[1]

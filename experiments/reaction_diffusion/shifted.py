@@ -1,5 +1,9 @@
 """The second study: the equations change, and a few trajectories show how: the paper's Figs. 3 and 5 for a PDE."""
 
+from functools import cache, partial
+from itertools import product
+from typing import Any
+
 import jax
 import numpy as np
 
@@ -10,7 +14,7 @@ from experiments.reaction_diffusion.models import error, pieces, weights, with_w
 from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
-from experiments.runner.stages import Found, Kept
+from experiments.runner.stages import Found, Kept, rows_of
 from hybrid_jax.dynamics.disturbance import physics_of, without_disturbance
 
 PART, AUTO = "shifted", "auto"
@@ -20,6 +24,7 @@ SOURCES = 2  # trajectories that a source learns from
 EVERY = 12  # intervals between the windows to learn from
 TUNING, SCRATCH = 6, 14  # most Gauss–Newton steps from the source, and from random weights
 WINDOW = 3  # intervals of a window to adapt parameters to
+SHARE = 3  # test trajectories: --test over this
 MODELS = {HYBRID: 1, NO_PHYSICS: 3}  # kernel of the network
 
 
@@ -37,56 +42,76 @@ def learned(field, data: hj.Trajectories, steps: int) -> hj.AbstractVectorField:
 
 def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.AbstractVectorField, str | None]:
     """Adapted by a method that leaves the network alone, or may; and what `auto` chose."""
+    every = max(WINDOW, WINDOW * len(data) // 2)  # with N = 2 or more the same number of windows, as they are dear
     settings = hj.Settings(solver=COARSE)
-    result = hj.adapt(field, pieces(data, WINDOW, WINDOW), method=method, settings=settings)
+    result = hj.adapt(field, pieces(data, every, WINDOW), method=method, settings=settings)
     return result.field, result.chosen
 
 
 def study(config: Config, kept: Kept) -> list[Row]:
     """A row for each shift, model, way of learning, number of trajectories and seed."""
-    grid, rows = plane(config.points), []
-    for seed in range(config.seeds):
-        source_data = reacting(fitzhugh_nagumo(grid), SOURCES, (SOURCE, seed))
-        sources = {}
-        for model in MODELS:
-            start = untrained(model, config, seed)
+    trained = sources(config, kept)
+    rows = [row for shift in config.shifts for row in before(config, trained, shift)]
+    of_source = {(row["shift"], row["model"], row["seed"]): row["mse"] for row in rows}
+    jobs = {}
+    for seed, shift, model, n in product(range(config.seeds), config.shifts, MODELS, config.sizes):
+        known = trained[model, seed], of_source[shift, model, seed]
+        jobs[f"{shift}, {model}, N = {n}, seed {seed}"] = partial(adapted, config, *known, shift, model, n, seed)
+    return rows + rows_of(kept(PART, jobs))
 
-            def train(start=start, data=source_data) -> Found:
-                return [], {"weights": weights(learned(start, data, config.steps))}
 
-            found = kept(f"{PART}: source, {model}, seed {seed}", train)[1]["weights"]
-            sources[model] = with_weights(start, found)
-        for shift in config.shifts:
-            truth = fitzhugh_nagumo(grid, *SHIFTS[shift])
-            pool = reacting(truth, max(config.sizes), (TARGET, seed))
-            test = reacting(truth, config.test, (TEST, 0))
-            for model, source in sources.items():
-                before = error(source, test, COARSE)
-                tags = {"part": PART, "shift": shift, "model": model, "seed": seed, "draw": 0}
-                rows.append(tags | {"mode": SOURCE_ONLY, "n": 0, "mse": before, "rho": 0.0})
-                for n in config.sizes:
-                    name = f"{PART}: {shift}, {model}, {n}, seed {seed}"
+def sources(config: Config, kept: Kept) -> dict[tuple[str, int], hj.AbstractVectorField]:
+    """Models of the equations before the change, by name and seed."""
 
-                    def adapt(model=model, source=source, data=pool[:n], before=before, tags=tags, test=test) -> Found:
-                        fresh = untrained(model, config, tags["seed"])
-                        fields = {
-                            FINE_TUNED: learned(source, data, min(TUNING, config.steps)),
-                            TARGET_ONLY: learned(fresh, data, min(SCRATCH, config.steps)),
-                        }
-                        chosen = {}
-                        if model == HYBRID:
-                            fields[LEAST_SQUARES], _ = by_parameters(source, data, "theta_least_squares")
-                            fields[AUTO], chosen[AUTO] = by_parameters(source, data, "auto")
-                        errors = {mode: error(field, test, COARSE) for mode, field in fields.items()}
-                        return [
-                            tags
-                            | {"mode": mode, "n": len(data), "mse": mse, "rho": 1 - mse / before}
-                            | {"chosen": chosen.get(mode), "diffusivity": _diffusivity(fields[mode])}
-                            for mode, mse in errors.items()
-                        ], {}
+    def train(model: str, seed: int) -> Found:
+        data = reacting(fitzhugh_nagumo(plane(config.points)), SOURCES, (SOURCE, seed))
+        return [], {"weights": weights(learned(untrained(model, config, seed), data, config.steps))}
 
-                    rows += kept(name, adapt)[0]
-    return rows
+    each = list(product(MODELS, range(config.seeds)))
+    found = kept(f"{PART} source", {f"{model}, seed {seed}": partial(train, model, seed) for model, seed in each})
+    return {
+        (model, seed): with_weights(untrained(model, config, seed), found[f"{model}, seed {seed}"][1]["weights"])
+        for model, seed in each
+    }
+
+
+def before(config: Config, trained, shift: str) -> list[Row]:
+    """The rows of the sources as they are, after a shift."""
+    test = tested(config, shift)
+    return [
+        _tags(shift, model, seed) | {"mode": SOURCE_ONLY, "n": 0, "mse": error(source, test, COARSE), "rho": 0.0}
+        for (model, seed), source in trained.items()
+    ]
+
+
+@cache
+def tested(config: Config, shift: str) -> hj.Trajectories:
+    return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), -(-config.test // SHARE), (TEST, 0))
+
+
+def adapted(config: Config, source, error_before: float, shift: str, model: str, n: int, seed: int) -> Found:
+    """The rows of a source that is adapted to N trajectories in each way."""
+    truth = fitzhugh_nagumo(plane(config.points), *SHIFTS[shift])
+    data, test = reacting(truth, max(config.sizes), (TARGET, seed))[:n], tested(config, shift)
+    chosen = {}
+    fields = {
+        FINE_TUNED: learned(source, data, min(TUNING, config.steps)),
+        TARGET_ONLY: learned(untrained(model, config, seed), data, min(SCRATCH, config.steps)),
+    }
+    if model == HYBRID:
+        fields[LEAST_SQUARES], _ = by_parameters(source, data, "theta_least_squares")
+        fields[AUTO], chosen[AUTO] = by_parameters(source, data, "auto")
+    errors = {mode: error(field, test, COARSE) for mode, field in fields.items()}
+    return [
+        _tags(shift, model, seed)
+        | {"mode": mode, "n": n, "mse": mse, "rho": 1 - mse / error_before}
+        | {"chosen": chosen.get(mode), "diffusivity": _diffusivity(fields[mode])}
+        for mode, mse in errors.items()
+    ], {}
+
+
+def _tags(shift: str, model: str, seed: int) -> dict[str, Any]:
+    return {"part": PART, "shift": shift, "model": model, "seed": seed, "draw": 0}
 
 
 def _diffusivity(field) -> list[float] | None:

@@ -3,14 +3,15 @@
 import json
 import re
 import time
-from collections.abc import Callable, Sequence
-from contextlib import nullcontext
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
 import numpy as np
+from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.reporting.results import Row
@@ -35,7 +36,8 @@ FINISHED_BY = ("jax", "hybrid_jax")
 
 Result = TypeVar("Result")
 Found = tuple[Sequence[Row], dict[str, np.ndarray]]  # of a job: rows, and arrays by name
-Kept = Callable[[str, Callable[[], Found]], Found]  # `Stages.kept` of some inputs
+Job = Callable[[], Found]
+Kept = Callable[[str, Mapping[str, Job]], dict[str, Found]]  # `Stages.kept` of some inputs
 
 
 class Stages:
@@ -61,12 +63,18 @@ class Stages:
     ) -> FitState:
         """The final states of a sweep on the train and validation splits of a dataset; see `sweep`.
 
+        Two processes with one cache do not train the same sweep: the second waits for the first.
+
         Raises:
             OtherRun: the sweep was begun by other versions of the libraries.
             ValueError: the cached result is damaged; the message names the file, so that it can be deleted.
             OSError: the state cannot be saved.
         """
         finished = self._folder / f"{_stem(name)}-{_identity(states, plans, settings, data)[:16]}.npz"
+        with self._alone(name, finished.with_suffix(".lock")):
+            return self._run(name, states, plans, settings, data, min_capacity, finished)
+
+    def _run(self, name, states, plans, settings, data, min_capacity, finished: Path) -> FitState:
         begun = finished.with_suffix(".begun")
         checkpoints = Checkpoints(begun)
         if self._fresh and hosts.is_main_process():
@@ -131,27 +139,23 @@ class Stages:
                 line.show_parts(len(results), len(jobs))
         return results
 
-    def kept(self, name: str, work: Callable[[], Found], identity: str) -> Found:
-        """Rows and arrays of a job, as one timed stage; they are kept in the cache, and so run once.
+    def kept(self, name: str, jobs: Mapping[str, Job], identity: str) -> dict[str, Found]:
+        """Rows and arrays of each job, as by `parts`; they are kept in the cache, and so run once.
 
-        `identity` says what determines them; see `identity_of`.
+        `identity` says what determines them, besides their names; see `identity_of`.
         """
-        (path,) = self._places(name, identity, 1)
-        if path.exists():
-            self.reused.append(name)
-        return self.timed(name, lambda: self._kept(name, path, work), "compiling and solving")
-
-    def kept_parts(self, name: str, jobs: Sequence[Callable[[], Sequence[Row]]], identity: str) -> list[Row]:
-        """The rows of jobs, as `parts`, each kept in the cache as by `kept`."""
-        paths = self._places(name, identity, len(jobs))
-        if kept := sum(path.exists() for path in paths):
-            self.reused.append(f"{kept} of {len(jobs)} parts of {name}")
-
-        def run(path: Path, job: Callable[[], Sequence[Row]]) -> Sequence[Row]:
-            return self._kept(name, path, lambda: (job(), {}))[0]
-
-        runs = [partial(run, path, job) for path, job in zip(paths, jobs, strict=True)]
-        return [row for rows in self.parts(name, runs) for row in rows]
+        folder = self._folder / f"{_stem(name)}-{identity[:16]}"
+        if self._fresh and folder.exists() and hosts.is_main_process():
+            self._say(f"{folder}: moved aside to {folder.rename(backup_path(folder, 'before')).name}")
+        paths = {job: folder / f"{_stem(job)}.npz" for job in jobs}
+        found = {job: self._load(name, path) for job, path in paths.items() if path.exists()}
+        if found:
+            self.reused.append(name if len(found) == len(jobs) else f"{len(found)} of {len(jobs)} parts of {name}")
+        missing = [job for job in jobs if job not in found]
+        if missing:
+            ran = self.parts(name, [partial(_run_and_save, paths[job], jobs[job]) for job in missing])
+            found |= dict(zip(missing, ran, strict=True))
+        return {job: found[job] for job in jobs}
 
     def knows(self, name: str) -> bool:
         """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
@@ -163,27 +167,29 @@ class Stages:
         saved = f"Saving checkpoints took {self._saving / (self._ran or 1):.2%} of the sweeps' time."
         return [reused] * bool(self.reused) + [saved] * bool(self._ran)
 
-    def _places(self, name: str, identity: str, jobs: int) -> list[Path]:
-        """A file for each of the jobs of a stage; with `fresh`, earlier ones are moved aside."""
-        folder = self._folder / f"{_stem(name)}-{identity[:16]}"
-        if self._fresh and folder.exists() and hosts.is_main_process():
-            self._say(f"{folder}: moved aside to {folder.rename(backup_path(folder, 'before')).name}")
-        return [folder / f"{index}.npz" for index in range(jobs)]
+    @contextmanager
+    def _alone(self, name: str, path: Path) -> Iterator[None]:
+        """Hold the lock file of a sweep; wait while another process does."""
+        if not hosts.is_main_process():  # it alone reads and writes
+            yield
+            return
+        path.parent.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(path)  # released with the process
+        try:
+            lock.acquire(timeout=0)
+        except Timeout:
+            with Line(name, self._console, "waiting for another run with this cache, which is at it"):
+                lock.acquire()
+        try:
+            yield
+        finally:
+            lock.release()
 
-    def _kept(self, stage: str, path: Path, work: Callable[[], Found]) -> Found:
-        """What a file holds, whose seconds are added to the stage's; or else what a job finds, which is then kept."""
-        if path.exists():
-            about, arrays = load_archive(path, JOB_FORMAT)
-            self.seconds[stage] = self.seconds.get(stage, 0.0) + about["seconds"]
-            return json.loads(about["rows"]), arrays
-        began = time.perf_counter()
-        rows, arrays = work()
-        # As text: errors may be infinite, which an archive's own JSON may not be.
-        text = json.dumps(rows, default=lambda number: number.item())
-        if hosts.is_main_process():
-            path.parent.mkdir(parents=True, exist_ok=True)
-            save_archive(path, JOB_FORMAT, {"rows": text, "seconds": time.perf_counter() - began}, arrays)
-        return json.loads(text), arrays
+    def _load(self, stage: str, path: Path) -> Found:
+        """What a job found before; its seconds are added to the stage's."""
+        about, arrays = load_archive(path, JOB_FORMAT)
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + about["seconds"]
+        return json.loads(about["rows"]), arrays
 
     def _back_up(self, finished: Path, begun: Path) -> None:
         stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
@@ -192,6 +198,11 @@ class Stages:
 
     def _say(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
+
+
+def rows_of(found: Mapping[str, Found]) -> list[Row]:
+    """The rows of all jobs, in their order."""
+    return [row for rows, _ in found.values() for row in rows]
 
 
 def stages_of(config: Run, console: Console) -> Stages:
@@ -217,6 +228,17 @@ def identity_of(*inputs: Any) -> str:
             case _:
                 fixed.append(json_value(value))
     return digest(fixed, arrays)
+
+
+def _run_and_save(path: Path, work: Job) -> Found:
+    began = time.perf_counter()
+    rows, arrays = work()
+    # As text: errors may be infinite, which an archive's own JSON may not be.
+    text = json.dumps(rows, default=lambda number: number.item())
+    if hosts.is_main_process():
+        path.parent.mkdir(parents=True, exist_ok=True)
+        save_archive(path, JOB_FORMAT, {"rows": text, "seconds": time.perf_counter() - began}, arrays)
+    return json.loads(text), arrays
 
 
 def summary(states: FitState) -> str:

@@ -1,12 +1,14 @@
 """A sweep is run once, survives an interrupt, and is found again only by what determines it."""
 
 import signal
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from functools import partial
 
 import jax
 import numpy as np
 import pytest
+from filelock import FileLock
 from pendulum import DAMPING, pendulum, swings
 from rich.console import Console
 
@@ -15,7 +17,7 @@ from experiments.paper.tables import run_notes
 from experiments.reporting.results import Results
 from experiments.runner.progress import Line
 from experiments.runner.run_record import OtherRun
-from experiments.runner.stages import Stages, identity_of
+from experiments.runner.stages import Stages, identity_of, rows_of
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane, stack
@@ -54,6 +56,21 @@ def test_a_finished_sweep_is_loaded(folder, whole):
     assert same(again, whole)
 
 
+def test_two_runs_with_one_cache_train_a_sweep_once(tmp_path, whole):
+    run(tmp_path)
+    (finished,) = tmp_path.glob("*.npz")
+    away = finished.rename(tmp_path / "away")
+    with ThreadPoolExecutor() as pool:
+        with FileLock(finished.with_suffix(".lock")):
+            second = pool.submit(run, tmp_path)
+            with pytest.raises(TimeoutError):
+                second.result(timeout=1.0)
+            away.rename(finished)
+        states, stages = second.result()
+    assert stages.reused == ["a sweep"]
+    assert same(states, whole)
+
+
 def interrupt(folder, monkeypatch):
     """Send SIGINT during the second block of epochs; returns the epochs after each block."""
     seen = []
@@ -73,7 +90,8 @@ def interrupt(folder, monkeypatch):
 @pytest.mark.usefixtures("heard")
 def test_an_interrupted_sweep_goes_on_and_ends_in_the_same_bits(tmp_path, whole, monkeypatch):
     seen, later = interrupt(tmp_path, monkeypatch), []
-    assert [path.name.endswith(".begun") for path in tmp_path.iterdir()] == [True]  # the block was finished, and saved
+    assert not list(tmp_path.glob("*.npz"))
+    assert len(list(tmp_path.glob("*.begun"))) == 1  # the block was finished, and saved
     monkeypatch.setattr(Line, "show_sweep", lambda self, progress: later.append(progress.epochs))
     resumed, found = run(tmp_path)
     assert later[0] > seen[1]  # it did not start anew
@@ -135,10 +153,10 @@ def parts(folder, done, inputs=(1,), fresh=False, stop=None):
         if index == stop:
             raise KeyboardInterrupt
         done.append(index)
-        return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}]
+        return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}], {}
 
     stages = Stages(folder, Console(quiet=True), fresh=fresh)
-    return stages.kept_parts("some parts", [partial(job, i) for i in range(4)], identity_of(*inputs))
+    return rows_of(stages.kept("some parts", {str(i): partial(job, i) for i in range(4)}, identity_of(*inputs)))
 
 
 def test_finished_parts_are_kept(tmp_path):
@@ -159,8 +177,10 @@ def test_a_job_that_is_kept_gives_the_same_rows_and_arrays(tmp_path):
         ran.append(1)
         return [{"error": np.inf, "seed": np.int32(3)}], {"path": np.arange(3.0)}
 
-    found = [Stages(tmp_path, Console(quiet=True)).kept("a: job", job, identity_of(1)) for _ in range(2)]
+    stages = [Stages(tmp_path, Console(quiet=True)) for _ in range(2)]
+    found = [each.kept("jobs", {"a: job": job}, identity_of(1))["a: job"] for each in stages]
     assert len(ran) == 1
+    assert (stages[0].reused, stages[1].reused) == ([], ["jobs"])
     assert found[0][0] == found[1][0] == [{"error": np.inf, "seed": 3}]
     assert np.array_equal(found[0][1]["path"], found[1][1]["path"])
 
