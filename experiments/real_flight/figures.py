@@ -61,7 +61,7 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     power, kind = (1, 1) if experiment.config.protocol == "nanodrone" else (2, 0)
     figure, panels = subplots((PAGE, 5.6), 2, 2, sharex=True)
     most = max(outputs.table["n_train"])
-    curves_of = {tuple(row[tag] for tag in TAGS): errors[kind] for row, errors in outputs.tests}
+    curves_of = {tuple(test.row[tag] for tag in TAGS): test.errors[kind] for test in outputs.tests}
 
     def curves(group: Results) -> np.ndarray:
         """Of each seed and quantity, over the test windows of all folds."""

@@ -42,7 +42,7 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
     """Write models, figures and, last, the report; print its main tables."""
     out, rows, stages = experiment.config.out / name, outputs.table, experiment.stages
     save_models(out / "models", experiment, outputs)
-    claims, nominal = scoring.verdicts(rows), named_parameters(experiment.before.physics())
+    claims, nominal = scoring.verdicts(outputs.replicates), named_parameters(experiment.before.physics())
     shares = {log: (fold.name, each) for fold in outputs.folds for log, each in outside_of_training(fold).items()}
     main = [expected_table(outputs.selections), *score_tables(rows, experiment.dt)]
     main += [verdict_table(claims, "Hypotheses")] if claims else []
@@ -57,6 +57,7 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
         ],
         "selections": [selected.described() for selected in outputs.selections],
         "outside": {flight: each for flight, (_, each) in shares.items()},
+        "replicates": outputs.replicates.rows,
         "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
     figures = save_figures(out, make_figures(experiment, outputs), experiment.config.paper)

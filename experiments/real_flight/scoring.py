@@ -7,12 +7,12 @@ units; theta_interval: their 95 % intervals [low, high]. Both are None where the
 
 from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby, product
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int
+from jaxtyping import Bool, Float, Int
 
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
 from experiments.real_flight.logs import non_overlapping
@@ -46,23 +46,43 @@ ROUND = 25  # their number is a multiple of it
 
 Cell = tuple[str, str, int]  # model, mode, n_train
 Cells = Mapping[Cell, Results]
-Test = tuple[dict[str, Any], np.ndarray]  # a row, and its errors at every step: RMS and mean over windows, (2, 4, t)
+Replicates = Sequence[tuple[str, Bool[np.ndarray, " n"]]]  # test flights, or manoeuvres, and which windows are theirs
+
+
+class Test(NamedTuple):
+    """A model tested in one fold."""
+
+    row: dict[str, Any]
+    errors: Float[np.ndarray, "2 4 t"]  # at every step: RMS and mean over windows
+    replicates: list[dict[str, Any]]  # a row with the scores of each
 
 
 def score(
-    field: AbstractVectorField, *, windows: Trajectories, config: RealFlightConfig, fold: str, **columns: Any
+    field: AbstractVectorField,
+    *,
+    windows: Trajectories,
+    replicates: Replicates,
+    config: RealFlightConfig,
+    fold: str,
+    **columns: Any,
 ) -> Test:
     """Test a field; `columns` are further columns of the row."""
-    rms, mean = errors_by_step(field, windows)
+    errors = flight_errors(field, windows)
+    rms, mean = by_step(errors)
     row = {"fold": fold, "model": "", "mode": "", "n_train": 0, "seed": 0, "recipe": "", "windows": len(windows)}
     row |= {"val_loss": None, "epochs": 0, "status": "ok", "scores": scores(rms, mean, config)}
-    row |= {"theta": None, "theta_interval": None}
-    return row | columns, np.stack([rms, mean])
+    row |= {"theta": None, "theta_interval": None} | columns
+    of_each = [
+        {"replicate": name}
+        | {tag: row[tag] for tag in TAGS}
+        | {"scores": scores(*by_step(FlightErrors(*(part[own] for part in errors))), config)}
+        for name, own in replicates
+    ]
+    return Test(row, np.stack([rms, mean]), of_each)
 
 
-def errors_by_step(field: AbstractVectorField, windows: Trajectories) -> tuple[np.ndarray, np.ndarray]:
+def by_step(errors: FlightErrors) -> tuple[np.ndarray, np.ndarray]:
     """RMS and mean of the errors over the windows, (4, t) each."""
-    errors = flight_errors(field, windows)
     rms = [np.sqrt(np.mean(np.square(part, dtype=float), axis=0)) for part in errors]
     return np.array(rms), np.array([np.mean(part, axis=0, dtype=float) for part in errors])
 
@@ -173,7 +193,7 @@ def pooled(rows: Results, label: str, quantity: str) -> np.ndarray:
 
 
 def verdicts(rows: Results) -> list[Verdict]:
-    """Evaluate each hypothesis that the rows can answer."""
+    """Evaluate each hypothesis that the rows of replicates can answer."""
     found = cells(rows)
     sizes = sorted({n for _, _, n in found} - {0})
     mode, most = ("fine_tuned", sizes[-1]) if sizes else ("source_only", 0)
@@ -211,13 +231,13 @@ def _better(name: str, cell: Cell, others: Sequence[Cell], of: str) -> Claim[Cel
         return every(outcomes), f"error over that of the best of them: {', '.join(words)}"
 
     text = f"{cell_name(*cell)}, has smaller errors than {of} in every quantity"
-    return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over folds and seeds).", predicate)
+    return Claim(name, f"{text} (95 % interval of the geometric mean ratio, over test flights and seeds).", predicate)
 
 
 def _log_ratio(rows: Results, others: Results, column: str) -> Interval:
-    """log(error / other error), of the same fold and seed; a baseline, which has no seeds, of the same fold."""
-    theirs = {(row["fold"], row["seed"]): error for row, error in zip(others, others.numbers(column), strict=True)}
-    pairs = [(row["fold"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]
+    """log(error / other error), of the same replicate and seed; a baseline, without seeds, of the same replicate."""
+    theirs = {(row["replicate"], row["seed"]): error for row, error in zip(others, others.numbers(column), strict=True)}
+    pairs = [(row["replicate"], row["seed"] if len(others.unique("seed")) > 1 else others[0]["seed"]) for row in rows]
     with np.errstate(all="ignore"):
         ratios = np.log(rows.numbers(column) / np.array([theirs[pair] for pair in pairs]))
-    return mean_interval(ratios, rows["seed"], rows["fold"])
+    return mean_interval(ratios, rows["seed"], rows["replicate"])

@@ -21,7 +21,16 @@ from experiments.real_flight.logs import (
     sampled_indices,
 )
 from experiments.real_flight.models import RECIPES, equivalent_recipe, thrust_baseline
-from experiments.real_flight.scoring import BASELINES, QUANTITIES, SUM, TAGS, Test, linear_residuals, parameters
+from experiments.real_flight.scoring import (
+    BASELINES,
+    QUANTITIES,
+    SUM,
+    TAGS,
+    Replicates,
+    Test,
+    linear_residuals,
+    parameters,
+)
 from experiments.real_flight.selection import BLEND, Selection
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting import names
@@ -29,7 +38,8 @@ from experiments.reporting.results import Results
 from hybrid_jax.dynamics.base import AbstractVectorField, Blend
 from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.flights.windows import count_windows, cut_windows
+from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.windows import count_windows, cut_windows, require_length
 from hybrid_jax.trajectories import Trajectories
 
 CHOICE_SEEDS = 2  # seeds that are trained to choose a candidate
@@ -48,7 +58,12 @@ class Outputs:
 
     @property
     def table(self) -> Results:
-        return Results([row for row, _ in self.tests], TAGS)
+        return Results([test.row for test in self.tests], TAGS)
+
+    @property
+    def replicates(self) -> Results:
+        """The scores of every model on each test flight, or manoeuvre."""
+        return Results([row for test in self.tests for row in test.replicates], (*TAGS, "replicate"))
 
 
 def run_folds(experiment: Experiment) -> Outputs:
@@ -160,12 +175,20 @@ class Trainer:
         cut = {name: cut_windows(logs, config.longest).windows for name, logs in long.items()}
         return {name: evenly_spaced(windows, CHOICE_WINDOWS) for name, windows in cut.items()}
 
+    def test_windows(self) -> tuple[Trajectories, Replicates]:
+        """All windows of the test flights, and which belong to each flight, or manoeuvre."""
+        config = self.experiment.config
+        logs = require_length(self.fold.test, config.longest)
+        cut, of = cut_windows(logs, config.longest), GROUP_BY[config.validated_by]
+        names = np.repeat([of(log) for log in logs], cut.sizes)
+        return cut.windows, [(name, names == name) for name in dict.fromkeys(names.tolist())]
+
     def log_errors(self, candidate: str, seeds: int, size: int) -> np.ndarray:
         """Logs of a candidate's errors, (flights, seeds, labels, quantities)."""
         fields, config = self.fields(candidate, seeds, size), self.experiment.config
 
         def of(field: AbstractVectorField, windows: Trajectories) -> np.ndarray:
-            found = scoring.scores(*scoring.errors_by_step(field, windows), config)
+            found = scoring.scores(*scoring.by_step(flight_errors(field, windows)), config)
             return np.array([list(errors.values()) for errors in found.values()])
 
         errors = [[of(field, windows) for field in fields] for windows in self.tested.values()]
@@ -225,8 +248,8 @@ def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Sou
 def _test(trainer: Trainer, outputs: Outputs, number: int, selections: Sequence[Selection]) -> Iterable[Test]:
     """Test all models of a fold, with the recipe that was chosen for the largest N, and what was chosen."""
     config = trainer.experiment.config
-    windows = cut_windows(trainer.fold.test, config.longest).windows
-    score = partial(scoring.score, windows=windows, config=config, fold=trainer.fold.name)
+    windows, replicates = trainer.test_windows()
+    score = partial(scoring.score, windows=windows, replicates=replicates, config=config, fold=trainer.fold.name)
     for model in (names.HOLD, names.THRUST):
         yield score(*trainer.fields(model, 1, 0), model=model, mode=names.NOMINAL)
     chosen = recipe_of(max(selections, key=lambda each: each.n_train), config)

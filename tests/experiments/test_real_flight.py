@@ -175,18 +175,20 @@ def test_folds_are_pooled_by_their_windows():
 
 
 @pytest.mark.parametrize(("noise", "decided"), [(0.01, True), (1.0, False)])
-def test_verdicts_are_decided_by_ratios_of_errors_over_folds_and_seeds(noise, decided):
+def test_verdicts_are_decided_by_ratios_of_errors_over_flights_and_seeds(noise, decided):
     rng = np.random.default_rng(0)
 
     def runs(mode, value, seeds=range(3), **columns):
         sizes = np.exp(noise * rng.normal(size=(4, len(seeds))))
         return [
-            row(mode, value * sizes[i, s], seed=s, fold=fold, **columns) for i, fold in enumerate("abcd") for s in seeds
+            row(mode, value * sizes[i, s], seed=s, replicate=flight, **columns)
+            for i, flight in enumerate("abcd")
+            for s in seeds
         ]
 
     rows = runs("fine_tuned", 1.0) + runs("scratch", 2.0) + runs("zero_shot", 0.5, n=0)
     rows += runs("nominal", 4.0, [0], n=0, model="hold") + runs("fine_tuned", 0.9, model="no_physics")
-    found = {each.id: each for each in verdicts(Results(rows, TAGS))}
+    found = {each.id: each for each in verdicts(Results(rows, (*TAGS, "replicate")))}
     if decided:
         assert {id: each.holds for id, each in found.items()} == {"F1": True, "F2": False, "F3": True, "F4": False}
         ratio = float(re.search(r"step 10 velocity (\S+) \(", found["F1"].measured)[1])
