@@ -25,8 +25,8 @@ Shift = Literal["parameter_shift", "new_term"]
 class Config(Run):
     """Learn and adapt reaction-diffusion equations."""
 
-    seeds: Count = 3
-    """Trials: initial weights and training trajectories. Cases that are dear take fewer: the tables say how many."""
+    seeds: Count = 10
+    """Trials: initial weights and training trajectories. Forecasts take three at most: the tables say how many."""
     parts: tuple[Part, ...] = get_args(Part)
     """forecast: as APHYNITY. shifted: adapt to changed equations. gray_scott: as Neural Context Flows."""
     cases: tuple[CaseName, ...] = get_args(CaseName)

@@ -47,13 +47,13 @@ POINTWISE, CONVOLUTION = "pointwise", "convolution"
 LOCAL = "convolution, neighbours penalised"
 NOISY = {noise: f"pointwise, noise {noise:g}" for noise in (1e-3, 1e-2)}
 CASES = (
-    Case(POINTWISE, seeds=10),
+    Case(POINTWISE, seeds=3),
     Case(NOISY[1e-3], noise=1e-3),
     Case(NOISY[1e-2], noise=1e-2),
     Case(CONVOLUTION, 3),
     Case("convolution, least action", 3, penalty="residual_norm", weight=1e-5),
     Case("convolution, correlation (paper)", 3, penalty="trajectory_correlation", weight=1e-3),
-    Case(LOCAL, 3, penalty="neighbour_weights", weight=1.0, seeds=10),
+    Case(LOCAL, 3, penalty="neighbour_weights", weight=1.0, seeds=3),
     Case("no physics, convolution", 3, physics="none"),
     Case("physics alone: diffusion", 0),
     Case("physics alone: complete", 0, physics="complete"),

@@ -42,7 +42,7 @@ def learned(field, data: hj.Trajectories, steps: int) -> hj.AbstractVectorField:
 
 def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.AbstractVectorField, str | None]:
     """Adapted by a method that leaves the network alone, or may; and what `auto` chose."""
-    every = max(WINDOW, WINDOW * len(data) // 2)  # with N = 2 or more the same number of windows, as they are dear
+    every = WINDOW * len(data)  # the same number of windows for every N, as they are dear
     settings = hj.Settings(solver=COARSE)
     result = hj.adapt(field, pieces(data, every, WINDOW), method=method, settings=settings)
     return result.field, result.chosen
