@@ -151,7 +151,7 @@ def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
         ValueError: file, row, field and what to do, in one line.
     """
     parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
-    t, found = parts.pop("time")[:, 0], {}
+    t, found, notes = parts.pop("time")[:, 0], {}, []
     for name, values in parts.items():
         quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), samples.XYZ
         if name == "attitude":
@@ -168,8 +168,13 @@ def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
         else:
             values = samples.body(values, frames.body)
             quantity = "body_velocity" if name == "velocity" else quantity
-        found[quantity] = samples.Samples(t, values, axes, f"columns {' '.join(stated[name].columns)}")
-    return samples.record(path, found, facts={"format": "CSV"})
+        source = f"columns {' '.join(stated[name].columns)}"
+        own, values = samples.uninterpolated(t, values)
+        if len(own) < len(t):
+            apart = float(np.median(np.diff(own)))
+            notes.append(f"{source}: lines between samples {apart:.3g} s apart; read as these samples")
+        found[quantity] = samples.Samples(own, values, axes, source)
+    return samples.record(path, found, notes=notes, facts={"format": "CSV"})
 
 
 def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:

@@ -14,6 +14,9 @@ from hybrid_jax.flights.recording import GAP, Recording, Signal
 XYZ, WXYZ, BATTERY = ("x", "y", "z"), ("w", "x", "y", "z"), ("battery",)
 LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
 WRAPS = (16, 32)  # bits of counters that may begin anew
+FEWEST_OF_LINES = 100  # samples; of fewer, lines may be chance
+STRAIGHT = 1e-6  # of the steepest slope: by how much that of a line may change at a sample, by rounding
+BENT = 0.5  # share of samples with a bend from which on a signal was not made of lines
 OPTIONAL = ("voltage",)  # samples that are not finite are left out, not refused
 
 
@@ -84,6 +87,43 @@ def _in_order(where: str, t: Float[np.ndarray, " n"], tick: float) -> tuple[np.n
     late, repeated = int((back > 0).sum()), int((~kept & (back == 0)).sum())
     lines = [f"{late} samples out of order by up to {back[row]:.2g} s"] if late else []
     return kept, lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
+
+
+def uninterpolated(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"]):
+    """Times and values of the samples between which a program drew straight lines, or the arguments as they are.
+
+    A program that puts signals of several rates on one clock writes a slow one as lines with bends at its samples. A
+    sample that fell between two times of that clock is where the lines beside it meet. A line as long as several
+    intervals keeps a sample in each; one longer than `GAP` intervals becomes a gap, which may lie under it.
+    """
+    sound = np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()
+    if len(t) < FEWEST_OF_LINES or not sound:
+        return t, values
+    slope = np.diff(values, axis=0) / np.diff(t)[:, None]
+    bend = np.abs(np.diff(slope, axis=0)).max(axis=1) > STRAIGHT * np.abs(slope).max()
+    moving = np.abs(slope[1:]).max(axis=1) > 0
+    if not moving.any() or bend[moving].mean() > BENT:
+        return t, values
+    ends = [(t[0], values[0]), *_meetings(t, values, slope, bend), (t[-1], values[-1])]
+    times, rows = map(np.array, zip(*ends, strict=True))
+    lengths = np.diff(times) / np.median(np.diff(times))
+    counts = np.where(lengths > GAP, 1, np.maximum(1, np.round(lengths))).astype(int)
+    own = np.interp(np.arange(counts.sum() + 1), np.append(0, np.cumsum(counts)), times)
+    return own, np.stack([np.interp(own, times, row) for row in rows.T], axis=1)
+
+
+def _meetings(t, values, slope, bend):
+    """Time and value of each sample in which lines meet: at a bend, or between two bends that follow each other."""
+    k = 1
+    while k < len(t) - 1:
+        late = 0.0
+        if bend[k - 1] and k < len(t) - 2 and bend[k]:
+            turn = slope[k - 1] - slope[k + 1]
+            late = turn @ (slope[k] - slope[k + 1]) * (t[k + 1] - t[k]) / max(turn @ turn, 1e-300)
+            late = late if 0 < late < t[k + 1] - t[k] else 0.0
+        if bend[k - 1]:
+            yield t[k] + late, values[k] + late * slope[k - 1]
+        k += 2 if late else 1
 
 
 def world(values: Float[np.ndarray, "n 3"], frame: str) -> Float[np.ndarray, "n 3"]:
