@@ -12,6 +12,7 @@ from experiments.reporting.plots import STYLE, save_figure
 from experiments.reporting.tables import Table
 from hybrid_jax.adaptation.adapting import UNITS
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
+from hybrid_jax.identification import between
 from hybrid_jax.identification.fitting import Identified, prediction_errors
 from hybrid_jax.identification.measured import Layout
 
@@ -34,6 +35,13 @@ def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Reco
     shown += [_predicted(found, each, layout, names) for each in left_out]
     unseen = [row["parameter"] for row in rows if not np.isfinite(row["high"])]
     notes = [f"{found.windows} windows, {found.seconds:.4g} s of flight, of {len(logs)} logs"]
+    with_commands = [log for log in logs if "command" in log.signals]
+    slow = [log.signals["command"].interval for log in with_commands if between.is_slow(log.signals["command"])]
+    if slow:
+        notes.append(
+            f"commands {max(slow):.3g} s apart: they changed in between, which the intervals count; a delay and a lag "
+            "are hardly told apart by such a log"
+        )
     if unseen:
         notes.append(f"not told by these logs, left as they were: {', '.join(unseen)}")
     shares = ", ".join(f"{axis} {share:.2f}" for axis, share in zip("xyz", found.explained, strict=True))

@@ -28,8 +28,9 @@ from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT
 from hybrid_jax.flights.recording import Recording
+from hybrid_jax.identification import between
 from hybrid_jax.identification.measured import Layout, Windows, cut
-from hybrid_jax.identification.prediction import Problem, all_errors, normal_equations, rms
+from hybrid_jax.identification.prediction import Problem, all_errors, normal_equations, rms, slopes_between
 
 ROUNDS = 3  # of weights
 CLUSTER = 2.0  # s of windows that are taken as one observation,
@@ -103,6 +104,8 @@ def identify(
             spread = spread.at[:, TANGENT:].set(jnp.where(spread[:, TANGENT:] > 0, size, 0.0))
             scale = {name: jnp.maximum(errors[name], 1e-9) for name in columns}
             problem = problem._replace(scale=scale, spread=spread)
+            if windows.between.shape[1]:
+                problem = _weighted(field, theta, changes, problem, layout)
         equations = normal_equations(field, theta, changes, problem, layout)[0]
         cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(windows.start) // FEWEST_CLUSTERS))
         covariance = _covariance(equations, cluster, moves, known)
@@ -154,6 +157,13 @@ def prediction_errors(
         zero = jnp.zeros((len(windows.start), TANGENT + 6))
         found = all_errors(field, ravel_parameters(field)[0], zero, problem, layout)
     return {name: np.where(windows.there[name][..., None], np.asarray(part), np.nan) for name, part in found.items()}
+
+
+def _weighted(field, theta, changes, problem: Problem, layout: Layout) -> Problem:
+    """The problem with errors weighted by what commands may have done between their samples."""
+    at = field, theta, changes, problem, layout
+    scale, whitening = between.whitened(all_errors(*at), slopes_between(*at), problem.windows.there, problem.scale)
+    return problem._replace(scale={name: jnp.asarray(each) for name, each in scale.items()}, whitening=whitening)
 
 
 def _explained(field, theta, changes, problem: Problem, layout: Layout) -> np.ndarray:

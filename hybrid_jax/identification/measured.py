@@ -13,6 +13,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.measurement import MEASURED, TANGENT
 from hybrid_jax.flights.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
+from hybrid_jax.identification import between
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 
 Initial = Literal["estimated", "sample"]
@@ -60,6 +61,7 @@ class Windows(NamedTuple):
     start: Float[np.ndarray, "n 13"]
     spread: Float[np.ndarray, "n 12"]  # standard deviation of its error; 0 of what is taken as exact
     recording: Float[np.ndarray, " n"]  # which of them
+    between: Float[np.ndarray, "n i 2"]  # intervals between samples of slow commands [s]; none of fast ones
 
 
 class Inputs(NamedTuple):
@@ -67,6 +69,7 @@ class Inputs(NamedTuple):
 
     t: Float[np.ndarray, " s"]
     values: Float[np.ndarray, "s m"]
+    root: Float[np.ndarray, "m m"]  # of the covariance of what slow commands do between samples, see `between`
 
 
 def cut(
@@ -88,9 +91,11 @@ def cut(
             if name not in each.signals:
                 raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
     begin, parts, inputs = 0.0, [], []
+    most = max(between.count(each.signals[told], layout.dt * layout.steps) for each in recordings)
     for i, each in enumerate(recordings):
-        parts.append(_windows(each, layout, told, names, begin, i))
-        inputs.append((each.signals[told].t + begin, each.signals[told].values))
+        parts.append(_windows(each, layout, told, names, begin, i, most))
+        t, values = between.lines(each.signals[told], layout.dt)
+        inputs.append((t + begin, values))
         begin += max(signal.t[-1] for signal in each.signals.values()) + BREAK
     parts = [part for part in parts if len(part.start)]
     if not parts:
@@ -103,15 +108,18 @@ def cut(
     columns = {name: columns_of(name, recordings) for name in names}
     return (
         jax.tree.map(lambda part: part[kept], windows),
-        _padded(*map(np.concatenate, zip(*inputs, strict=True))),
+        Inputs(
+            *_padded(*map(np.concatenate, zip(*inputs, strict=True))),
+            between.root([each.signals[told] for each in recordings]),
+        ),
         columns,
     )
 
 
-def _padded(t: Float[np.ndarray, " s"], values: Float[np.ndarray, "s m"]) -> Inputs:
+def _padded(t: Float[np.ndarray, " s"], values: Float[np.ndarray, "s m"]) -> tuple[np.ndarray, np.ndarray]:
     """The inputs, with the last repeated up to a multiple of `PADDING` samples: logs of like length share a program."""
     more = -len(t) % PADDING
-    return Inputs(np.append(t, t[-1] + 1 + np.arange(more)), np.concatenate([values, np.repeat(values[-1:], more, 0)]))
+    return np.append(t, t[-1] + 1 + np.arange(more)), np.concatenate([values, np.repeat(values[-1:], more, 0)])
 
 
 def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
@@ -124,7 +132,7 @@ def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
     return tuple(map(known.index, axes))
 
 
-def _windows(recording: Recording, layout: Layout, told: str, names, begin: float, number: int) -> Windows:
+def _windows(recording: Recording, layout: Layout, told: str, names, begin: float, number: int, most) -> Windows:
     signals, length = recording.signals, layout.dt * layout.steps
     before = max(layout.span, layout.warm)
     first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
@@ -137,7 +145,8 @@ def _windows(recording: Recording, layout: Layout, told: str, names, begin: floa
     voltage = signals.get("voltage")
     volts = np.zeros_like(edges[:, 1:]) if voltage is None else _at(voltage, (edges[:, 1:] + edges[:, :-1]) / 2)[..., 0]
     start, spread = initial_states(recording, starts, layout)
-    return Windows(edges + begin, volts, y, there, start, spread, np.full(len(starts), number))
+    slow = between.spans(signals[told], starts + length, most) + begin
+    return Windows(edges + begin, volts, y, there, start, spread, np.full(len(starts), number), slow)
 
 
 def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:

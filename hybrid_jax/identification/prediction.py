@@ -17,6 +17,7 @@ from hybrid_jax.dynamics.actuators import Actuated, held_means
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT, difference, measure, moved
+from hybrid_jax.identification import between
 from hybrid_jax.identification.measured import Inputs, Layout, Windows
 from hybrid_jax.integrate import RK4, integrate
 from hybrid_jax.matrices import solve
@@ -34,6 +35,7 @@ class Problem(NamedTuple):
     columns: dict[str, tuple[int, ...]]  # of each quantity, which of its axes were measured
     scale: dict[str, Array]
     spread: Float[Array, "n 18"]  # of the priors: initial states, constant accelerations and angular accelerations
+    whitening: Float[Array, "n r r"] | None = None  # of a window's errors in units of their scale; see `between`
 
 
 class Pushed(AbstractVectorField):
@@ -49,19 +51,25 @@ class Pushed(AbstractVectorField):
         return physics_of(self.field).speeds(x, u)  # pyright: ignore[reportAttributeAccessIssue]
 
 
-def errors_of(field, theta, change, window: Windows, inputs: Inputs, columns, layout: Layout) -> dict[str, Array]:
-    """y − ŷ of one window for parameters and a change of its initial state; 0 where nothing was measured."""
+def errors_of(
+    field, theta, change, window: Windows, inputs: Inputs, columns, layout: Layout, strayed=None
+) -> dict[str, Array]:
+    """y − ŷ of one window for parameters and a change of its initial state; 0 where nothing was measured.
+
+    `strayed` are the ξ of `between`, by default zero.
+    """
     _, unravel = ravel_parameters(field)
     field, ahead = unravel(theta), layout.ahead
     physics, x = physics_of(field), moved(jnp.asarray(window.start), change[:TANGENT])
+    delay = physics.delay if isinstance(physics, Actuated) else 0.0
+    u = held_means(inputs.t, inputs.values, window.edges, delay)
+    if strayed is not None:
+        u = u + between.means(strayed, window.between, inputs.root, window.edges, delay)
     if isinstance(physics, Actuated):
-        u = held_means(inputs.t, inputs.values, window.edges, physics.delay)
         if physics.reads_voltage:
             u = jnp.concatenate([u, window.voltage[:, None]], axis=1)
         if physics.rotor_states:
             x = jnp.concatenate([x, physics.settled(u[:ahead] if ahead else u[:1], layout.dt)])
-    else:
-        u = held_means(inputs.t, inputs.values, window.edges)
     u = u[ahead:]
     pushed = Pushed(field, change[TANGENT:])
     states = integrate(pushed, x, u, layout.dt, RK4())
@@ -83,6 +91,22 @@ def all_errors(field, theta, changes, problem: Problem, layout: Layout):
 
 
 @kept_jit
+def slopes_between(field, theta, changes, problem: Problem, layout: Layout):
+    """∂ŷ/∂ξ of what commands do between samples: (n, t, k, ξ) of each quantity."""
+    size = problem.windows.between.shape[1] * between.MODES * len(problem.inputs.root)
+
+    def one(each):
+        window, change = each
+
+        def of(strayed):
+            return errors_of(field, theta, change, window, problem.inputs, problem.columns, layout, strayed)
+
+        return jax.jacfwd(of)(jnp.zeros(size))
+
+    return jax.lax.map(one, (problem.windows, changes), batch_size=CHUNK)
+
+
+@kept_jit
 def rms(field, theta, changes, problem: Problem, layout: Layout) -> dict[str, Array]:
     found = all_errors(field, theta, changes, problem, layout)
     counts = {name: jnp.sum(there) for name, there in problem.windows.there.items()}
@@ -94,7 +118,7 @@ def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
     """The normal equations of θ with each initial state eliminated, and what gives its step: −(a + B Δθ); the cost."""
 
     def one(each) -> tuple[NormalEquations, Array, Array, Array]:
-        (window, spread), change = each
+        (window, spread, whitening), change = each
         p = theta.size
         free = spread > 0
         unit = jnp.where(free, spread, 1.0)
@@ -102,6 +126,7 @@ def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
         def residual(both):
             found = errors_of(field, both[:p], both[p:] * unit, window, problem.inputs, problem.columns, layout)
             r = jnp.concatenate([jnp.ravel(part / problem.scale[name]) for name, part in found.items()])
+            r = r if whitening is None else whitening @ r
             return r, r
 
         # A prior of one standard deviation on each initial state; those that are exact do not move.
@@ -118,4 +143,5 @@ def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
         known = jnp.diagonal(inverse) * unit**2
         return NormalEquations(gram, reduced, cost), step[:, 0] * unit, by_theta * unit[:, None], known
 
-    return jax.lax.map(one, ((problem.windows, problem.spread), changes), batch_size=CHUNK)
+    every = problem.windows, problem.spread, problem.whitening
+    return jax.lax.map(one, (every, changes), batch_size=CHUNK)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import scipy
 from surface import refusal
 
 import hybrid_jax as hj
@@ -25,13 +26,17 @@ NOISE = {"rates": 0.01, "specific_force": 0.05, "attitude": 0.005, "velocity": 0
 LAYOUT = Layout(DT, 20, 60, span=0.05)
 
 
-def recorded(vehicle=TRUTH, tau=0.07, delay=0.0, seed=0, noise=1.0):
-    """A hover shaken in thrust, roll and pitch, with a pilot that keeps it level, and all that can be measured."""
+def recorded(vehicle=TRUTH, tau=0.07, delay=0.0, seed=0, noise=1.0, hold=20, smooth=0.0):
+    """A hover shaken in thrust, roll and pitch, with a pilot that keeps it level, and all that can be measured.
+
+    The shakes are held for `hold` steps and filtered by 1 / (1 − smooth z⁻¹).
+    """
     field = actuated(hj.multirotor(vehicle, ()), replace(ACTUATOR, time_constants=tau))
     rng, n, late = np.random.default_rng(seed), round(SECONDS / DT), round(delay / DT)
     hover = (vehicle.hover_speed - 100) / 900
     roll, pitch = np.sign(np.array(vehicle.rotor_positions)[:, 1]), -np.sign(np.array(vehicle.rotor_positions)[:, 0])
-    shakes = np.repeat(rng.normal(size=(n // 20 + 1, 3)) * [0.06, 0.01, 0.01], 20, axis=0)[:n]
+    shakes = np.repeat(rng.normal(size=(n // hold + 1, 3)) * [0.06, 0.01, 0.01], hold, axis=0)[:n]
+    shakes = scipy.signal.lfilter([np.sqrt(1 - smooth**2)], [1.0, -smooth], shakes, axis=0)
 
     def pilot(x, shake):
         tilt = 2 * x[4:6]
