@@ -1,14 +1,16 @@
-"""When the vehicle of a recording is in the air: motors that turn do not yet carry it.
+"""When a vehicle is in the air: motors that turn do not yet carry it.
 
 On the ground an accelerometer measures gravity whatever the thrust is. Near it the ground effect adds to the thrust.
 """
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
-from hybrid_jax.flights.log import IDLE, RESTING, runs_of
-from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.flights.log import FlightLog, runs_of
+from hybrid_jax.flights.recording import Recording
 
+IDLE = 0.3  # share of the power in flight below which motors idle
+RESTING = 0.5  # s of idle motors, and more, end a flight
 CLEAR = 0.2  # m above where the vehicle stood before its motors turned
 MARGIN = 0.5  # s left out beside time with idle motors where the height is not known
 
@@ -23,25 +25,32 @@ def airborne(recording: Recording, told: str = "command") -> list[tuple[float, f
     Args:
         told: the quantity that drives the rotors, "command" or "rotor_speed".
     """
-    inputs = recording.signals[told]
+    inputs, position = recording.signals[told], recording.signals.get("position")
     power = (np.asarray(inputs.values) ** 2).sum(axis=1)
+    if position is None or "z" not in position.axes:
+        return _flights(inputs.t, power)
+    z = np.asarray(position.values)[:, position.axes.index("z")]
+    return _flights(inputs.t, power, np.interp(inputs.t, position.t, z))
+
+
+def on_ground(log: FlightLog) -> Bool[np.ndarray, " n"]:
+    """Which samples are not `airborne`."""
+    flights = _flights(log.t, (log.u**2).sum(axis=1), log.x[:, 2])
+    return ~np.any([(log.t >= first) & (log.t <= last) for first, last in flights] or [np.zeros(len(log))], axis=0)
+
+
+def _flights(t, power: Float[np.ndarray, " n"], z=None) -> list[tuple[float, float]]:
     idle = np.zeros(len(power), bool)
     for part in runs_of(power < IDLE * np.quantile(power, 0.9)):
-        idle[part] = inputs.t[part][-1] - inputs.t[part][0] >= RESTING
-    height = recording.signals.get("position")
+        idle[part] = t[part][-1] - t[part][0] >= RESTING
     found = []
     for run in runs_of(~idle):
-        if height is not None and "z" in height.axes and run.start > 0:
-            found += _above(inputs.t[run], height, float(inputs.t[run.start - 1]))
+        if z is not None and run.start > 0:
+            clear = runs_of(z[run] > z[run.start - 1] + CLEAR)
+            found += [(float(t[run][part][0]), float(t[run][part][-1])) for part in clear]
         else:
-            found += _carried(inputs.t[run], power[run], run.start > 0, run.stop < len(power))
+            found += _carried(t[run], power[run], run.start > 0, run.stop < len(power))
     return found
-
-
-def _above(t: Float[np.ndarray, " n"], height: Signal, rest: float) -> list[tuple[float, float]]:
-    """The times of t at which the vehicle is clear of where it stood at the end of its rest."""
-    z = np.interp(np.append(t, rest), height.t, np.asarray(height.values)[:, height.axes.index("z")])
-    return [(float(t[part][0]), float(t[part][-1])) for part in runs_of(z[:-1] > z[-1] + CLEAR)]
 
 
 def _carried(t, power, rested: bool, rests: bool) -> list[tuple[float, float]]:

@@ -5,8 +5,9 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import scipy  # not scipy.signal, which takes a second: it is imported where it is first used
 
+from hybrid_jax.flights.airborne import on_ground
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
-from hybrid_jax.flights.log import GAP, FlightLog, at_rest, even_segments, repeats, runs_of, segments
+from hybrid_jax.flights.log import GAP, FlightLog, even_segments, repeats, runs_of, segments
 from hybrid_jax.flights.readings import respond
 from hybrid_jax.state import QUATERNION, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
@@ -46,14 +47,14 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
-    """Cut out periods of half a second and more with hardly any thrust, when the vehicle is on the ground.
+    """Cut out the time on the ground, where `flights.airborne` says that the vehicle is not in the air.
 
     Raises:
         ValueError: no samples remain.
     """
-    flying = ~at_rest(log)
+    flying = ~on_ground(log)
     if not flying.any():
-        raise ValueError(f"{log.name}: the motors stand still; leave the file out")
+        raise ValueError(f"{log.name}: the vehicle stays on the ground; leave the file out")
     return log[flying], f"{len(log) - flying.sum()} samples on the ground cut out"
 
 

@@ -11,8 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights import readings
+from hybrid_jax.flights.airborne import on_ground
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.log import FlightLog, at_rest, gaps, repeats, sound_intervals
+from hybrid_jax.flights.log import FlightLog, gaps, repeats, sound_intervals
 from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
 from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import Vehicle
@@ -74,7 +75,7 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         _compare(log, "dp/dt against v", readings.velocities(log), LEAST_MOTION["velocity"]),
         _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
         _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
-        _at_most("time on the ground", float(at_rest(log).mean()), "share of samples", 0.01, GROUND),
+        _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
         _thrust(log, vehicle),
         _columns(log),
         *_motors(log, vehicle),
@@ -91,12 +92,12 @@ def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Che
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
     """Check the mean specific force along body z in flight, over k Σu² / m."""
-    flying, name = sound_intervals(log) & ~at_rest(log)[:-1], "specific force over thrust per mass"
+    flying, name = sound_intervals(log) & ~on_ground(log)[:-1], "specific force over thrust per mass"
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
-        still = "the motors stand still: check a log in flight"
+        still = "the vehicle stays on the ground: check a log in flight"
         return Check(name, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT

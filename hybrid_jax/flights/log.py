@@ -12,9 +12,7 @@ from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
 GAP = 1.5  # intervals longer than this many times the median are gaps
-IDLE = 0.3  # share of the thrust in flight below which a vehicle is on the ground
 JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
-RESTING = 0.5  # minimum time [s] with idle motors to count as on the ground
 
 
 @dataclass(frozen=True)
@@ -149,12 +147,3 @@ def even_segments(log: FlightLog) -> list[slice]:
 def unevenness(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
     """Whether a sound interval has another length than the median one."""
     return sound_intervals(log) & (np.abs(np.diff(log.t) - log.dt) > JITTER * log.dt)
-
-
-def at_rest(log: FlightLog) -> Bool[np.ndarray, " n"]:
-    """Whether a sample belongs to a period of half a second or more with hardly any thrust, on the ground."""
-    power = (log.u**2).sum(axis=1)
-    found = np.zeros(len(log), bool)
-    for part in runs_of(power < IDLE * np.quantile(power, 0.9)):
-        found[part] = log.t[part][-1] - log.t[part.start] >= RESTING
-    return found

@@ -132,11 +132,21 @@ def test_filters_drop_repeated_samples(flight):
 
 
 def test_time_on_the_ground_is_cut_but_not_a_short_fall(flight):
-    u = flight.u.copy()
+    u, x = flight.u.copy(), flight.x.copy()
     u[:80], u[500:530] = 3.0, 3.0  # 0.8 s, and 0.3 s without thrust
-    log, done = in_flight(FlightLog(flight.t, flight.x, u))
+    x[:80, 2] = flight.x[:, 2].min() - 0.3
+    log, done = in_flight(FlightLog(flight.t, x, u))
     np.testing.assert_array_equal(log.t, flight.t[80:])
     assert done == "80 samples on the ground cut out"
+
+
+def test_motors_that_turn_before_take_off_carry_nothing(flight):
+    u, x = flight.u.copy(), flight.x.copy()
+    u[:80], x[:200, 2] = 3.0, flight.x[:, 2].min() - 0.3  # full power from 0.8 s on, off the ground after 2 s
+    log, _ = in_flight(FlightLog(flight.t, x, u))
+    np.testing.assert_array_equal(log.t, flight.t[200:])
+    x[:, 2] = 0.0
+    refusal(lambda: in_flight(FlightLog(flight.t, x, u)), "stays on the ground")
 
 
 @pytest.mark.parametrize("cutoff", [0.0, 50.1, -1.0, np.nan])

@@ -129,7 +129,7 @@ def test_steady_wind_fails_no_check(flight):
 
 def test_time_on_the_ground_is_found_and_excluded_from_thrust(flight):
     x = np.tile(flight.x[:1], (600, 1))
-    x[:, 7:] = 0
+    x[:, 7:], x[:, 2] = 0, flight.x[:, 2].min() - 0.3
     t, u = np.arange(600 + len(flight)) * 0.01, np.concatenate([np.full((600, 4), 5.0), flight.u])
     check = table(FlightLog(t, np.concatenate([x, flight.x]), u))
     assert check["time on the ground"].value == pytest.approx(600 / len(t))
