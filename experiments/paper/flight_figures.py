@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.reporting.names import HYBRID, label
 from experiments.reporting.plots import COLOURS, DRAWABLE, PAGE, STYLE, colour, legend_below
@@ -36,8 +37,8 @@ def predictions(
         shown: index of the flight that is drawn in space, as predicted with the smallest N.
     """
     sizes = sorted(predicted)
-    figure = Figure(figsize=(PAGE, 5.6), layout="constrained")
-    grid = figure.add_gridspec(2, len(sizes), height_ratios=(1, 1.35))
+    figure = Figure(figsize=(PAGE, 6.2), layout="constrained")
+    grid = figure.add_gridspec(2, len(sizes), height_ratios=(1, 1.7))
     first = None
     for column, n in enumerate(sizes):
         first = axes = figure.add_subplot(grid[0, column], sharey=first)
@@ -51,7 +52,8 @@ def predictions(
     space = figure.add_subplot(grid[1, :], projection="3d")
     models = {name: states[shown] for name, states in predicted[sizes[0]].items()}
     _draw_predicted_paths(space, truth[shown], models, f"one of these flights, N = {sizes[0]}")
-    return legend_below(figure, title, "line: median flight; band: 10 to 90 % of flights", columns=4)
+    meaning = "line: median flight; band: 10 to 90 % of flights; in space ●: end, ×: where a prediction leaves the box"
+    return legend_below(figure, title, meaning, columns=4)
 
 
 @mpl.rc_context(STYLE)
@@ -97,7 +99,7 @@ def _draw_predicted_paths(axes: Any, truth: States, models: Mapping[str, States]
     """Paths in space, in a box around the truth with one scale; a prediction ends with × where it leaves the box."""
     path, count = truth[:, POSITION], len(models)
     centre, half = (path.min(axis=0) + path.max(axis=0)) / 2, VIEW_RATIO * np.ptp(path, axis=0) / 2
-    half = np.maximum(half, max(MIN_HALF_WIDTH, half.max() / 3))
+    half = np.maximum(half, max(MIN_HALF_WIDTH, half.max() / 2))
     axes.plot(*path.T, color="0.8", linewidth=7, label="truth", solid_capstyle="round")  # wide, so that none hides it
     axes.plot(*path[:1].T, "o", color="black", markerfacecolor="white", label="start")
     for i, (name, states) in enumerate(models.items()):
@@ -111,8 +113,9 @@ def _draw_predicted_paths(axes: Any, truth: States, models: Mapping[str, States]
     low, high = centre - half, centre + half
     axes.set(xlabel="x [m]", ylabel="y [m]", zlabel="z [m]", title=title)
     axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]), zlim=(low[2], high[2]))
-    axes.locator_params(nbins=4)
-    axes.set_box_aspect(half, zoom=0.9)  # room for the labels
+    for axis, share in zip((axes.xaxis, axes.yaxis, axes.zaxis), half / half.max(), strict=True):
+        axis.set_major_locator(MaxNLocator(max(2, round(4 * share))))  # labels of a short axis would lie on each other
+    axes.set_box_aspect(half, zoom=0.76)  # room for the labels
 
 
 def _draw_space(axes: Any, states: States) -> None:
