@@ -16,6 +16,7 @@ from hybrid_jax import runtime
 from hybrid_jax.adaptation import (
     METHODS,
     Adaptation,
+    Cause,
     FineTune,
     LeastSquares,
     Method,
@@ -69,5 +70,5 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
-__all__ += ["Excitation", "FlightBounds", "InputBounds", "OnlineAdaptation", "excitation"]
+__all__ += ["Cause", "Excitation", "FlightBounds", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]

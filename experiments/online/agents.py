@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax.adaptation.causes import Cause
 from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
@@ -57,6 +58,17 @@ PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
 PROCESS = (0.0,) * 7 + (0.003,) * 3 + (0.005,) * 3  # m/s² and rad/s² of a white noise, √s
 INITIAL = 1.0  # nothing but the prior is known at the start
+INERTIA = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3}
+# One e-fold of mass, which the model does not have, is one less of all accelerations.
+MASS = {"efficiency": -1.0, "Ix": -1.0, "Iy": -1.0, "Iz": -1.0, "added_drag": -DRAG_COEFFICIENT / IRIS.mass}
+FORCES = ("disturbance[vx]", "disturbance[vy]", "disturbance[vz]")
+CAUSES = (
+    Cause("inertia", INERTIA),
+    Cause("load", INERTIA | {"centre_of_mass": 0.05}, ({name: 0.2 * size for name, size in MASS.items()},)),
+    *(Cause(f"rotor {i}", {f"efficiency[{i}]": 0.2}) for i in range(IRIS.rotors)),
+    Cause("drag", {"added_drag": 0.3}),
+    Cause("wind", dict.fromkeys(FORCES, 3.0), rates=dict.fromkeys(FORCES, 1.5), lead=0.1),
+)
 
 
 def nominal() -> AbstractVectorField:
@@ -163,7 +175,7 @@ def told(field: AbstractVectorField, period: float, clock: float, bandwidth: flo
 def online(hardware: Hardware, period: float) -> OnlineAdaptation:
     sizes = np.maximum(hardware.sizes(), 1e-4)
     return OnlineAdaptation(
-        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, initial=INITIAL
+        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, initial=INITIAL, causes=CAUSES
     )
 
 

@@ -113,8 +113,8 @@ def learned(estimator, state) -> tuple[Array, ...]:
     """θ, its standard deviation, NIS and changes found; zeros for an agent that does not estimate them."""
     if not isinstance(estimator, OnlineAdaptation):
         return jnp.zeros(0), jnp.zeros(0), jnp.zeros(()), jnp.zeros(())
-    scales, d = jnp.asarray(estimator.scales), len(state.x)
-    return scales * state.theta, scales * jnp.sqrt(jnp.diagonal(state.covariance)[d:]), state.nis, state.changes
+    theta, covariance = estimator.estimate(state)
+    return theta, jnp.sqrt(jnp.diagonal(covariance)), state.nis, state.changes
 
 
 def before(own: Setting, name: str, path: str, seed: int, key, bandwidths: Mapping[str, float]) -> Half:

@@ -13,12 +13,14 @@ the system runs, one sample at a time.
 
 from hybrid_jax.adaptation.adapting import METHODS, Adaptation, Parameter, adapt
 from hybrid_jax.adaptation.auto import Auto
+from hybrid_jax.adaptation.causes import Cause
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
 from hybrid_jax.adaptation.online import OnlineAdaptation
-from hybrid_jax.adaptation.online_state import Flags, OnlineState, Tuning
+from hybrid_jax.adaptation.online_state import Flags, OnlineState
 from hybrid_jax.adaptation.pooling import pool
+from hybrid_jax.adaptation.tuning import Tuning
 from hybrid_jax.adaptation.uncertainty import (
     DisturbanceSelection,
     Interval,
@@ -29,6 +31,6 @@ from hybrid_jax.adaptation.uncertainty import (
 
 __all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "DisturbanceSelection", "ExpertAugmented", "FineTune"]
 __all__ += ["Interval", "LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
-__all__ += ["Flags", "OnlineAdaptation", "OnlineState", "Tuning"]
+__all__ += ["Cause", "Flags", "OnlineAdaptation", "OnlineState", "Tuning"]
 __all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "pool"]
 __all__ += ["select_disturbance"]

@@ -1,7 +1,6 @@
-"""What an `OnlineAdaptation` carries from sample to sample, how it is tuned, and what its parameters are called."""
+"""What an `OnlineAdaptation` carries from sample to sample, and what its parameters are called."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import equinox as eqx
@@ -11,6 +10,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
+from hybrid_jax.adaptation.causes_bank import Mixture
+from hybrid_jax.adaptation.change_test import ChangeTest
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -19,44 +20,17 @@ DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
 
 
-@dataclass(frozen=True)
-class Tuning:
-    """How fast an `OnlineAdaptation` forgets, and what it calls a change. ValueError for numbers that are negative."""
-
-    drift: float = 0.002  # random walk of a parameter, as a share of its prior standard deviation, 1/√s
-    forgetting: float = 30.0  # how much faster a parameter walks for each unit of its squared test beyond `eager`
-    eager: float = 6.0  # of a χ² of one degree
-    window: float = 0.2  # time constant of the mean NIS [s]
-    spans: tuple[float, float] = (0.05, 0.5)  # time constants of the two sums of the test [s]
-    alarm: float = 5.0  # of the test, a normal number if nothing has changed
-    caution: float = 1.5  # share of what uncertain parameters do to a step that counts as noise, for its nonlinearity
-    pause: float = 0.1  # least time between two alarms [s]
-    reject: float = 6.0  # mean NIS from which the filter is not believed
-    clip: float = 5.0  # standard deviations at which an innovation is cut off, so that an outlier does little
-    gap: float = 0.1  # after so long without a sample the state is taken from the next one [s]
-    frozen: int = 3  # equal samples in a row from which a sensor counts as frozen
-    bound: float = 4.0  # prior standard deviations that a parameter may move
-
-    def __post_init__(self):
-        for name in ("drift", "forgetting", "eager", "caution", "pause"):
-            checks.not_negative(name, getattr(self, name))
-        for name in ("window", "alarm", "reject", "clip", "gap", "bound"):
-            checks.positive(name, getattr(self, name))
-        checks.count("frozen", self.frozen)
-
-
 class OnlineState(eqx.Module):
     """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold."""
 
     x: Float[Array, "*n d"]  # estimated state
-    theta: Float[Array, "*n p"]  # change of θ in prior standard deviations
+    theta: Float[Array, "*n p"]  # change of θ in prior standard deviations, as the filter of all parameters has it
     covariance: Float[Array, "*n d+p d+p"]  # of both, in these units
-    trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
     free: Float[Array, "*n p"]  # variances that θ would have, had nothing been measured since the last alarm
-    pull: Float[Array, "*n 2 p"]  # weighted sums of the corrections of θ, for the test
-    spread: Float[Array, "*n 2 p"]  # their variances if nothing has changed
+    test: ChangeTest  # of the filter of x and θ
+    mixture: Mixture | None  # of the causes, if there are
+    trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
     nis: Float[Array, "*n"]  # mean normalised innovation squared, 1 if noise and model are as stated
-    quiet: Float[Array, "*n"]  # time since the last alarm [s]
     silent: Float[Array, "*n"]  # time since something was measured [s]
     last: Float[Array, "*n d"]  # the last sample
     equal: Float[Array, "*n d"]  # how many samples in a row were equal

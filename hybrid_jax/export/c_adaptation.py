@@ -132,8 +132,8 @@ def export_adaptation_c(
 def _parts(adaptation: Any, state: Any, tables: Tables) -> dict[str, Any]:
     """Where what lies in the state, in words."""
     places, at = [], 0
-    for key, value in vars(state).items():
-        places.append((key, at, value.size))
+    for path, value in jax.tree_util.tree_leaves_with_path(state):
+        places.append((jax.tree_util.keystr(path, simple=True, separator="."), at, value.size))
         at += value.size
     layout = ",\n   ".join(f"{key} at {start} ({size})" for key, start, size in places)
     names: Callable = ", ".join

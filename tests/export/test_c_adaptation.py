@@ -19,7 +19,12 @@ pytestmark = needs_compiler
 DT = 0.01
 # θ, the last good θ and the sums of corrections are in standard deviations of the prior. An innovation is a difference
 # of two nearly equal numbers: a last digit of 2 m is 1e-4 of a noise of 1 mm, so θ near zero has few right digits.
-UNITS = {"theta": 1.0, "trusted": 1.0, "pull": 1.0, "nis": 1.0}
+UNITS = {"theta": 1.0, "trusted": 1.0, "pull": 1.0, "nis": 1.0, "z": 1.0, "odds": 25.0}
+CAUSES = (
+    hj.Cause("inertia", {"Ix": 0.3, "Iy": 0.3}),
+    hj.Cause("thrust", {"k": 0.3}),
+    hj.Cause("wind", {"disturbance[vx]": 2.0}, rates={"disturbance[vx]": 1.0}, lead=0.1),
+)
 
 
 def flight(steps=36):
@@ -60,15 +65,18 @@ def compiled(folder, adaptation, precise, size):
 def error(found, expected):
     """The largest difference, relative to the largest number of its part of the state or to the unit of that."""
     off = {}
-    for name, value in vars(expected).items():
-        value, other = np.asarray(value), np.asarray(getattr(found, name))
-        off[name] = np.abs(other - value).max() / max(np.abs(value).max(), UNITS.get(name, 1e-9))
+    parts = zip(*map(jax.tree_util.tree_leaves_with_path, (expected, found)), strict=True)
+    for (path, value), (_, other) in parts:
+        value, other, name = np.asarray(value), np.asarray(other), path[-1].name
+        off[path] = np.abs(other - value).max() / max(np.abs(value).max(), UNITS.get(name, 1e-9))
     return max(off.values())
 
 
+@pytest.mark.parametrize("causes", [(), CAUSES], ids=["alone", "causes"])
 @pytest.mark.parametrize(("precise", "allowed"), [(True, 1e-12), (False, 1e-5)])
-def test_c_is_the_filter(precise, allowed, tmp_path):
-    adaptation = OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, process=1e-2)
+def test_c_is_the_filter(precise, allowed, causes, tmp_path):
+    body = hj.rigid_body(hj.IRIS)
+    adaptation = OnlineAdaptation(body, DT, 1e-3, disturbance=2.0, process=1e-2, causes=causes)
     (first, *_), *samples = flight()
     with jax.enable_x64(True):
         exact = double(adaptation)
@@ -85,6 +93,6 @@ def test_c_is_the_filter(precise, allowed, tmp_path):
             after = unravel(jnp.asarray(update(before, x, u, periods), float))
             assert error(after, expected) < allowed  # one step from the same numbers
             state, flown = update_of_jax(state, *arguments), update(flown, x, u, periods)
-        assert state.changes == 1  # an alarm is among what was compared
+        assert state.changes >= 1  # an alarm is among what was compared
         # Errors of a whole flight add up: JAX in single precision differs by 3e-6 from itself in double.
         assert error(unravel(jnp.asarray(flown, float)), state) < 10 * allowed
