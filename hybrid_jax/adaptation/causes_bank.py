@@ -105,11 +105,11 @@ def after_sample(
 ) -> Verdict:
     """After a sample, with the filter of all parameters as that sample corrected it."""
     tuning, shares = plant.tuning, weights(mixture, plant.tuning.least)
-    mixture, own = corrected(mixture, bank, plant, sample)
-    white = jnp.concatenate([own.white, correction.white[None]])
+    mixture, white, likelihoods = corrected(mixture, bank, plant, sample)
+    white = jnp.concatenate([white, correction.white[None]])
     pulled = shares @ white, correction.gains
     test, found = change_test.after_sample(mixture.test, *pulled, sample, plant.dt, tuning, tuning.settle)
-    likelihoods = jnp.concatenate([own.likelihood, correction.likelihood[None]])
+    likelihoods = jnp.concatenate([likelihoods, correction.likelihood[None]])
     before, mixture = mixture.odds[-1], weighed(mixture, likelihoods, tuning.floor)
     # The filter of all parameters has found what the test has not.
     taken = (mixture.odds[-1] == 0) & (before < 0) & (mixture.test.quiet > tuning.settle)
@@ -119,8 +119,10 @@ def after_sample(
     return Verdict(mixture, mean(mixture, bank, joint, tuning.least), shares @ jnp.square(white), found, lost)
 
 
-def corrected(mixture: Mixture, bank: Bank, plant: Plant, sample: Sample) -> tuple[Mixture, Correction]:
-    """After a sample, in which all hypotheses learn."""
+def corrected(
+    mixture: Mixture, bank: Bank, plant: Plant, sample: Sample
+) -> tuple[Mixture, Float[Array, "h d"], Float[Array, " h"]]:
+    """After a sample, in which all hypotheses learn; and of each the white innovations and their likelihood."""
     prior = of_all(mixture, bank.prior)
     walked = plant.dt * sample.elapsed * (of_all(mixture, bank.walked) + plant.tuning.drift**2 * prior)
 
@@ -130,11 +132,12 @@ def corrected(mixture: Mixture, bank: Bank, plant: Plant, sample: Sample) -> tup
 
         belief = kalman.predict(Belief(z, covariance), plant, field, turned, walked, sample.acted)
         belief = kalman.restarted(kalman.capped(belief, prior), sample, sample.anew, plant.variances)
-        return kalman.correct(belief, sample, plant)
+        belief, correction = kalman.correct(belief, sample, plant)
+        return belief, correction.white, correction.likelihood
 
     effects, turned = of_all(mixture, bank.effects), of_all(mixture, bank.turned)
-    belief, correction = jax.vmap(one)(mixture.z, mixture.covariance, effects, turned, prior, walked)
-    return eqx.tree_at(lambda m: (m.z, m.covariance), mixture, tuple(belief)), correction
+    belief, white, likelihood = plant.each(one)(mixture.z, mixture.covariance, effects, turned, prior, walked)
+    return eqx.tree_at(lambda m: (m.z, m.covariance), mixture, tuple(belief)), white, likelihood
 
 
 def weighed(mixture: Mixture, likelihoods: Float[Array, " h+1"], floor: float) -> Mixture:
@@ -163,9 +166,9 @@ def opened(mixture: Mixture, bank: Bank, plant: Plant, sample: Sample, alarm: Bo
 
     z = jnp.concatenate([(first @ mixture.z)[None], mixture.z[1:]])
     covariance = jnp.concatenate([jnp.tensordot(first, mixture.covariance, 1)[None], mixture.covariance[1:]])
-    belief = jax.vmap(one)(z, covariance, of_all(mixture, bank.prior), anew)
+    belief = plant.each(one)(z, covariance, of_all(mixture, bank.prior), anew)
     # What learns goes on with its weight.
     least = jnp.full_like(mixture.odds, -plant.tuning.change)
     odds = least.at[0].set(least[0] * joint).at[-1].set(jnp.maximum(mixture.odds[-1], least[0]))
-    new = Mixture(*belief, first[0] * mixture.before + first[1:], odds, mixture.test)
+    new = Mixture(belief.z, belief.covariance, first[0] * mixture.before + first[1:], odds, mixture.test)
     return jax.tree.map(lambda a, b: jnp.where(alarm, a, b), new, mixture)

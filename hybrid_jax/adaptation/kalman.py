@@ -15,6 +15,7 @@ from hybrid_jax.adaptation.samples import Sample
 from hybrid_jax.adaptation.tuning import Tuning
 from hybrid_jax.integrate import rk4_step
 
+Each = Callable[[Callable], Callable]  # a function of one filter → of arrays of several, as `jax.vmap`
 Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
 
 
@@ -34,6 +35,7 @@ class Plant(NamedTuple):
     added: Float[Array, " d"]  # variance that a period adds to x
     dt: float
     tuning: Tuning
+    each: Each  # does the same for several filters
 
     def tidy(self, belief: Belief) -> Belief:
         """With a unit quaternion, and a within its bounds."""

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.adaptation import causes_bank, change_test, kalman
 from hybrid_jax.adaptation.causes import Bank, Cause, Directions, bank_of, directions
-from hybrid_jax.adaptation.kalman import Belief, Plant
+from hybrid_jax.adaptation.kalman import Belief, Each, Plant
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.online_state import DISTURBANCE, Flags, Numbers, OnlineState, named_priors
 from hybrid_jax.adaptation.samples import HUGE, Heard, Sample, nearer, sampled
@@ -133,7 +133,12 @@ class OnlineAdaptation(AbstractEstimator):
         )
 
     def update(
-        self, state: OnlineState, x: Float[Array, " d"], u: Float[Array, " m"], elapsed: Float[Array, ""] | float = 1.0
+        self,
+        state: OnlineState,
+        x: Float[Array, " d"],
+        u: Float[Array, " m"],
+        elapsed: Float[Array, ""] | float = 1.0,
+        each: Each = jax.vmap,
     ) -> OnlineState:
         """After one period.
 
@@ -142,13 +147,14 @@ class OnlineAdaptation(AbstractEstimator):
             u: the mean input over the period, as it acted: delayed and lagged, not as it was commanded.
             elapsed: periods since the last update. Over more than one nothing is learned of the input, and the state is
                 taken from the sample.
+            each: turns a function of the filter of one cause into one of arrays of all.
         """
         tuning, d = self.tuning, len(state.x)
         x = jnp.asarray(x, state.x.dtype)
         x = nearer(x, state.x) if moves_a_rigid_body(self.field) else x
         heard = Heard(state.last, state.equal, state.silent)
         sample, heard = sampled(x, u, elapsed, heard, self.dt, tuning.gap)
-        plant = self._plant(sample)
+        plant = self._plant(sample, each)
         belief, free = self._predicted(state, plant, sample)
         belief = kalman.restarted(belief, sample, sample.anew, plant.variances)
         belief, correction = kalman.correct(belief, sample, plant)
@@ -236,10 +242,10 @@ class OnlineAdaptation(AbstractEstimator):
     def _joint(self, state: OnlineState) -> Belief:
         return Belief(jnp.concatenate([state.x, state.theta]), state.covariance)
 
-    def _plant(self, sample: Sample) -> Plant:
+    def _plant(self, sample: Sample, each: Each) -> Plant:
         x = sample.x
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
-        return Plant(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning)
+        return Plant(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning, each)
 
     def _predicted(self, state: OnlineState, plant: Plant, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
         """The filter of all parameters before the sample, and the variances without data."""

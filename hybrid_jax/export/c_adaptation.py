@@ -12,9 +12,8 @@ import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
 from hybrid_jax import checks
-from hybrid_jax.export.c_code import body_of
+from hybrid_jax.export.c_code import body_of, shared_by
 from hybrid_jax.export.c_loops import Tables
-from hybrid_jax.export.c_templates import HELPERS
 from hybrid_jax.export.program import Size, sizes_of
 from hybrid_jax.io.files import write_atomic
 
@@ -102,31 +101,37 @@ def export_adaptation_c(
         likes = {key: jax.ShapeDtypeStruct((size,), float) for key, size in sizes.items()}
 
         def update(state, x, u, elapsed):
-            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0]))[0]]
+            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0], _in_turn))[0]]
 
         def begin(x):
             return [ravel_pytree(exact.begin(x))[0]]
 
         stepped = body_of(update, list(likes.values()), tables, ("next",), tuple(likes))
         begun = body_of(begin, [likes["x"]], tables, ("state",), ("x",))
-    words = set(re.findall(r"\w+", stepped + begun))
-    parts = _parts(exact, first, tables) | {
-        "name": name,
-        "NAME": name.upper(),
-        "type": "double" if double else "float",
-        "d": d,
-        "m": m,
-        "size": flat.size,
-        "tables": "\n".join(text for key, text in tables.definitions.items() if key in words),
-        "helpers": "\n".join(text for key, text in HELPERS.items() if key in words),
-        "begin": begun,
-        "update": stepped,
-        "elapsed": f"periods of {name.upper()}_DT ago",
-    }
+    parts = (
+        _parts(exact, first, tables)
+        | shared_by(tables, stepped, begun)
+        | {
+            "name": name,
+            "NAME": name.upper(),
+            "type": "double" if double else "float",
+            "d": d,
+            "m": m,
+            "size": flat.size,
+            "begin": begun,
+            "update": stepped,
+            "elapsed": f"periods of {name.upper()}_DT ago",
+        }
+    )
     written = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
     for path, template in zip(written, (HEADER, SOURCE), strict=True):
         write_atomic(path, Template(template).substitute(parts))
     return written
+
+
+def _in_turn(one: Callable) -> Callable:
+    """As `jax.vmap`, but a loop, which keeps C small."""
+    return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
 
 def _parts(adaptation: Any, state: Any, tables: Tables) -> dict[str, Any]:

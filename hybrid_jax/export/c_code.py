@@ -10,7 +10,7 @@ import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, linearize
-from hybrid_jax.export.c_loops import Entry, Tables, declared, needed, stores, used
+from hybrid_jax.export.c_loops import Entry, Tables
 from hybrid_jax.export.c_operations import CTranslation, column
 from hybrid_jax.export.c_templates import HEADER, HELPERS, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
@@ -62,8 +62,6 @@ def export_c(
         fused = fuse_for_inference(prepared(field, likes, smooth))
         values = body_of(fused, likes, tables, ("xdot",))
         slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
-    code = "\n".join([values, slopes])
-    words = set(re.findall(r"\w+", code))
     parts = {
         "name": name,
         "NAME": name.upper(),
@@ -72,11 +70,9 @@ def export_c(
         "m": m,
         "dt": tables.text(float(dt)),
         "about": _about(vehicle_in(field) is not None, smooth),
-        "tables": "\n".join(text for key, text in tables.definitions.items() if key in words),
-        "helpers": "\n".join(text for key, text in HELPERS.items() if key in words),
         "values": values,
         "slopes": slopes,
-    }
+    } | shared_by(tables, values, slopes)
     written = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
     for path, template in zip(written, (HEADER, SOURCE), strict=True):
         write_atomic(path, Template(template).substitute(parts))
@@ -97,10 +93,16 @@ def body_of(
     sizes = [like.shape[0] for like in likes]
     arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip(inputs, sizes, strict=True)]
     results = translation.run(jax.make_jaxpr(function)(*likes), arguments, sizes)
-    read = frozenset().union(*map(used, results))
-    end = [tables.filled(stores(out, one, tables), []) for out, one in zip(outputs, results, strict=True)]
-    code = declared(needed(translation.statements, read), read, end)
-    return "\n".join(f"    {line}" for line in code.splitlines())
+    return translation.body(results, outputs)
+
+
+def shared_by(tables: Tables, *bodies: str) -> dict[str, str]:
+    """The tables and functions that bodies of functions use."""
+    words = set(re.findall(r"\w+", "\n".join([*tables.functions, *bodies])))
+    return {
+        "tables": "\n".join(text for key, text in tables.definitions.items() if key in words),
+        "helpers": "\n".join([*(text for key, text in HELPERS.items() if key in words), *tables.functions]),
+    }
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:

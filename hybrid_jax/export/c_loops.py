@@ -1,7 +1,6 @@
 """Pieces of C: tables of numbers, loops over arrays, and statements of which those that nothing uses are left out."""
 
 import re
-from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -43,11 +42,12 @@ class Code:
 
 @dataclass
 class Tables:
-    """The numbers of a file: literals, tables of constants, and names that are not taken."""
+    """What the functions of a file share: numbers, functions that they call, and names that are not taken."""
 
     double: bool
     constants: dict[bytes, str] = field(default_factory=dict)  # bytes of the numbers → name
     definitions: dict[str, str] = field(default_factory=dict)  # name → C
+    functions: list[str] = field(default_factory=list)  # each after those that it calls
     _count: int = 0
 
     def name(self, letter: str) -> str:
@@ -71,6 +71,12 @@ class Tables:
     def filled(self, template: str, operands: Sequence[str], out: str = "") -> str:
         """Code with its operands."""
         return template.format(*operands, out=out, f="" if self.double else "f", r="real")
+
+    def function(self, parameters: Sequence[str], body: str) -> str:
+        """The name of a new function."""
+        name = self.name("f")
+        self.functions.append(f"static void {name}({', '.join(parameters)}) {{\n{body}\n}}\n")
+        return name
 
     def table(self, numbers: np.ndarray) -> str:
         """The name of a table of these numbers."""
@@ -146,7 +152,7 @@ def _index(corner: int, steps: Sequence[int]) -> str:
     return " + ".join([*([str(corner)] if corner or not terms else []), *terms])
 
 
-def _nest(shape: Sequence[int], body: str, first: int = 0) -> str:
+def nest(shape: Sequence[int], body: str, first: int = 0) -> str:
     heads = (f"for (int i{first + k} = 0; i{first + k} < {size}; ++i{first + k}) " for k, size in enumerate(shape))
     return "".join(heads) + f"{{{{ {body} }}}}"
 
@@ -154,28 +160,28 @@ def _nest(shape: Sequence[int], body: str, first: int = 0) -> str:
 def mapping(template: str, operands: Sequence[Code], shape: tuple[int, ...]) -> Code:
     """An operation on each entry."""
     place = _index(0, [int(np.prod(shape[axis + 1 :])) for axis in range(len(shape))])
-    return Code(_nest(shape, f"{{out}}[{place}] = {template};"), operands)
+    return Code(nest(shape, f"{{out}}[{place}] = {template};"), operands)
 
 
 def folding(template: str, operand: Code | None, shape: tuple[int, int]) -> Code:
     """The entries of each row put together by an operation of two."""
     assert operand is not None  # contiguous
     start = operand.text.replace("i1", "0")
-    inner = _nest(shape[1:], "s = " + template.replace("{0}", "s").replace("{1}", "{0}") + ";", first=1)
+    inner = nest(shape[1:], "s = " + template.replace("{0}", "s").replace("{1}", "{0}") + ";", first=1)
     inner = inner.replace("i1 = 0", "i1 = 1", 1)
-    return Code(_nest(shape[:1], f"real s = {start}; {inner} {{out}}[i0] = s;"), (operand,))
+    return Code(nest(shape[:1], f"real s = {start}; {inner} {{out}}[i0] = s;"), (operand,))
 
 
 def stores(out: str, entries: np.ndarray, tables: Tables) -> str:
-    """Lines that write entries into an array: zeros and runs of another array by loops."""
+    """Lines that write entries into an array: the same number, and runs of another array, by loops."""
     lines, i = [], 0
     while i < len(entries):
-        run = _run(entries[i:])
+        run, step = _run(entries[i:])
         value = tables.text(entries[i])
         if run >= LOOPED:
             first = entries[i]
             in_array = isinstance(first, Entry) and first.index is not None
-            source = f"{first.name}[{_index(first.index or 0, [1])}]" if in_array else value
+            source = f"{first.name}[{_index(first.index or 0, [step])}]" if in_array else value
             lines.append(f"for (int i0 = 0; i0 < {run}; ++i0) {{{{ {out}[{_index(i, [1])}] = {source}; }}}}")
         else:
             run = 1
@@ -184,17 +190,16 @@ def stores(out: str, entries: np.ndarray, tables: Tables) -> str:
     return "\n".join(lines)
 
 
-def _run(entries: np.ndarray) -> int:
-    """How many of the first entries follow each other in one array, or are the same number."""
-    first = entries[0]
+def _run(entries: np.ndarray) -> tuple[int, int]:
+    """How many of the first entries follow each other in one array, and how far apart, or are the same number."""
+    first, step = entries[0], 0
+    if (places := _places(entries[:2])) is not None and len(places) > 1:
+        step = int(places[1] - places[0])
     for count, one in enumerate(entries):
-        if isinstance(first, Entry) and first.index is not None:
-            follows = one == replace(first, index=first.index + count)
-        else:
-            follows = one == first
-        if not follows:
-            return count
-    return len(entries)
+        expected = replace(first, index=first.index + step * count) if step else first
+        if one != expected:
+            return count, step
+    return len(entries), step
 
 
 def needed(statements: Sequence[Statement], results: frozenset[str]) -> list[Statement]:
@@ -210,19 +215,22 @@ def needed(statements: Sequence[Statement], results: frozenset[str]) -> list[Sta
 def declared(statements: Sequence[Statement], results: frozenset[str], end: Sequence[str]) -> str:
     """The code of statements and of what stands at the end, with arrays declared.
 
-    An array takes the place of one of its type and size that is not read any more: compilers keep each on the stack.
+    An array takes the place of one of its type, and of its size or more, that is not read any more: compilers keep each
+    on the stack.
     """
     last = {name: i for i, statement in enumerate(statements) for name in statement.uses}
     kinds = {statement.defines: statement.array for statement in statements if statement.array}
-    places, spare, lines = {}, defaultdict(list), []
+    places, spare, lines = {}, [], []
     for i, statement in enumerate(statements):
         if (kind := statement.array) is not None:
-            if not spare[kind]:
-                lines.append(f"{kind[0]} {statement.defines}[{kind[1]}];")
-                spare[kind].append(statement.defines)
-            places[statement.defines] = spare[kind].pop()
+            fitting = [one for one in spare if kinds[one][0] == kind[0] and kinds[one][1] >= kind[1]]
+            place = min(fitting, key=lambda one: kinds[one][1], default=statement.defines)
+            if fitting:
+                spare.remove(place)
+            else:
+                lines.append(f"{kind[0]} {place}[{kind[1]}];")
+            places[statement.defines] = place
         lines.append(statement.text)
-        for name in statement.uses - results:
-            if name in kinds and last[name] == i:
-                spare[kinds[name]].append(places[name])
+        ended = (name for name in sorted(statement.uses - results) if last[name] == i)
+        spare += [places[name] for name in ended if name in kinds]
     return re.sub(r"\ba\d+\b", lambda found: places.get(found[0], found[0]), "\n".join([*lines, *end]))

@@ -4,19 +4,20 @@ A column is a NumPy array of objects: numbers (floats, or bools), and `Entry` fo
 physics thus become straight code, and layers of a network loops over tables and arrays.
 """
 
+import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import reduce
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from hybrid_jax.export import c_loops
 from hybrid_jax.export.c_loops import Entry
-from hybrid_jax.export.translation import Translation
+from hybrid_jax.export.translation import Entries, Translation, Value
 
 EXPANDED = 24  # operations on at most so many entries are written out; more become a loop if they can
-COPIED = 400  # and on at most so many if they cannot
+COPIED = 200  # and on at most so many if they cannot
 PRODUCTS = 160  # multiplications of a matrix product that are written out
 
 # Name → C of operands in braces. {f} is the suffix of a function of math.h, {r} the type.
@@ -99,15 +100,64 @@ class CTranslation(Translation[np.ndarray]):
         count = sum(one is None for one in done)
         if count > EXPANDED and (loop := self._loop(name, columns, shape)) is not None:
             return loop
-        if count > COPIED and (loop := self._loop(name, list(map(self._gathered, columns)), shape)) is not None:
-            return loop
+        if count > COPIED:
+            columns = [self._compact(one, shape) for one in columns]
+            if (loop := self._loop(name, columns, shape)) is not None:
+                return loop
         pairs = zip(done, zip(*columns, strict=True), strict=True)
         return column(self._scalar(name, operands) if one is None else one for one, operands in pairs)
+
+    def scan(self, equation, inputs):
+        """A function of one of the arrays, called in a loop; none of them may need the result of another."""
+        inner, count, shared = (equation.params[key] for key in ("jaxpr", "length", "num_consts"))
+        if equation.params["num_carry"]:
+            raise self._refusal(equation)
+        passed = [self._passed(value, value.shape, 0) for value in inputs[:shared]]
+        passed += [self._passed(value, value.shape[1:], 1) for value in inputs[shared:]]
+        called = CTranslation(self.tables)
+        found = called._run(inner.jaxpr, inner.consts, [one.inside for one in passed])
+        results, outs = [called._column(one) for one in found], [self.tables.name("r") for _ in found]
+        body = called.body(results, outs)
+        words = set(re.findall(r"\w+", body))
+        taken = [one for one in passed if one.name in words]
+        name = self.tables.function([*(one.parameter for one in taken), *(f"real *{out}" for out in outs)], body)
+
+        starts = count * np.cumsum([0, *map(len, results)])
+        places = [f"{{{i}}}" for i in range(len(taken))]
+        places += [f"{{out}} + {start} + {len(one)} * i0" for start, one in zip(starts, results, strict=False)]
+        call = c_loops.nest((count,), f"{name}({', '.join(places)});")
+        whole = self._define(int(starts[-1]), c_loops.Code(call, [one.given for one in taken]))
+        parts = zip(np.split(whole, starts[1:-1]), found, strict=True)
+        return [Entries(part, (count, *one.shape)) for part, one in parts]
+
+    def _passed(self, value: Value, shape: tuple[int, ...], stride: int) -> "_Passed":
+        """How a value, or an array of this shape in it, comes into a function that is called for each of these."""
+        if not stride and not isinstance(value, Entries):
+            return _Passed(value)  # a constant, which the function may as well have
+        entries, size = self._column(value), int(np.prod(shape))
+        name, logical = self.tables.name("p"), any(self._is_logical(one) for one in entries)
+        kind = "int" if logical else "real"
+        if not stride and size == 1:
+            inside = column([Entry(name, None, logical)])
+            given = c_loops.Code(self.tables.text(entries[0]), (), c_loops.used(entries))
+            return _Passed(Entries(inside, shape), name, f"{kind} {name}", given)
+        inside = column(Entry(name, i, logical) for i in range(size))
+        given = c_loops.address(self.tables, self._gathered(entries))
+        given = replace(given, text=f"{given.text} + {size} * i0") if stride else given
+        return _Passed(Entries(inside, shape), name, f"const {kind} *{name}", given)
+
+    def body(self, results: Sequence[np.ndarray], outs: Sequence[str]) -> str:
+        """The lines of a function that fills some arrays with these results."""
+        read = frozenset().union(*map(c_loops.used, results))
+        pairs = zip(outs, results, strict=True)
+        end = [self.tables.filled(c_loops.stores(out, one, self.tables), []) for out, one in pairs]
+        code = c_loops.declared(c_loops.needed(self.statements, read), read, end)
+        return "\n".join(f"    {line}" for line in code.splitlines())
 
     def fold(self, name, rows):
         if len(rows) * len(rows[0]) > EXPANDED:
             shape = (len(rows[0]), len(rows))
-            whole = self._gathered(np.stack(rows, axis=1).ravel())
+            whole = self._compact(np.stack(rows, axis=1).ravel(), shape)
             operand = c_loops.indexed(self.tables, whole, shape)
             return self._define(len(rows[0]), c_loops.folding(CODE[name], operand, shape))
         return reduce(lambda a, b: self.entrywise(name, (a, b), (len(a),), ()), rows)
@@ -130,9 +180,9 @@ class CTranslation(Translation[np.ndarray]):
     def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
         """A B as loops: of a matrix and a vector if one of them is one, else of two matrices."""
         (m, k), n = a.shape, b.shape[1]
-        if m == 1 and n > 1:
+        if m == 1 and n > 1 and c_loops.is_contiguous(b.T.ravel()):
             return self._loops(b.T, a.T).T
-        operands = [c_loops.address(self.tables, self._gathered(one.ravel())) for one in (a, b)]
+        operands = [c_loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
         call = f"dense({{0}}, {{1}}, {{out}}, {m}, {k}" if n == 1 else f"product({{0}}, {{1}}, {{out}}, {m}, {k}, {n}"
         return self._define(m * n, c_loops.Code(f"{call});", operands)).reshape(m, n)
 
@@ -188,13 +238,25 @@ class CTranslation(Translation[np.ndarray]):
             return None
         return self._define(int(np.prod(shape)), c_loops.mapping(CODE[name], known, shape), name in LOGICAL)
 
-    def _gathered(self, entries: np.ndarray) -> np.ndarray:
-        """The entries one after the other in one array, copied there unless they are."""
+    def _gathered(self, entries: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """The entries, of an array of this shape, one after the other in one array, copied there unless they are."""
         if c_loops.is_contiguous(entries):
             return entries
         logical = any(self._is_logical(one) for one in entries)
+        if shape is not None and (found := c_loops.indexed(self.tables, entries, shape)) is not None:
+            return self._define(len(entries), c_loops.mapping("{0}", [found], shape), logical)
         lines = c_loops.stores("{out}", entries, self.tables)
         return self._define(len(entries), c_loops.Code(lines, (), c_loops.used(entries)), logical)
+
+    def _compact(self, entries: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Entries of an array of this shape, of which each that is there along a whole axis is copied once."""
+        if c_loops.indexed(self.tables, entries, shape) is not None:
+            return entries
+        grid = entries.reshape(shape)
+        for axis in range(grid.ndim):
+            first = grid.take([0], axis)
+            grid = first if (grid == first).all() else grid
+        return np.broadcast_to(self._gathered(grid.ravel(), grid.shape).reshape(grid.shape), shape).ravel()
 
     def _define(self, size: int, code: c_loops.Code, logical: bool = False) -> np.ndarray:
         """A new array that the code fills."""
@@ -207,6 +269,15 @@ class CTranslation(Translation[np.ndarray]):
     @staticmethod
     def _is_logical(one) -> bool:
         return isinstance(one, bool) or (isinstance(one, Entry) and one.logical)
+
+
+class _Passed(NamedTuple):
+    """A value as a function has it, and how it comes in; a constant does not."""
+
+    inside: Value
+    name: str = ""
+    parameter: str = ""
+    given: c_loops.Code = c_loops.Code("")
 
 
 def column(entries: Iterable[Any]) -> np.ndarray:

@@ -57,6 +57,10 @@ class Translation(ABC, Generic[Column]):
     def matrix_product(self, left: Column, right: Column, sizes: tuple[int, int, int]) -> Column:
         """A B of A (m × k) and B (k × n), sizes (m, k, n)."""
 
+    def scan(self, equation: JaxprEqn, inputs: list[Value]) -> list[Value]:
+        """The same program on each of several arrays, which most languages here do not know."""
+        raise self._refusal(equation)
+
     def run(self, program: ClosedJaxpr, arguments: Sequence[Column], sizes: Sequence[int]) -> list[Column]:
         """The results of a program of vectors as columns; ValueError, with its name, for an unknown operation."""
         inputs = [Entries(column, (size,)) for column, size in zip(arguments, sizes, strict=True)]
@@ -69,7 +73,7 @@ class Translation(ABC, Generic[Column]):
         def read(atom) -> Value:
             return np.asarray(atom.val) if isinstance(atom, Literal) else values[atom]
 
-        for equation in program.eqns:
+        for equation in filter(lambda one: one.outvars, program.eqns):  # a derivative may leave calls of nothing
             results = self._results(equation, [read(atom) for atom in equation.invars])
             values.update(zip(equation.outvars, results, strict=True))
         return [read(atom) for atom in program.outvars]
@@ -90,6 +94,8 @@ class Translation(ABC, Generic[Column]):
             return [Entries(self._linear(equation, inputs), shape)]
         if name in FOLDS:
             return [Entries(self._folded(inputs[0], equation.params["axes"], name), shape)]
+        if name == "scan":
+            return self.scan(equation, inputs)
         if name == "dot_general":
             return [Entries(self._product(inputs[0], inputs[1], equation.params["dimension_numbers"]), shape)]
         raise self._refusal(equation)

@@ -89,6 +89,20 @@ def test_a_function_of_one_s_own_of_any_size_may_be_one(tmp_path):
     check(turned, tmp_path, sizes=(2, 1), points=(rng.normal(size=(4, 2)), rng.normal(size=(4, 1))))
 
 
+def test_a_map_over_rows_is_a_loop(tmp_path):
+    def rows(x, u):
+        """Beside each other constants, what all rows have in common, a logical and a number of each row."""
+
+        def one(row):
+            place, entry, above = row
+            return place * jnp.where((x[0] > 0) & above, jnp.sin(entry), entry * u[0])
+
+        return jax.lax.map(one, (jnp.arange(3.0), x, x > u[0]))
+
+    rng = np.random.default_rng(0)
+    check(rows, tmp_path, sizes=(3, 1), points=(rng.normal(size=(4, 3)), rng.normal(size=(4, 1))))
+
+
 def test_what_is_not_a_number_is_not_hidden(tmp_path):
     library = Library(export_c(tmp_path, wide(), DT)[1], (13, 4), double=False)
     x, u = (part[0] for part in samples())

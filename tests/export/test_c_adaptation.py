@@ -96,3 +96,14 @@ def test_c_is_the_filter(precise, allowed, causes, tmp_path):
         assert state.changes >= 1  # an alarm is among what was compared
         # Errors of a whole flight add up: JAX in single precision differs by 3e-6 from itself in double.
         assert error(unravel(jnp.asarray(flown, float)), state) < 10 * allowed
+
+
+def test_c_hardly_grows_with_causes(tmp_path):
+    """One function for all hypotheses: three more causes add a few numbers, not their filters."""
+    more = tuple(hj.Cause(name, {name: 0.3}) for name in ("Ix", "Iy", "disturbance[wz]"))
+
+    def size(name, causes):
+        adaptation = OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, causes=causes)
+        return export_adaptation_c(tmp_path, adaptation, name=name)[1].stat().st_size
+
+    assert size("six", CAUSES + more) < 1.2 * size("three", CAUSES)
