@@ -104,6 +104,6 @@ def test_the_command_flies_and_reports(tmp_path):
     assert not any(row["crashed"] for row in report["rows"])
     assert {"errors.png", "parameters.png", "flight.gif"} <= {path.name for path in out.iterdir()}
     wind_rows = {row["agent"]: row["settled"] for row in report["rows"] if row["change"] == "wind"}
-    assert wind_rows["oracle"] < wind_rows["online"] < wind_rows["unadapted"] / 2
+    assert wind_rows["online"] < min(1.2 * wind_rows["oracle"], wind_rows["unadapted"] / 2)
     again = command("online", "--references", "hover", "hover", folder=tmp_path)
     assert "--references must be" in refused(again, "online")
