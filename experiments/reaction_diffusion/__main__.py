@@ -76,7 +76,7 @@ def experiment(config: Config, console: Console) -> None:
 
 ABOUT = (
     "A partial differential equation from one trajectory: forecasts and parameters against published numbers, and "
-    "adaptation after a change. About 80 minutes on one busy core; quick: 2 minutes on two."
+    "adaptation after a change. The default takes long, and goes on where it was interrupted; quick: 2 minutes."
 )
 main = partial(command.run, NAME, ABOUT, experiment, presets=PRESETS)
 
