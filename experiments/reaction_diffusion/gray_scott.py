@@ -13,6 +13,7 @@ from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conve
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
 from hybrid_jax.networks import zero_output
+from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.normalisation import ChannelScaling
 
 PART = "gray_scott"
@@ -46,7 +47,7 @@ def source_model(config: Config, kept: Kept) -> Any:
     size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
     network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)
     # Zero at first, or 40 s of a wrong reaction hide the right one.
-    source: Any = hj.Hybrid(physics, Conversion(zero_output(network), physics.grid))
+    source: Any = hj.Hybrid(physics, Conversion(GridNetwork(zero_output(network), physics.grid)))
     for held, most in STAGES:
         name = f"source in {len(data)} windows, F and k {'held' if held else 'free'}"
         train = partial(trained, source, data, min(most, config.steps), held)

@@ -6,11 +6,13 @@ of an `AbstractVectorField`, whose defaults serve code for one sample; a subclas
 """
 
 from abc import abstractmethod
-from collections.abc import Iterable
-from typing import ClassVar, Self
+from collections.abc import Callable, Iterable
+from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.batching import (
@@ -57,6 +59,10 @@ class AbstractVectorField(eqx.Module):
     def linearize(self, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns):
         return jvp_columns(self, (x, u), (dx, du))
 
+    def parameter_columns(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
+        theta, at = ravel_learned(self)
+        return jax.jacfwd(lambda theta: at(theta)(x, u))(theta)
+
     def fuse_for_inference(self) -> "AbstractVectorField":
         return self
 
@@ -93,6 +99,11 @@ def linearize(
 ) -> tuple[Float[Array, " d"], Columns]:
     """ẋ of one sample in inference mode, and its derivative along each pair of columns of dx (d, c) and du (m, c)."""
     return _methods_of(field).linearize(field, x, u, dx, du)
+
+
+def parameter_columns(field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
+    """The derivative of ẋ of one sample along each learned number (d, p), in the order of the leaves of the field."""
+    return _methods_of(field).parameter_columns(field, x, u)
 
 
 def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
@@ -132,6 +143,13 @@ class Hybrid(AbstractVectorField):
         values, columns = zip((x, dx), linearize(self.residual, x, u, dx, du), strict=True)
         added, d_added = jvp_columns(self.apply_residual, values, columns)
         return physics + added, d_physics + d_added
+
+    def parameter_columns(self, x, u):
+        value, columns = self.residual(x, u), parameter_columns(self.residual, x, u)
+        moved = jvp_columns(lambda value: self.apply_residual(x, value), (value,), (columns,))[1]
+        theta, at = ravel_learned(self.physics)
+        mapped = jax.jacfwd(lambda theta: apply_residual(at(theta), x, value))(theta)
+        return jnp.concatenate([parameter_columns(self.physics, x, u) + mapped, moved], axis=1)
 
     def fuse_for_inference(self):
         return Hybrid(fuse_for_inference(self.physics), fuse_for_inference(self.residual))
@@ -243,6 +261,13 @@ def trainable(field: AbstractVectorField) -> AbstractVectorField:
         return isinstance(node, RunningStats | Frozen)
 
     return jax.tree.map(lambda node: not fixed(node) and eqx.is_inexact_array(node), field, is_leaf=fixed)
+
+
+def ravel_learned(field: AbstractVectorField) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], Any]]:
+    """The learned numbers of a field as a vector, in the order of its leaves, and the field as a function of them."""
+    learned, rest = eqx.partition(field, trainable(field))
+    theta, unravel = ravel_pytree(learned)
+    return theta, lambda theta: eqx.combine(unravel(theta), rest)
 
 
 def check_batch_norm(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> None:

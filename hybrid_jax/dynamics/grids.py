@@ -82,11 +82,15 @@ class Grid:
 
     def patches(self, fields: Float[Array, " c *cells"], kernel: int) -> Float[Array, " k *cells"]:
         """At each point the values at its kernel × … × kernel neighbours, itself among them: c · kernelⁿ components."""
+        return jnp.concatenate(self.moved(fields, kernel))
+
+    def moved(self, fields: Float[Array, " c *cells"], kernel: int) -> list[Float[Array, " c *cells"]]:
+        """The fields of each of the kernel × … × kernel neighbours, in row-major order of where these are."""
         if kernel == 1:
-            return fields
+            return [fields]
         padded, at = self.padded(fields, kernel // 2), product(range(kernel), repeat=len(self.shape))
         shifts = (tuple(slice(i, i + n) for i, n in zip(place, self.shape, strict=True)) for place in at)
-        return jnp.concatenate([padded[(slice(None), *shift)] for shift in shifts])
+        return [padded[(slice(None), *shift)] for shift in shifts]
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
         """The longest step [s] for which RK4 is stable with these diffusivities [m²/s], by linear theory.
@@ -147,6 +151,9 @@ class Diffusion(AbstractVectorField):
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         spread = self.grid.laplacian(self.grid.fields(x))
         return (jnp.exp(self.log_diffusivity).reshape(-1, *(1,) * (spread.ndim - 1)) * spread).reshape(x.shape)
+
+    def linearize(self, x, u, dx, du):
+        return self(x, u), self(dx, u)  # it is linear
 
     def theta(self) -> dict[str, Float[Array, " c"]]:
         """The diffusivities [m²/s]."""

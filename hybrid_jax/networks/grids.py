@@ -1,5 +1,6 @@
 """Networks on periodic grids: the same small network at every point, which reads the point alone or its neighbours."""
 
+from functools import reduce
 from typing import ClassVar
 
 import equinox as eqx
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, train_batch, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, parameter_columns, train_batch, update_running_stats
 from hybrid_jax.dynamics.grids import Grid
 from hybrid_jax.networks.mlp import ResidualNetwork, residual_network
 from hybrid_jax.networks.normalisation import AbstractScaling
@@ -32,7 +33,21 @@ class GridNetwork(AbstractVectorField):
     kernel: int = eqx.field(static=True, default=1)
 
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
-        return self.network(*self.points(x, u)).reshape(x.shape)
+        return self.network(*self.points(x, u)).reshape(-1, *x.shape[1:])
+
+    def linearize(self, x, u, dx, du):
+        near, held = self.points(x, u)
+        at_points = jax.vmap(jax.jacrev(lambda read: self.network(*jnp.split(read, [len(near)]))), 1, 2)
+        slopes = at_points(jnp.concatenate([near, held]))  # (c, numbers read, points): the same for all columns
+        moved = self.grid.moved(self.grid.fields(dx), self.kernel)
+        read = [column.reshape(-1, dx.shape[1]) for fields in moved for column in fields]
+        read += [row[None] for row in du[: len(held)]]
+        columns = reduce(jnp.add, (slopes[:, i, :, None] * column for i, column in enumerate(read)))
+        return self(x, u), columns.reshape(-1, dx.shape[1])
+
+    def parameter_columns(self, x, u):
+        found = jax.vmap(lambda near, held: parameter_columns(self.network, near, held), 1, 1)(*self.points(x, u))
+        return found.reshape(-1, found.shape[-1])
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
         """What the network reads, a column for each point of each sample: neighbours (k, n), input (m, n)."""

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns
+from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns, ravel_learned
 from hybrid_jax.dynamics.batching import RunningStats, expand_trailing
 from hybrid_jax.networks.activations import ACTIVATIONS, SmoothRelu, function_of
 from hybrid_jax.networks.normalisation import (
@@ -101,6 +101,10 @@ class ResidualNetwork(AbstractVectorField):
     def update_running_stats(self, x, u):
         norm = self.norm.observed(self.weight_in @ self.inputs(x, u))
         return eqx.tree_at(lambda network: network.norm, self, norm)
+
+    def parameter_columns(self, x, u):
+        theta, at = ravel_learned(self)
+        return jax.jacrev(lambda theta: at(theta)(x, u))(theta)  # outputs are fewer than weights
 
     def fuse_for_inference(self):
         return self.fused_with(jnp.zeros((len(self.weight_out), self.weight_in.shape[1]), self.weight_in.dtype)) or self

@@ -1,8 +1,9 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
 Levenberg–Marquardt (Levenberg 1944; Marquardt 1963). A step solves min ‖J δ + r‖² + μ ‖D δ‖², with D the lengths of the
-columns of J. J is computed in the field's precision one window at a time; JᵀJ is summed, and the step solved, in double
-precision by NumPy, since squaring J would leave nothing of float32 for the directions that matter least.
+columns of J. J is computed in the field's precision one window at a time, with the trajectory (`sensitivities`); JᵀJ is
+summed, and the step solved, in double precision by NumPy, since squaring J would leave nothing of float32 for the
+directions that matter least.
 """
 
 from collections.abc import Callable
@@ -20,6 +21,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.training.driver import ready
+from hybrid_jax.training.sensitivities import with_sensitivities
 from hybrid_jax.trajectories import Trajectories, check
 
 MOST = 1000  # parameters: the cost of a step grows with their square
@@ -118,9 +120,8 @@ def fit_gauss_newton(
         scale = checks.floating("scale", scale)
         if scale.shape != windows.x0.shape[1:] or not (scale > 0).all():
             raise ValueError(f"scale must be {windows.x0.shape[1:]} positive numbers, got shape {scale.shape}")
-    data, penalised = jax.tree.map(jnp.asarray, windows), jnp.asarray(weight, float)
-    problem = _Problem(learned, rest, data, penalised, scale, rows, RK4() if solver is None else solver)
-    return _descend(problem, max_steps)
+    problem = _Problem(learned, rest, jnp.asarray(weight, float), scale, rows, RK4() if solver is None else solver)
+    return _descend(problem, jax.tree.map(jnp.asarray, windows), max_steps)
 
 
 class _Problem(eqx.Module):
@@ -128,7 +129,6 @@ class _Problem(eqx.Module):
 
     learned: PyTree
     rest: PyTree
-    windows: Trajectories
     weight: Float[Array, ""]
     scale: Float[Array, " d"] | None
     penalty: Rows | None = eqx.field(static=True)
@@ -137,45 +137,56 @@ class _Problem(eqx.Module):
     def field(self, theta: Float[Array, " p"]) -> AbstractVectorField:
         return eqx.combine(ravel_pytree(self.learned)[1](theta), self.rest)
 
-    def rows(self, theta: Float[Array, " p"], window: Trajectories) -> Float[Array, " r"]:
-        candidate = self.field(theta)
-        predicted = integrate(candidate, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, self.solver)
+    def rows(self, candidate, predicted: Float[Array, "t d"], window: Trajectories) -> Float[Array, " r"]:
         errors = predicted - window.x if self.scale is None else (predicted - window.x) / self.scale
         found = errors.ravel() / len(window.u) ** 0.5
         if self.penalty is not None:
-            held = self.penalty(candidate, predicted, window, self.solver)  # type: ignore[arg-type]
+            held = self.penalty(candidate, predicted, window, self.solver)
             found = jnp.concatenate([found, jnp.sqrt(self.weight) * held])
-        return found.astype(theta.dtype)
+        return found
 
     @eqx.filter_jit
-    def losses(self, thetas: Float[Array, "k p"]) -> Float[Array, " k"]:
+    def losses(self, thetas: Float[Array, "k p"], windows: Trajectories) -> Float[Array, " k"]:
         def one(theta):
-            return jnp.mean(jax.lax.map(lambda window: jnp.sum(jnp.square(self.rows(theta, window))), self.windows))
+            candidate = self.field(theta)
+
+            def square(window):
+                x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
+                predicted = integrate(candidate, x0, u, window.dt, self.solver)
+                return jnp.sum(jnp.square(self.rows(candidate, predicted, window)))
+
+            return jnp.mean(jax.lax.map(square, windows))
 
         return jax.lax.map(one, thetas)
 
     @eqx.filter_jit
     def linearised(
-        self, theta: Float[Array, " p"], index: int | Array
+        self, theta: Float[Array, " p"], window: Trajectories
     ) -> tuple[Float[Array, "p r"], Float[Array, " r"]]:
-        """Jᵀ and r of a window. One direction after the other: on a CPU several at once leave the cache."""
-        window = self.windows[index]
-        r, push = jax.linearize(lambda theta: self.rows(theta, window), theta)
-        return jax.lax.map(push, jnp.eye(theta.size, dtype=theta.dtype)), r
+        """Jᵀ and r of a window."""
+        x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
+        predicted, columns = with_sensitivities(self.field(theta), x0, u, window.dt, self.solver)
+
+        def rows(theta, predicted):
+            return self.rows(self.field(theta), predicted, window).astype(theta.dtype)
+
+        r, push = jax.linearize(rows, theta, predicted)
+        each = jnp.eye(theta.size, dtype=theta.dtype), jnp.moveaxis(columns, -1, 0)
+        return jax.lax.map(lambda direction: push(*direction), each), r
 
 
-def _descend(problem: _Problem, max_steps: int) -> GaussNewtonFit:
+def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussNewtonFit:
     theta = ravel_pytree(problem.learned)[0]
-    loss, damping, steps, slow = float(problem.losses(theta[None])[0]), FIRST, 0, 0
+    loss, damping, steps, slow = float(problem.losses(theta[None], windows)[0]), FIRST, 0, 0
     while steps < max_steps and slow < 2 and 0 < loss < np.inf:
-        gram, score = _normal_equations(problem, theta)
+        gram, score = _normal_equations(problem, theta, windows)
         lengths = np.sqrt(np.maximum(np.diag(gram), 1e-12 * np.diag(gram).max()))
         values, vectors = scipy.linalg.eigh(gram / np.outer(lengths, lengths))
         along = vectors.T @ (score / lengths)
         dampings = np.clip(damping * TRIALS, LEAST, LARGEST)
         moves = [vectors @ (along / (np.maximum(values, 0) + each)) / lengths for each in dampings]
         tried = theta - jnp.asarray(np.array(moves), theta.dtype)
-        found = np.nan_to_num(np.asarray(problem.losses(tried), float), nan=np.inf)
+        found = np.nan_to_num(np.asarray(problem.losses(tried, windows), float), nan=np.inf)
         best, steps = int(np.argmin(found)), steps + 1
         better = found[best] < loss
         slow = 0 if better and found[best] < (1 - SLOW) * loss else slow + 1
@@ -184,9 +195,11 @@ def _descend(problem: _Problem, max_steps: int) -> GaussNewtonFit:
     return GaussNewtonFit(problem.field(theta), loss, steps, bool(np.isfinite(loss)) and (slow >= 2 or loss == 0))
 
 
-def _normal_equations(problem: _Problem, theta) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
+def _normal_equations(
+    problem: _Problem, theta, windows: Trajectories
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, " p"]]:
     gram, score = np.zeros((theta.size, theta.size)), np.zeros(theta.size)
-    for index in range(len(problem.windows)):
-        columns, r = (np.asarray(part, float) for part in problem.linearised(theta, jnp.asarray(index)))
+    for index in range(len(windows)):
+        columns, r = (np.asarray(part, float) for part in problem.linearised(theta, windows[index]))
         gram, score = gram + columns @ columns.T, score + columns @ r
     return gram, score
