@@ -67,8 +67,11 @@ def fit_anchored(
             images = jax.lax.map(lambda direction: pull(push(direction))[0], basis, batch_size=TOGETHER)
             return part * jnp.linalg.qr(images.T)[0].T
 
-        basis = part * jax.random.normal(jax.random.key(0), (rank, weights.size), weights.dtype)
-        basis = jax.lax.fori_loop(0, ITERATIONS, iterate, basis)
+        if rank == weights.size:  # all directions
+            basis = part * jnp.eye(rank, dtype=weights.dtype)
+        else:
+            basis = part * jax.random.normal(jax.random.key(0), (rank, weights.size), weights.dtype)
+            basis = jax.lax.fori_loop(0, ITERATIONS, iterate, basis)
         effects = jnp.moveaxis(jax.lax.map(push, basis, batch_size=TOGETHER), 0, -1)
         gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
         largest = jnp.linalg.eigvalsh(jnp.sum(gram, axis=0))[-1]
