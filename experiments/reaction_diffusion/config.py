@@ -46,9 +46,9 @@ class Config(Run):
     units: Count = 12
     """Hidden units of the hybrids that are adapted."""
     starts: Count = 3
-    """Random networks that learn from single intervals; the one with the least training loss goes on."""
+    """Random networks that begin; the one with the least training loss after ten steps goes on."""
     steps: Count = 35
-    """Gauss–Newton steps on single intervals."""
+    """Gauss–Newton steps on single intervals, the first ten included."""
     polish: Count = 8
     """Gauss–Newton steps on whole trajectories."""
 

@@ -89,10 +89,14 @@ def tested(config: Config, shift: str) -> hj.Trajectories:
     return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), -(-config.test // SHARE), (TEST, 0))
 
 
+@cache
+def targets(config: Config, shift: str, seed: int) -> hj.Trajectories:
+    return reacting(fitzhugh_nagumo(plane(config.points), *SHIFTS[shift]), max(config.sizes), (TARGET, seed))
+
+
 def adapted(config: Config, source, error_before: float, shift: str, model: str, n: int, seed: int) -> Found:
     """The rows of a source that is adapted to N trajectories in each way."""
-    truth = fitzhugh_nagumo(plane(config.points), *SHIFTS[shift])
-    data, test = reacting(truth, max(config.sizes), (TARGET, seed))[:n], tested(config, shift)
+    data, test = targets(config, shift, seed)[:n], tested(config, shift)
     chosen = {}
     fields = {
         FINE_TUNED: learned(source, data, min(TUNING, config.steps)),
