@@ -15,9 +15,10 @@ import numpy as np
 import optax
 
 import hybrid_jax as hj
-from benchmarks.timing import Findings, Ratio, agree, compiled_with_memory, in_turns, run, table
-from hybrid_jax.dynamics.base import trainable
+from benchmarks.timing import Findings, Ratio, agree, compiled, compiled_with_memory, in_turns, run, table
+from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.training.fitting import gradient_step, make_run_config, start
+from hybrid_jax.training.sensitivities import with_sensitivities
 
 DT, SUBSTEPS, RATE = 0.1, 2, 1e-3
 # Sums over 25 intervals of 2048 states in another order, in float32.
@@ -109,6 +110,28 @@ def measured(kernel: int, preset: Preset) -> dict[str, Any]:
     return {"kernel": kernel, "difference": difference, "seconds": seconds} | sizes | ratio
 
 
+def jacobian(kernel: int, preset: Preset) -> dict[str, Any]:
+    """The states of one interval and their derivatives along all parameters, as `fit_gauss_newton` needs them."""
+    field: Any = hybrid(kernel, preset)
+    solver = hj.RK4(substeps=SUBSTEPS)
+    x0 = np.random.default_rng(0).random(field.physics.grid.size).astype(np.float32)
+    theta, at = ravel_learned(field)
+
+    def together(theta, x0):
+        return with_sensitivities(at(theta), x0, jnp.zeros((1, 0)), DT, solver)
+
+    def one_by_one(theta, x0):
+        states, push = jax.linearize(lambda theta: hj.rollout(at(theta), x0, jnp.zeros((1, 0)), DT, solver), theta)
+        return states, jnp.moveaxis(jax.lax.map(push, jnp.eye(theta.size)), 0, -1)
+
+    calls = {way.__name__: compiled(way, theta, x0)[0] for way in (together, one_by_one)}
+    own, theirs = (call() for call in calls.values())
+    difference = agree(f"derivatives of kernel {kernel}", own, theirs, AGREEMENT)
+    times = in_turns(calls, preset.turns)
+    row = {"kernel": kernel, "parameters": theta.size, "seconds": {name: times.median(name) for name in calls}}
+    return row | {"difference": difference, "ratio": times.ratio("one_by_one", "together")}
+
+
 COLUMNS = {
     "kernel": lambda row: str(row["kernel"]),
     "ms": lambda row: f"{1e3 * row['seconds']['ours']:.1f}",
@@ -120,11 +143,27 @@ COLUMNS = {
 }
 
 
+JACOBIAN_COLUMNS = {
+    "kernel": lambda row: str(row["kernel"]),
+    "parameters": lambda row: str(row["parameters"]),
+    "ms": lambda row: f"{1e3 * row['seconds']['together']:.1f}",
+    "one direction at a time [ms]": lambda row: f"{1e3 * row['seconds']['one_by_one']:.1f}",
+    "ratio": lambda row: f"{row['ratio']:.2f}",
+    "differ by": lambda row: f"{row['difference']:.0e}",
+}
+
+
 def measure(preset: Preset) -> Findings:
     """A pointwise network and a convolution, against their plain selves."""
     rows = [measured(kernel, preset) for kernel in preset.kernels]
     ratios = [Ratio(f"kernel {row['kernel']}: plain / ours", row["plain_over_ours"], at_least=1 / 1.05) for row in rows]
-    return Findings(rows, [table("one gradient step of a field on a grid", rows, COLUMNS)], ratios)
+    slopes = [jacobian(kernel, preset) for kernel in preset.kernels]
+    ratios += [
+        Ratio(f"kernel {row['kernel']}: one direction at a time / ours", row["ratio"], at_least=1) for row in slopes
+    ]
+    tables = [table("one gradient step of a field on a grid", rows, COLUMNS)]
+    tables += [table("derivatives of one interval along all parameters", slopes, JACOBIAN_COLUMNS)]
+    return Findings([*rows, *slopes], tables, ratios)
 
 
 if __name__ == "__main__":

@@ -47,7 +47,8 @@ def source_model(config: Config, kept: Kept) -> Any:
     size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
     network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)
     # Zero at first, or 40 s of a wrong reaction hide the right one.
-    source: Any = hj.Hybrid(physics, Conversion(GridNetwork(zero_output(network), physics.grid)))
+    rate: Any = zero_output(network)
+    source: Any = hj.Hybrid(physics, Conversion(GridNetwork(rate, physics.grid)))
     for held, most in STAGES:
         name = f"source in {len(data)} windows, F and k {'held' if held else 'free'}"
         train = partial(trained, source, data, min(most, config.steps), held)
