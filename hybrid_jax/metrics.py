@@ -2,11 +2,11 @@
 
 from collections.abc import Callable
 
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.trajectories import Trajectories, check
@@ -48,21 +48,11 @@ def window_mse(
         predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
-    return over(windows, errors, chunk)
+    return in_chunks(errors, windows, chunk)
 
 
 def mean_over(
     windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
 ) -> Float[Array, ""]:
     """The mean over windows of `errors`, which is evaluated on `chunk` windows at a time."""
-    return jnp.mean(over(windows, errors, chunk))
-
-
-def over(
-    windows: Trajectories, errors: Callable[[Trajectories], Float[Array, " n"]], chunk: int = CHUNK
-) -> Float[Array, " n"]:
-    whole = len(windows) // chunk * chunk
-    chunks = jax.tree.map(lambda leaf: leaf[:whole].reshape(whole // chunk, chunk, *leaf.shape[1:]), windows)
-    rest = jax.tree.map(lambda leaf: leaf[whole:], windows)
-    parts = [jax.lax.map(errors, chunks).ravel()] if whole else []
-    return jnp.concatenate([*parts, errors(rest)] if len(rest) else parts)
+    return jnp.mean(in_chunks(errors, windows, chunk))

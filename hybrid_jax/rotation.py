@@ -36,6 +36,16 @@ def rotate(q: Quaternion, v: Vector) -> Vector:
     return multiply(multiply(q, jnp.stack([jnp.zeros_like(v[0]), *v])), conjugate(q))[1:]
 
 
+def matrix(q: Quaternion | Rows) -> tuple[Rows, Rows, Rows]:
+    """The rows of R, with R v = rotate(q, v)."""
+    w, x, y, z = q
+    return (
+        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
+        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
+        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
+    )
+
+
 def body_z(q: Quaternion | Rows) -> Vector:
     """rotate(q, [0, 0, 1]) written out: the direction of thrust in the world frame."""
     w, x, y, z = q

@@ -38,6 +38,7 @@ def matrix(q):
 def test_rotate_is_the_rotation_matrix_and_keeps_length(q, v):
     turned = rotation.rotate(jnp.asarray(q), jnp.asarray(v))
     np.testing.assert_allclose(turned, matrix(q) @ v, **CLOSE)
+    np.testing.assert_allclose(np.array(rotation.matrix(jnp.asarray(q))) @ v, turned, **CLOSE)
     np.testing.assert_allclose(np.linalg.norm(turned), np.linalg.norm(v), **CLOSE)
 
 

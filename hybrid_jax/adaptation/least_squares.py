@@ -105,10 +105,9 @@ def fit_free(
 
     # Each parameter is measured by what it does to the residuals, and these by their size at the start, so that the
     # damping and the tolerances, which are absolute numbers, mean the same for any units, data and field (Moré 1978).
-    at_start, push = jax.linearize(residuals, start)
+    effects, at_start = jax.jacfwd(lambda theta: 2 * (residuals(theta),), has_aux=True)(start)
     size = _nonzero(jnp.linalg.norm(at_start))
-    effects = jax.vmap(push)(jnp.eye(start.size, dtype=start.dtype))
-    effect = jnp.linalg.norm(effects.reshape(start.size, -1), axis=1)
+    effect = jnp.linalg.norm(effects.reshape(-1, start.size), axis=0)
     seen = effect > rounding(windows, scale)
     unit = jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0)
 

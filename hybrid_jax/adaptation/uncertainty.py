@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax import checks
 from hybrid_jax.adaptation import least_squares
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -145,7 +146,7 @@ def normal_equations(
         effect, r = jacobian.reshape(-1, theta.size), r.ravel()
         return NormalEquations(effect.T @ bent.reshape(-1, theta.size), effect.T @ slope.ravel(), r @ r)
 
-    return jax.lax.map(one, windows, batch_size=min(chunk, len(windows)))
+    return in_chunks(jax.vmap(one), windows, chunk)
 
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:

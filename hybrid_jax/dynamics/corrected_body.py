@@ -1,5 +1,7 @@
 """A rigid body with what its own parameters cannot express: rotors that lost thrust, and air drag."""
 
+from operator import mul
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,6 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual
-from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.dynamics.disturbance import (
     ConstantDisturbance,
     disturbance_of,
@@ -37,12 +38,12 @@ class CorrectedBody(AbstractRigidBody):
     def theta(self) -> dict[str, Array]:
         return self.body.theta() | {"efficiency": jnp.exp(self.log_efficiency), "added_drag": self.drag}
 
-    def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " m *b"]) -> Float[Array, " 13 *b"]:
-        q, v = x[QUATERNION], x[VELOCITY]
-        in_body = rotation.rotate(rotation.conjugate(q), v)
-        slowed = rotation.rotate(q, expand_trailing(self.drag, in_body) * in_body)
-        effective = expand_trailing(jnp.exp(self.log_efficiency / 2), u) * u
-        return self.body(x, effective).at[VELOCITY].add(-slowed)
+    def __call__(self, x: Float[Array, " 13"], u: Float[Array, " m"]) -> Float[Array, " 13"]:
+        rows, velocity = rotation.matrix(x[QUATERNION]), x[VELOCITY]
+        columns = zip(*rows, strict=True)
+        in_body = [c * sum(map(mul, column, velocity)) for c, column in zip(self.drag, columns, strict=True)]
+        slowed = jnp.stack([sum(map(mul, row, in_body)) for row in rows])
+        return self.body(x, jnp.exp(self.log_efficiency / 2) * u).at[VELOCITY].add(-slowed)
 
     def apply_residual(self, x, residual):
         return apply_residual(self.body, x, residual)

@@ -13,6 +13,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.uncertainty import NormalEquations
+from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.actuators import Actuated, held_means
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import physics_of
@@ -87,7 +88,7 @@ def all_errors(field, theta, changes, problem: Problem, layout: Layout):
         window, change = each
         return errors_of(field, theta, change, window, problem.inputs, problem.columns, layout)
 
-    return jax.lax.map(one, (problem.windows, changes), batch_size=CHUNK)
+    return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
 
 
 @kept_jit
@@ -103,7 +104,7 @@ def slopes_between(field, theta, changes, problem: Problem, layout: Layout):
 
         return jax.jacfwd(of)(jnp.zeros(size))
 
-    return jax.lax.map(one, (problem.windows, changes), batch_size=CHUNK)
+    return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
 
 
 @kept_jit
@@ -144,4 +145,4 @@ def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
         return NormalEquations(gram, reduced, cost), step[:, 0] * unit, by_theta * unit[:, None], known
 
     every = problem.windows, problem.spread, problem.whitening
-    return jax.lax.map(one, (every, changes), batch_size=CHUNK)
+    return in_chunks(jax.vmap(one), (every, changes), CHUNK)

@@ -1,0 +1,29 @@
+"""Many windows a few at a time, so that memory does not grow with their number."""
+
+from collections.abc import Callable
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+
+Stacked = TypeVar("Stacked")
+Found = TypeVar("Found")
+
+
+def in_chunks(function: Callable[[Stacked], Found], values: Stacked, size: int) -> Found:
+    """`function` of stacked values, of at most `size` at a time, in chunks of equal length.
+
+    The last value is repeated to fill the last chunk: a shorter one, as that of `jax.lax.map`, would be compiled as a
+    program of its own.
+    """
+    n = len(jax.tree.leaves(values)[0])
+    chunks = -(-n // size)
+    length = -(-n // chunks)
+
+    def cut(leaf):
+        missing = chunks * length - n
+        leaf = jnp.concatenate([leaf, jnp.repeat(leaf[-1:], missing, axis=0)]) if missing else jnp.asarray(leaf)
+        return leaf.reshape(chunks, length, *leaf.shape[1:])
+
+    found = jax.lax.map(function, jax.tree.map(cut, values))
+    return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:n], found)
