@@ -28,7 +28,7 @@ import jax
 import jax.numpy as jnp
 from jax.experimental import serialize_executable
 
-from hybrid_jax import checks, runtime
+from hybrid_jax import checks, native, runtime
 
 OWN = ("hybrid_jax", "experiments", "benchmarks")  # known by their source
 LIBRARIES = ("jax", "jaxlib", "numpy", "equinox", "diffrax", "optimistix", "lineax", "optax", "mujoco", "mujoco-mjx")
@@ -170,6 +170,7 @@ def _read(path: Path) -> Callable | None:
             return None
         executable, devices, inputs, skeleton, rest = pickle.loads(content)
         runtime.load_lapack()  # JAX does that when it lowers a first call, which it may not do here
+        native.register()
         by_id = {device.id: device for device in jax.devices(devices[0])}
         chosen = [by_id[i] for i in devices[1]]
         before = jax.tree.structure((([0] * inputs,), {}))
@@ -211,7 +212,7 @@ def _context() -> tuple:
 
 @functools.cache
 def _environment() -> tuple:
-    return tuple((name, version(name)) for name in LIBRARIES), runtime.machine()
+    return tuple((name, version(name)) for name in LIBRARIES), runtime.machine(), native.identity()
 
 
 @functools.cache

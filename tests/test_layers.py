@@ -9,7 +9,7 @@ import pytest
 ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
-    *("state", "rotation", "matrices", "chunks", "runtime", "checks", "programs", "vehicle", "trajectories"),
+    *("state", "rotation", "matrices", "chunks", "runtime", "native", "checks", "programs", "vehicle", "trajectories"),
     *("extrapolation", "dynamics", "integrate", "networks", "metrics", "io", "training", "adaptation", "sweep"),
     *("sim", "flights", "control", "export", "identification"),
 )

@@ -5,7 +5,7 @@ training and in inference.
 """
 
 from abc import abstractmethod
-from functools import partial, reduce
+from functools import reduce
 from typing import Self
 
 import equinox as eqx
@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
 from hybrid_jax.networks.activations import Activation
+from hybrid_jax.networks.normalised_layer import normalised_layer, row_means
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
 Channels = tuple[float, ...]
@@ -116,11 +117,11 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         return weight * scale[:, None], self.shift - scale * self.running.mean
 
     def train_layers(self, activation, weight_in, weight_out, bias_out, z):
-        return _normalised_layer(self.epsilon, activation, weight_in, self.gain, self.shift, weight_out, bias_out, z)
+        return normalised_layer(self.epsilon, activation, weight_in, self.gain, self.shift, weight_out, bias_out, z)
 
     def observed(self, hidden):
-        mean = _row_means(hidden)
-        return self.moved(RunningStats(mean, _row_means(jnp.square(hidden - mean[:, None]))))
+        mean = row_means(hidden)
+        return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
 
     def training_mode(self, seen):
         return MinibatchNorm(self.gain, self.shift, seen, self.epsilon)
@@ -174,56 +175,3 @@ def product(weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Arra
     if len(z) > UNROLLED_INPUTS:
         return weight @ z
     return reduce(jnp.add, (expand_trailing(column, z) * row for column, row in zip(weight.T, z, strict=True)))
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _normalised_layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
-
-    The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
-    on a CPU; as products with a vector of ones they halve the time of a training step. A test compares the two.
-    """
-    return _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z)[0]
-
-
-def _forward(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z):
-    # W₁ (z − z̄) is W₁ z less its mean, and needs no subtraction of two large numbers for its variance.
-    centred = z - _row_means(z)[:, None]
-    hidden = weight_in @ centred
-    inverse_deviation = jax.lax.rsqrt(_row_means(jnp.square(hidden)) + epsilon)
-    active = activation((gain * inverse_deviation)[:, None] * hidden + shift[:, None])
-    # The active units are computed again in `_backward`: that takes less than to keep them for forty evaluations.
-    saved = (weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation)
-    return weight_out @ active + bias_out[:, None], saved
-
-
-def _backward(_, activation, saved, d_out: Float[Array, "d b"]):
-    weight_in, gain, shift, weight_out, centred, hidden, inverse_deviation = saved
-    columns = centred.shape[1]
-    scale = gain * inverse_deviation
-    normal = scale[:, None] * hidden + shift[:, None]
-    active, pullback = jax.vjp(activation, normal)
-    (d_active,) = pullback(_transposed(weight_out) @ d_out)
-    d_scale = columns * _row_means(d_active * hidden)
-    # Through the scale γ r, and through r = (mean of h² + ε)^(−½).
-    through_deviation = -(d_scale * gain) * inverse_deviation**3 / columns
-    d_hidden = scale[:, None] * d_active + through_deviation[:, None] * hidden
-    d_centred = _transposed(weight_in) @ d_hidden
-    d_z = d_centred - _row_means(d_centred)[:, None]
-    d_shift, d_bias = columns * _row_means(d_active), columns * _row_means(d_out)
-    d_weight_out = d_out @ active.T
-    return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
-
-
-_normalised_layer.defvjp(_forward, _backward)
-
-
-def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
-    # As a matrix of its own: a small product that reads its left factor by columns takes half as long again on a CPU.
-    return jax.lax.optimization_barrier(matrix.T)
-
-
-def _row_means(rows: Float[Array, "r b"]) -> Float[Array, " r"]:
-    """The mean of each row."""
-    # A row times the transposed: on a CPU less than half of what the matrix times a column takes.
-    return (jnp.full((1, rows.shape[1]), 1 / rows.shape[1], rows.dtype) @ rows.T)[0]

@@ -1,0 +1,109 @@
+"""Kernels in C++ that XLA calls, in place of many small kernels of its own.
+
+They are compiled by GCC at first use, which takes some seconds, and kept in the user's cache folder. Where that is not
+possible, and for anything but single precision on a processor with AVX2, JAX does the same: `status` tells which.
+HYBRID_JAX_NATIVE=0 switches them off. Both ways agree to rounding, so a run should be continued the way it began.
+"""
+
+import ctypes
+import hashlib
+import os
+import shutil
+import subprocess
+import threading
+from functools import cache
+from pathlib import Path
+
+import jax
+import platformdirs
+
+from hybrid_jax import runtime
+
+SWITCH = "HYBRID_JAX_NATIVE"
+SOURCE = Path(__file__).parent / "networks" / "normalised_layer.cc"
+HANDLERS = "forward", "backward"  # functions in the source
+# Errors and exceptions of the square root are not asked for: without them several are taken at once.
+OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w"]
+LONGEST = 300  # s to compile
+_REGISTERED: list[str] = []  # with XLA, which takes a name once
+_LOCK = threading.Lock()  # programs are traced in several threads
+
+
+def status() -> str:
+    """Whether kernels are used in this process: "used", or why not. Compiles them if need be."""
+    return _obstacle() or ("used" if prefix() else "not used: they could not be compiled, or not be kept")
+
+
+def identity() -> str | None:
+    """A digest of the kernels, the compiler and the processor; None where there can be none. Compiles nothing."""
+    return None if _obstacle() else _digest()
+
+
+def prefix() -> str | None:
+    """What the targets' names begin with, once compiled and registered with XLA; None where there are no kernels."""
+    with _LOCK:
+        return _compiled()
+
+
+def register() -> None:
+    """Register kernels that were compiled before, if there are any: a kept program needs them when it is loaded."""
+    with _LOCK:
+        if identity() and _library().exists():
+            _register()
+
+
+@cache
+def _compiled() -> str | None:
+    if not identity():
+        return None
+    try:
+        if not _library().exists():
+            _compile()
+        return _register()
+    except (OSError, subprocess.SubprocessError, AttributeError):
+        return None
+
+
+def _register() -> str:
+    begin = f"hybrid_jax_{_digest()}_"
+    if begin not in _REGISTERED:
+        library = ctypes.CDLL(str(_library()))
+        for handler in HANDLERS:
+            jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
+        _REGISTERED.append(begin)
+    return begin
+
+
+@cache
+def _obstacle() -> str | None:
+    if os.environ.get(SWITCH) == "0":
+        return f"not used: {SWITCH} is 0"
+    if jax.default_backend() != "cpu":
+        return f"not used: arrays are on a {jax.default_backend()}"
+    if not {"avx2", "fma"} <= set(runtime.machine()[-1].split()):
+        return "not used: the processor has no AVX2"
+    return None if _compiler() else "not used: there is no g++"
+
+
+def _compiler() -> str | None:
+    return shutil.which(os.environ.get("CXX") or "g++")
+
+
+@cache
+def _digest() -> str:
+    compiler = Path(_compiler() or "").resolve()
+    made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
+    return hashlib.sha256(SOURCE.read_bytes() + repr(made_by).encode()).hexdigest()[:16]
+
+
+def _library() -> Path:
+    return Path(platformdirs.user_cache_dir("hybrid_jax")) / "native" / f"{_digest()}.so"
+
+
+def _compile() -> None:
+    library = _library()
+    library.parent.mkdir(parents=True, exist_ok=True)
+    part = library.with_name(f".{library.name}.{os.getpid()}.part")
+    command = [_compiler() or "g++", *OPTIONS, f"-I{jax.ffi.include_dir()}", str(SOURCE), "-o", str(part)]
+    subprocess.run(command, check=True, capture_output=True, timeout=LONGEST)
+    os.replace(part, library)
