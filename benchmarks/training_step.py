@@ -4,13 +4,15 @@ A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gr
 plain one is one sample at a time under `vmap`, batch statistics by `pmean`, an RK4 by hand, derivatives by autodiff.
 Both must agree, ours also with itself in double precision. The yardstick is a large float32 matrix product in the same
 turns; it uses all cores, a step hardly more than one: set one core with taskset to compare the two. A user's own fields
-have no form for a batch; they must not be slower than plain.
+have no form for a batch; they must not be slower than plain. Our own step is also timed without the kernels of
+`hybrid_jax.native`.
 """
 
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, get_args
+from unittest import mock
 
 import equinox as eqx
 import jax
@@ -23,11 +25,14 @@ from benchmarks.operations import count_operations
 from benchmarks.own_fields import OwnField, own_field, own_windows
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_run
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compile_all, compiled, in_turns, run, table
+from hybrid_jax import native
 from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.training.fitting import gradient_step, make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 PRODUCT = "matrix product"  # beside the names of models
+BARE = "without kernels"
 # Sums of 100 windows × 40 evaluations in another order, in float32; and 1e-4 of a leaf's largest entry moves no rate.
 AGREEMENT = 1e-4
 # Of a step in single precision from the same in double: rounding at 6e-8 in 40 evaluations and sums of thousands.
@@ -88,9 +93,21 @@ def prepare(model: Any, preset: Preset) -> Contest:
     arguments, ours = (state.field, state.adam, plan, windows), partial(gradient_step, settings=settings)
     calls, seconds = compile_all({"ours": ours, "plain": plain.training_step}, *arguments)
     difference = compare(f"steps of {model}", calls["ours"](), calls["plain"]())
+    if batch_norms(state.field) and native.prefix():
+        calls[BARE], seconds[BARE] = without_kernels(ours, *arguments)
+        compare(f"steps of {model} with and without kernels", calls["ours"](), calls[BARE]())
     exact = in_double_precision(ours, *arguments)
     rounding = compare(f"steps of {model} in single and double precision", calls["ours"](), exact, ROUNDING)
     return Contest(calls, seconds, difference, rounding, dict(count_operations(ours, *arguments)))
+
+
+def without_kernels(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
+    """`compiled`, by JAX alone."""
+    jax.clear_caches()  # of what was traced with kernels
+    with mock.patch.object(native, "prefix", return_value=None):
+        found = compiled(function, *arguments)
+    jax.clear_caches()
+    return found
 
 
 def in_double_precision(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
@@ -118,6 +135,7 @@ def row_of(model: str, contest: Contest, times: Times, preset: Preset) -> dict[s
         "seconds": seconds,
         "windows_per_second": preset.windows / seconds["ours"],
         "plain_over_ours": times.ratio((model, "plain"), (model, "ours")),
+        "bare_over_ours": times.ratio((model, BARE), (model, "ours")) if BARE in contest.calls else None,
         "operations": contest.operations,
         "gflops": rate / 1e9,
         "matrix_product_gflops": roof / 1e9,
@@ -131,6 +149,7 @@ STEP = {
     "windows/s": lambda row: f"{row['windows_per_second']:,.0f}",
     "plain [ms]": lambda row: f"{1e3 * row['seconds']['plain']:.2f}",
     "plain / ours": lambda row: f"{row['plain_over_ours']:.2f}",
+    BARE: lambda row: "" if row["bare_over_ours"] is None else f"{row['bare_over_ours']:.2f}",
     "compile [s]": lambda row: f"{row['compile_seconds']['ours']:.1f}",
     "differ by": lambda row: f"{row['difference']:.0e}",
     "float32 error": lambda row: f"{row['float32_error']:.0e}",
@@ -159,6 +178,11 @@ def measure(preset: Preset) -> Findings:
             f"{row['model']}: plain / ours", row["plain_over_ours"], at_least=1 if model in preset.models else 1 / 1.05
         )
         for model, row in zip(contests, rows, strict=True)
+    ]
+    ratios += [
+        Ratio(f"{row['model']}: {BARE} / ours", row["bare_over_ours"], at_least=1.1)
+        for row in rows
+        if row["bare_over_ours"] is not None
     ]
     tables = [
         table("one gradient step", rows, STEP),
