@@ -95,17 +95,17 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
 def ranges_of_motion(folds: Sequence[Fold]) -> Figure:
     """A panel for each kind of motion, a line for each test flight, before the range of its fold's training flights."""
     tested = [(motion_of_logs([*fold.train, *fold.validation]), log) for fold in folds for log in fold.test]
-    figure, panels = subplots((PAGE, 1.4 + 0.18 * len(tested)), 1, 4, sharey=True)
+    figure, panels = subplots((PAGE, 1.7 + 0.18 * len(tested)), 1, 4, sharey=True)
     for line, (known, log) in enumerate(tested):
         for axes, (name, values) in zip(panels.flat, motion_of_logs([log]).items(), strict=True):
             low, middle, high = np.quantile(values, (RANGE[0], 0.5, RANGE[1]))
-            axes.barh(line, np.ptp(ends := np.quantile(known[name], RANGE)), left=ends[0], height=0.9, color="0.87")
-            axes.plot([low, high], [line, line], color=COLOURS["hybrid"])
-            axes.plot(middle, line, "o", color=COLOURS["hybrid"], markersize=3.5)
+            band = {"height": 0.9, "color": "0.87", "label": "flights trained on, 1 to 99 %"}
+            axes.barh(line, np.ptp(ends := np.quantile(known[name], RANGE)), left=ends[0], **band)
+            axes.plot([low, high], [line, line], color=COLOURS["hybrid"], label="test flight, 1 to 99 %")
+            axes.plot(middle, line, "o", color=COLOURS["hybrid"], markersize=3.5, label="its median")
             axes.set_xlabel(name)
     name_lines(panels[0, 0], [flight_of(log) for _, log in tested])
-    figure.suptitle("What is asked of the models, and what they were trained on")
-    return figure
+    return legend_below(figure, "What is asked of the models, and what they were trained on")
 
 
 @mpl.rc_context(STYLE)
