@@ -8,7 +8,7 @@ import numpy as np
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
-from experiments.reaction_diffusion.models import error, pieces, predicted, weights, with_weights
+from experiments.reaction_diffusion.models import error, joined, pieces, predicted, weights, with_weights
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
@@ -42,7 +42,7 @@ def source_model(config: Config, kept: Kept) -> Any:
     """A hybrid trained on one trajectory in each of the four environments, with F and k of each."""
     parts = [patterns(gray_scott(TRAINED_IN, reacts=True), e, 1, (TRAIN, e)) for e in range(len(TRAINED_IN))]
     physics = gray_scott([GUESS] * len(TRAINED_IN), reacts=False)
-    data = jax.tree.map(lambda *leaves: np.concatenate(leaves), *(pieces(part, EVERY) for part in parts))
+    data = joined([pieces(part, EVERY) for part in parts])
     hj.check_grid(physics.grid, data, diffusivity=(D_U, D_V), substeps=SCOTT_COARSE.substeps)
     size = {"outputs": 1, "hidden": min(UNITS, config.hidden)}
     network = hj.residual_network(2, 0, jax.random.key(0), **size, activation="tanh", norm="none", scaling=SCALING)

@@ -1,5 +1,6 @@
 """What the studies share: weights as a vector, forecasts and their error, and windows cut from trajectories."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
@@ -35,13 +36,17 @@ def error(model, data: hj.Trajectories, solver) -> float:
     return value if np.isfinite(value) else float("inf")
 
 
-def pieces(data: hj.Trajectories, every: int, steps: int = 1) -> hj.Trajectories:
-    """Windows of `steps` intervals from each trajectory in turn, from its start at every so many intervals."""
+def pieces(data: hj.Trajectories, every: int, steps: int = 1, first: int = 0) -> hj.Trajectories:
+    """Windows of `steps` intervals from each trajectory in turn, at every so many intervals from the `first`."""
     states = np.concatenate([data.x0[:, None], data.x], axis=1)
-    starts = range(0, data.horizon - steps + 1, every)
+    starts = range(first, data.horizon - steps + 1, every)
 
     def each(part, length):
         found = np.stack([part[:, i : i + length] for i in starts], axis=1)
         return found.reshape(len(part) * len(starts), length, part.shape[-1])
 
     return hj.Trajectories(each(states, 1)[:, 0], each(data.u, steps), each(states[:, 1:], steps), data.dt)
+
+
+def joined(parts: Sequence[hj.Trajectories]) -> hj.Trajectories:
+    return jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)

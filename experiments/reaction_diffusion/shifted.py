@@ -10,7 +10,7 @@ import numpy as np
 import hybrid_jax as hj
 from experiments.reaction_diffusion.config import Config
 from experiments.reaction_diffusion.forecast import GUESS, scaling
-from experiments.reaction_diffusion.models import error, pieces, weights, with_weights
+from experiments.reaction_diffusion.models import error, joined, pieces, weights, with_weights
 from experiments.reaction_diffusion.systems import COARSE, A, B, K, fitzhugh_nagumo, plane, reacting
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, NO_PHYSICS, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Row
@@ -42,9 +42,11 @@ def learned(field, data: hj.Trajectories, steps: int) -> hj.AbstractVectorField:
 
 def by_parameters(field, data: hj.Trajectories, method: str) -> tuple[hj.AbstractVectorField, str | None]:
     """Adapted by a method that leaves the network alone, or may; and what `auto` chose."""
-    every = WINDOW * len(data)  # the same number of windows for every N, as they are dear
-    settings = hj.Settings(solver=COARSE)
-    result = hj.adapt(field, pieces(data, every, WINDOW), method=method, settings=settings)
+    # The same number of windows for every N, as they are dear. Each trajectory's begin a window later than those of the
+    # one before it: of eight trajectories they would all be beginnings, which say little of what comes after.
+    every, each = WINDOW * len(data), range(len(data))
+    windows = joined([pieces(data[i : i + 1], every, WINDOW, WINDOW * i) for i in each])
+    result = hj.adapt(field, windows, method=method, settings=hj.Settings(solver=COARSE))
     return result.field, result.chosen
 
 
