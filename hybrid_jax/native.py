@@ -11,6 +11,7 @@ import os
 import shutil
 import subprocess
 import threading
+from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
 
@@ -20,8 +21,10 @@ import platformdirs
 from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
-SOURCE = Path(__file__).parent / "networks" / "normalised_layer.cc"
-HANDLERS = "forward", "backward"  # functions in the source
+VECTOR = 16  # numbers in a vector, at most: of samples the kernels take at least so many
+FOLDER = Path(__file__).parent
+SOURCES = FOLDER / "networks" / "normalised_layer.cc", FOLDER / "dynamics" / "rigid_body.cc"
+HANDLERS = [f"{source.stem}_{way}" for source in SOURCES for way in ("forward", "backward")]  # functions in the sources
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w"]
 LONGEST = 300  # s to compile
@@ -50,6 +53,19 @@ def register() -> None:
     with _LOCK:
         if identity() and _library().exists():
             _register()
+
+
+def call(handler: str, results: jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct], *arrays, **attributes):
+    """What a kernel makes of the arrays, whose shapes it does not check. Lanes under `vmap` are one call."""
+    kernel = jax.ffi.ffi_call(f"{prefix()}{handler}", results, vmap_method="broadcast_all")
+    return kernel(*arrays, **attributes)
+
+
+def with_derivative(kernel: Callable, plain: Callable) -> Callable:
+    """The kernel, which for a second derivative becomes the same in plain JAX."""
+    function = jax.custom_jvp(kernel)
+    function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
+    return function
 
 
 @cache
@@ -93,7 +109,8 @@ def _compiler() -> str | None:
 def _digest() -> str:
     compiler = Path(_compiler() or "").resolve()
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
-    return hashlib.sha256(SOURCE.read_bytes() + repr(made_by).encode()).hexdigest()[:16]
+    sources = b"".join(path.read_bytes() for path in (*SOURCES, FOLDER / "vectors.h"))
+    return hashlib.sha256(sources + repr(made_by).encode()).hexdigest()[:16]
 
 
 def _library() -> Path:
@@ -104,6 +121,7 @@ def _compile() -> None:
     library = _library()
     library.parent.mkdir(parents=True, exist_ok=True)
     part = library.with_name(f".{library.name}.{os.getpid()}.part")
-    command = [_compiler() or "g++", *OPTIONS, f"-I{jax.ffi.include_dir()}", str(SOURCE), "-o", str(part)]
+    folders = [f"-I{folder}" for folder in (FOLDER, jax.ffi.include_dir())]
+    command = [_compiler() or "g++", *OPTIONS, *folders, *map(str, SOURCES), "-o", str(part)]
     subprocess.run(command, check=True, capture_output=True, timeout=LONGEST)
     os.replace(part, library)

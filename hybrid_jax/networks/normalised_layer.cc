@@ -8,32 +8,19 @@
 // depends on the sizes alone, so that a lane of a sweep is the same run alone. h is a multiple of V, and b at least V,
 // which the caller sees to, as to all shapes.
 
-#include <algorithm>
 #include <cmath>
-#include <cstdint>
 #include <cstring>
 #include <utility>
 #include <vector>
 
-#include "xla/ffi/api/ffi.h"
-
-namespace ffi = xla::ffi;
+#include "vectors.h"
 
 namespace {
 
-#if defined(__AVX512F__)
-constexpr int V = 16, ACCUMULATORS = 20;  // numbers in a vector, and vectors that a tile keeps in registers
-#else
-constexpr int V = 8, ACCUMULATORS = 12;
-#endif
+constexpr int ACCUMULATORS = V == 16 ? 20 : 12;  // vectors that a tile keeps in registers
 
-#define INLINE inline __attribute__((always_inline))
 #define UNROLL _Pragma("GCC unroll 16")
-typedef float Vec __attribute__((vector_size(4 * V), aligned(4), may_alias));
-typedef int32_t Places __attribute__((vector_size(4 * V)));
 
-INLINE Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
-INLINE void store(float* to, Vec v) { *reinterpret_cast<Vec*>(to) = v; }
 INLINE Vec relu(Vec v) { return v <= 0 ? Vec{} : v; }  // NaN stays
 
 struct Left { const float* at; int64_t row, step; };  // x[r, k] is at[r row + k step]
@@ -97,9 +84,6 @@ INLINE void exchange(Vec (&rows)[V]) {
   }
 }
 
-// The first of V rows or columns from i on: the last overlap those before, so that no vector is cut where there are V.
-INLINE int64_t first(int64_t i, int64_t n) { return std::max<int64_t>(0, std::min(i, n - V)); }
-
 // to[j, i] = from[i, j]. Where there are fewer than V rows or columns, V are read and written nevertheless.
 void transpose(const float* from, int64_t from_row, float* to, int64_t to_row, int64_t rows, int64_t columns) {
   for (int64_t i = 0; i < rows; i += V)
@@ -116,14 +100,8 @@ float sum(const float* row, int64_t n) {
   Vec all{};
   int64_t i = 0;
   for (; i + V <= n; i += V) all += load(row + i);
-  Places place;
-  for (int j = 0; j < V; ++j) place[j] = j;
-  all += place >= int32_t(i + V - n) ? load(row + n - V) : Vec{};  // what is left, at the end of a vector
-  float part[V];
-  store(part, all);
-  for (int half = V / 2; half; half /= 2)
-    for (int j = 0; j < half; ++j) part[j] += part[j + half];
-  return part[0];
+  all += without(load(row + n - V), i + V - n);  // what is left, at the end of a vector
+  return sum(all);
 }
 
 // Each row less its mean.
@@ -133,9 +111,6 @@ void centre(const float* from, float* to, int64_t rows, int64_t n) {
     for (int64_t i = 0; i < n; i += V) store(to + first(i, n), load(from + first(i, n)) - mean);
   }
 }
-
-using Array = ffi::Buffer<ffi::F32>;
-using Result = ffi::ResultBuffer<ffi::F32>;
 
 // Sizes of a lane, the lanes of a sweep, which are the axes before, and where the arrays of a lane begin.
 struct Sizes {
@@ -295,6 +270,6 @@ ffi::Error backward_call(Array w1, Array gain, Array shift, Array w2, Array kept
 }  // namespace
 
 #define SIX(KIND) .KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>()
-XLA_FFI_DEFINE_HANDLER_SYMBOL(forward, forward_call,
+XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_forward, forward_call,
                               ffi::Ffi::Bind().Attr<float>("epsilon") SIX(Arg).Ret<Array>().Ret<Array>());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(backward, backward_call, ffi::Ffi::Bind() SIX(Arg) SIX(Ret));
+XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_backward, backward_call, ffi::Ffi::Bind() SIX(Arg) SIX(Ret));

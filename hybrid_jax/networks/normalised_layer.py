@@ -3,7 +3,6 @@
 As plain JAX for any activation, precision and device, and by the kernels of `hybrid_jax.native` where they serve.
 """
 
-from collections.abc import Callable, Sequence
 from functools import partial
 
 import jax
@@ -15,7 +14,6 @@ from hybrid_jax import native
 from hybrid_jax.networks.activations import ACTIVATIONS, Activation
 
 RELU = ACTIVATIONS["relu"]
-VECTOR = 16  # the kernels take whole vectors of hidden units, and of samples at least one
 
 
 def normalised_layer(
@@ -33,7 +31,7 @@ def _has_kernel(activation: Activation, arrays) -> bool:
     (h, m), d, b = arrays[0].shape, len(arrays[4]), arrays[5].shape[1]
     fits = [array.shape for array in arrays] == [(h, m), (h,), (h,), (d, h), (d,), (m, b)]
     single = all(array.dtype == jnp.float32 for array in arrays)
-    return fits and single and activation is RELU and h % VECTOR == 0 and b >= VECTOR
+    return fits and single and activation is RELU and h % native.VECTOR == 0 and b >= native.VECTOR
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
@@ -88,13 +86,13 @@ def _forward_kernel(epsilon, *arrays):
     def kernel(weight_in, gain, shift, weight_out, bias_out, z):
         results = _shape(bias_out, z), jax.ShapeDtypeStruct((z.size + len(gain),), z.dtype)
         arrays = weight_in, gain, shift, weight_out, bias_out, z
-        return tuple(_call("forward", results, *arrays, epsilon=np.float32(epsilon)))
+        return tuple(native.call("normalised_layer_forward", results, *arrays, epsilon=np.float32(epsilon)))
 
     def plain(*arrays):
         y, (*_, centred, _, inverse_deviation) = _forward(epsilon, RELU, *arrays)
         return y, jnp.concatenate([centred.ravel(), inverse_deviation])
 
-    y, kept = _with_derivative(kernel, plain)(*arrays)
+    y, kept = native.with_derivative(kernel, plain)(*arrays)
     return y, (*arrays[:4], kept)
 
 
@@ -102,34 +100,21 @@ def _backward_kernel(_, saved, d_out: Float[Array, "d b"]):
     def kernel(weight_in, gain, shift, weight_out, kept, d_out):
         like = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (weight_in, gain, shift, weight_out, d_out[:, 0])]
         arrays = weight_in, gain, shift, weight_out, kept, d_out
-        return tuple(_call("backward", (*like, _shape(weight_in[0], d_out)), *arrays))
+        return tuple(native.call("normalised_layer_backward", (*like, _shape(weight_in[0], d_out)), *arrays))
 
     def plain(weight_in, gain, shift, weight_out, kept, d_out):
         centred, inverse_deviation = kept[: -len(gain)].reshape(-1, d_out.shape[1]), kept[-len(gain) :]
         saved = weight_in, gain, shift, weight_out, centred, weight_in @ centred, inverse_deviation
         return _backward(None, RELU, saved, d_out)
 
-    return _with_derivative(kernel, plain)(*saved, d_out)
+    return native.with_derivative(kernel, plain)(*saved, d_out)
 
 
 _kernel_layer.defvjp(_forward_kernel, _backward_kernel)
 
 
-def _with_derivative(kernel: Callable, plain: Callable) -> Callable:
-    """The kernel, which for a second derivative becomes the same in plain JAX."""
-    function = jax.custom_jvp(kernel)
-    function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
-    return function
-
-
 def _shape(rows: Float[Array, " r"], columns: Float[Array, "_ b"]) -> jax.ShapeDtypeStruct:
     return jax.ShapeDtypeStruct((len(rows), columns.shape[1]), columns.dtype)
-
-
-def _call(handler: str, results: Sequence[jax.ShapeDtypeStruct], *arrays, **attributes):
-    # Lanes under `vmap` are one call.
-    call = jax.ffi.ffi_call(f"{native.prefix()}{handler}", results, vmap_method="broadcast_all")
-    return call(*arrays, **attributes)
 
 
 def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:
