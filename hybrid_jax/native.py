@@ -5,12 +5,14 @@ possible, and for anything but single precision on a processor with AVX2, JAX do
 HYBRID_JAX_NATIVE=0 switches them off. Both ways agree to rounding, so a run should be continued the way it began.
 """
 
+import contextlib
 import ctypes
 import hashlib
 import os
 import shutil
 import subprocess
 import threading
+import time
 from collections.abc import Callable, Sequence
 from functools import cache
 from pathlib import Path
@@ -84,6 +86,8 @@ def _register() -> str:
     begin = f"hybrid_jax_{_digest()}_"
     if begin not in _REGISTERED:
         library = ctypes.CDLL(str(_library()))
+        with contextlib.suppress(OSError):
+            _library().touch()  # it was used
         for handler in HANDLERS:
             jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
         _REGISTERED.append(begin)
@@ -125,3 +129,12 @@ def _compile() -> None:
     command = [_compiler() or "g++", *OPTIONS, *folders, *map(str, SOURCES), "-o", str(part)]
     subprocess.run(command, check=True, capture_output=True, timeout=LONGEST)
     os.replace(part, library)
+    _delete_unused(library.parent)
+
+
+def _delete_unused(folder: Path) -> None:
+    """Delete libraries of other sources or compilers, and what a kill left half written."""
+    for path in folder.glob("*"):
+        with contextlib.suppress(FileNotFoundError):  # deleted by another process
+            if time.time() - path.stat().st_mtime > runtime.UNUSED:
+                path.unlink()
