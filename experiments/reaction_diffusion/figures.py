@@ -97,7 +97,7 @@ def scores(rows: Results) -> Figure:
         panel.minorticks_off()
     axes[0, 0].set_ylabel("mean squared error")
     tick_errors(axes[0, 0].yaxis, *axes[0, 0].get_ylim())
-    return legend_below(figure, columns=3)
+    return legend_below(figure, meaning="mean over seeds; bars: smallest and largest", columns=3)
 
 
 def _forecast(shown: Shown, name: str) -> np.ndarray:
