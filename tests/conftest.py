@@ -1,17 +1,15 @@
-"""Tests spend most of their time compiling: programs are compiled without optimisation, and kept for the next run.
+"""Tests spend most of their time compiling: programs are compiled without optimisation and shared by all processes.
 
 `XLA_FLAGS= pytest` compiles them as users do. Each process of tests keeps to one core: XLA starts a thread for every
 core that a process may use, and those of two processes wait for each other.
 """
 
 import os
+import shutil
 import signal
-import time
-import zlib
+import tempfile
 from importlib.metadata import version
-from pathlib import Path
 
-import platformdirs
 import pytest
 
 pytest.register_assert_rewrite("any_system")
@@ -27,8 +25,6 @@ KEEP_ALL = {
 QUICK = "--xla_backend_optimization_level=0"
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
     QUICK += " --xla_cpu_use_fusion_emitters=false"
-CPUS = Path("/proc/cpuinfo")
-UNUSED = 14 * 24 * 3600  # s after which a program is deleted
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # other systems bind no process
 
 
@@ -37,21 +33,10 @@ def pytest_configure(config):
     if worker and CORES:
         os.sched_setaffinity(0, {CORES[int(worker.removeprefix("gw")) % len(CORES)]})
     if PROGRAMS not in os.environ:
-        os.environ[PROGRAMS] = str(programs_folder())
+        folder = os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="hybrid_jax_programs_")
+        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     for name, value in (KEEP_ALL | {"XLA_FLAGS": QUICK}).items():
         os.environ.setdefault(name, value)
-
-
-def programs_folder() -> Path:
-    """Where compiled programs are kept for processors with the instructions of this one; old ones are deleted."""
-    lines = CPUS.read_text().splitlines() if CPUS.exists() else []
-    instructions = next((line for line in lines if line.startswith(("flags", "Features"))), "")
-    folder = platformdirs.user_cache_path("hybrid_jax") / f"tests-{zlib.crc32(instructions.encode()):08x}"
-    folder.mkdir(parents=True, exist_ok=True)
-    for path in folder.iterdir():
-        if time.time() - path.stat().st_mtime > UNUSED:
-            path.unlink(missing_ok=True)
-    return folder
 
 
 @pytest.fixture(scope="module")
