@@ -7,20 +7,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.dynamics.base import ravel_learned
 
 
 def weights(model: hj.AbstractVectorField) -> np.ndarray:
     """All parameters of a model as a vector."""
-    return np.asarray(ravel_pytree(eqx.filter(model, trainable(model)))[0])
+    return np.asarray(ravel_learned(model)[0])
 
 
 def with_weights(model: Any, vector: np.ndarray) -> Any:
-    learned, rest = eqx.partition(model, trainable(model))
-    return eqx.combine(ravel_pytree(learned)[1](jnp.asarray(vector)), rest)
+    return ravel_learned(model)[1](jnp.asarray(vector))
 
 
 @eqx.filter_jit

@@ -11,11 +11,10 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import optimistix
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import compact, rollout
@@ -140,11 +139,10 @@ def fit_free(
 def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:
     """θ_p as a vector, in the order of the physics' leaves, and the field as a function of it; ValueError if none."""
     physics = physics_of(field)
-    learned, rest = eqx.partition(physics, trainable(physics))
-    theta, unravel = ravel_pytree(learned)
+    theta, at = ravel_learned(physics)
     if theta.size == 0:
         raise ValueError(f"field: its physics, {type(physics).__name__}, has no parameter to fit")
-    return theta, lambda theta: with_physics(field, eqx.combine(unravel(theta), rest))
+    return theta, lambda theta: with_physics(field, at(theta))
 
 
 @eqx.filter_jit
