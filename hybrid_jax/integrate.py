@@ -17,15 +17,13 @@ import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_batch, train_batch
-from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
+from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_batch
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
-_train, _infer = eqx.filter_jit(train_batch), eqx.filter_jit(infer_batch)
-_evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
+_infer = eqx.filter_jit(infer_batch)
 
 
 class RK4(diffrax.AbstractSolver):
@@ -220,24 +218,6 @@ def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.
         found = f"{slope.dtype}{list(slope.shape)}" if hasattr(slope, "shape") else type(slope).__name__
         raise ValueError(f"field: {name} must return a derivative {x.shape} for {given}, returned {found}")
     return slope
-
-
-def rollout_minibatch(
-    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
-) -> Float[Array, "t d b"]:
-    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
-
-    A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
-    """
-    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations
-        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
-    alone = training_mode(field)
-
-    def one_window(x0, u):
-        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
-
-    return over_samples(one_window)(x0, u)
 
 
 def along(x0: Float[Array, "d b"], x: Float[Array, "t d b"], u: Float[Array, "t m b"]):

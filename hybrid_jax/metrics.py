@@ -8,7 +8,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.rollouts import predict
 from hybrid_jax.trajectories import Trajectories, check
 
 CHUNK = 1000  # windows predicted at once
@@ -45,7 +45,7 @@ def window_mse(
         raise ValueError(f"every={every} is more than the {windows.horizon} intervals of the windows")
 
     def errors(windows: Trajectories) -> Float[Array, " n"]:
-        predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
+        predicted = predict(field, windows.x0, windows.u, windows.dt, solver)
         return mse(predicted[:, every - 1 :: every], jnp.asarray(windows.x)[:, every - 1 :: every])
 
     return in_chunks(errors, windows, chunk)

@@ -11,9 +11,11 @@ import hashlib
 import os
 import shutil
 import subprocess
+import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -24,11 +26,11 @@ from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
 VECTOR = 16  # numbers in a vector, at most: of samples the kernels take at least so many
-FOLDER = Path(__file__).parent
-SOURCES = FOLDER / "networks" / "normalised_layer.cc", FOLDER / "dynamics" / "rigid_body.cc"
-HANDLERS = [f"{source.stem}_{way}" for source in SOURCES for way in ("forward", "backward")]  # functions in the sources
+FOLDER = Path(__file__).parent / "kernels"
+SOURCES = [FOLDER / f"{name}.cc" for name in ("normalised_layer", "rollout", "prediction")]
+HANDLERS = "normalised_layer_forward", "normalised_layer_backward", "rollout_forward", "rollout_backward", "prediction"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
-OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-shared", "-w"]
+OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
 _REGISTERED: list[str] = []  # with XLA, which takes a name once
 _LOCK = threading.Lock()  # programs are traced in several threads
@@ -113,7 +115,7 @@ def _compiler() -> str | None:
 def _digest() -> str:
     compiler = Path(_compiler() or "").resolve()
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
-    sources = b"".join(path.read_bytes() for path in (*SOURCES, FOLDER / "vectors.h"))
+    sources = b"".join(path.read_bytes() for path in sorted(FOLDER.iterdir()))
     return hashlib.sha256(sources + repr(made_by).encode()).hexdigest()[:16]
 
 
@@ -125,11 +127,19 @@ def _compile() -> None:
     library = _library()
     library.parent.mkdir(parents=True, exist_ok=True)
     part = library.with_name(f".{library.name}.{os.getpid()}.part")
-    folders = [f"-I{folder}" for folder in (FOLDER, jax.ffi.include_dir())]
-    command = [_compiler() or "g++", *OPTIONS, *folders, *map(str, SOURCES), "-o", str(part)]
-    subprocess.run(command, check=True, capture_output=True, timeout=LONGEST)
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as threads:
+        objects = [Path(folder) / f"{source.stem}.o" for source in SOURCES]
+        include = f"-I{jax.ffi.include_dir()}"
+        commands = [["-c", include, str(source), "-o", str(to)] for source, to in zip(SOURCES, objects, strict=True)]
+        list(threads.map(_run_compiler, commands))
+        _run_compiler(["-shared", *map(str, objects), "-o", str(part)])
     os.replace(part, library)
     _delete_unused(library.parent)
+
+
+def _run_compiler(arguments: list[str]) -> None:
+    command = [_compiler() or "g++", *OPTIONS, *arguments]
+    subprocess.run(command, check=True, capture_output=True, timeout=LONGEST)
 
 
 def _delete_unused(folder: Path) -> None:

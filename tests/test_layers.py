@@ -10,8 +10,8 @@ ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
     *("state", "rotation", "matrices", "chunks", "runtime", "native", "checks", "programs", "vehicle", "trajectories"),
-    *("extrapolation", "dynamics", "integrate", "networks", "metrics", "io", "training", "adaptation", "sweep"),
-    *("sim", "flights", "control", "export", "identification"),
+    *("extrapolation", "dynamics", "integrate", "networks", "rollout_kernels", "rollouts", "metrics", "io"),
+    *("training", "adaptation", "sweep", "sim", "flights", "control", "export", "identification"),
 )
 # These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.
 SERVICES = {"sim", "flights", "control", "export"}

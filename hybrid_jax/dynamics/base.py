@@ -47,9 +47,6 @@ class AbstractVectorField(eqx.Module):
         direct = features_first(self) and not batch_norms(self)
         return self(x, u) if direct else over_samples(training_mode(self))(x, u)
 
-    def train_sum(self, x: Batch, u: Float[Array, "m b"], residual: Batch) -> Batch:
-        return train_batch(self, x, u) + apply_residual(self, x, residual)
-
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         return self(x, u) if features_first(self) else over_samples(self)(x, u)
 
@@ -78,11 +75,6 @@ def _methods_of(field) -> type[AbstractVectorField]:
 def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
     """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
     return _methods_of(field).train_batch(field, x, u)
-
-
-def train_sum(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"], residual: Batch) -> Batch:
-    """`train_batch` of physics plus, by `apply_residual`, what a network returned for the same minibatch."""
-    return _methods_of(field).train_sum(field, x, u, residual)
 
 
 def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
@@ -135,7 +127,7 @@ class Hybrid(AbstractVectorField):
         return self.physics(x, u) + apply_residual(self.physics, x, self.residual(x, u))
 
     def train_batch(self, x, u):
-        return train_sum(self.physics, x, u, train_batch(self.residual, x, u))
+        return train_batch(self.physics, x, u) + apply_residual(self.physics, x, train_batch(self.residual, x, u))
 
     def infer_batch(self, x, u):
         return infer_batch(self.physics, x, u) + apply_residual(self.physics, x, infer_batch(self.residual, x, u))

@@ -1,7 +1,6 @@
 """f_p: the Newton–Euler equations of a multirotor with unknown Ix, Iy and k (paper, Eq. 10)."""
 
 from abc import abstractmethod
-from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
@@ -10,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import checks, native
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.dynamics.equations import derivative, evaluate_columns
@@ -63,71 +62,13 @@ class RigidBody(AbstractRigidBody):
     def train_batch(self, x, u):
         return evaluate_columns(RigidBody.of_rows, self, x, u)
 
-    def train_sum(self, x, u, residual):
-        # Only beside a network, which calls kernels anyway. A rollout of physics alone is one kernel of XLA, which is
-        # faster, and which calls would break up.
-        arrays = *(self.theta()[name] for name in LEARNED), x, u, self.apply_residual(x, residual)
-        own = type(self).train_batch is RigidBody.train_batch
-        if own and _has_kernel(self.vehicle, arrays) and native.prefix():
-            return _kernel_sum(self.vehicle, *arrays)
-        return super().train_sum(x, u, residual)
-
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-        return _of_theta(self.vehicle, self.theta(), x, u)
+        return newton_euler(self.vehicle, self.theta(), x, u)
 
 
-def _of_theta(vehicle: Vehicle, theta: dict[str, Array], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+def newton_euler(vehicle: Vehicle, theta: dict[str, Array], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
+    """ẋ of a rigid body with θ_p = {"Ix": …, "Iy": …, "k": …}."""
     return derivative(vehicle, Terms(), {name: (value,) for name, value in theta.items()}, x, u)
-
-
-def _has_kernel(vehicle: Vehicle, arrays) -> bool:
-    """Whether the kernels are written for these arrays. They do not check shapes: what does not fit, JAX refuses."""
-    b = arrays[3].shape[-1]
-    fits = [array.shape for array in arrays] == [(), (), (), (STATE_SIZE, b), (vehicle.rotors, b), (STATE_SIZE, b)]
-    return fits and all(array.dtype == jnp.float32 for array in arrays) and b >= native.VECTOR
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _kernel_sum(vehicle: Vehicle, ix, iy, k, x: Float[Array, "13 b"], u: Float[Array, "rotors b"], residual):
-    """ẋ at θ_p = (Ix, Iy, k) plus the residual, each way in one call."""
-    return _forward_kernel(vehicle, ix, iy, k, x, u, residual)[0]
-
-
-def _plain_sum(vehicle: Vehicle, ix, iy, k, x, u, residual):
-    return _of_theta(vehicle, {"Ix": ix, "Iy": iy, "k": k}, tuple(x), tuple(u)) + residual
-
-
-def _forward_kernel(vehicle: Vehicle, *arrays):
-    def kernel(*arrays):
-        return native.call("rigid_body_forward", _like(arrays[-1]), *arrays, constants=_constants(vehicle))
-
-    return native.with_derivative(kernel, partial(_plain_sum, vehicle))(*arrays), arrays[:-1]
-
-
-def _backward_kernel(vehicle: Vehicle, saved, d_out: Float[Array, "13 b"]):
-    def kernel(*arrays):
-        results = [_like(array) for array in arrays[:-1]]
-        return tuple(native.call("rigid_body_backward", results, *arrays, constants=_constants(vehicle)))
-
-    def plain(*arrays):
-        *saved, d_out = arrays
-        return jax.vjp(partial(_plain_sum, vehicle, residual=jnp.zeros_like(d_out)), *saved)[1](d_out)
-
-    return *native.with_derivative(kernel, plain)(*saved, d_out), d_out
-
-
-_kernel_sum.defvjp(_forward_kernel, _backward_kernel)
-
-
-def _like(array: Array) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct(array.shape, array.dtype)
-
-
-def _constants(vehicle: Vehicle) -> np.ndarray:
-    """As rigid_body.cc has them."""
-    rotors = [(*position, spin) for position, spin in zip(vehicle.rotor_positions, vehicle.spin, strict=True)]
-    body = vehicle.mass, vehicle.gravity, vehicle.inertia[2], vehicle.torque_coefficient
-    return np.array([*body, *np.ravel(rotors)], np.float32)
 
 
 class ForcedBody(RigidBody):

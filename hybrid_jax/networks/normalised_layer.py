@@ -23,7 +23,7 @@ def normalised_layer(
     arrays = weight_in, gain, shift, weight_out, bias_out, z
     if _has_kernel(activation, arrays) and native.prefix():
         return _kernel_layer(epsilon, *arrays)
-    return _plain_layer(epsilon, activation, *arrays)
+    return plain_layer(epsilon, activation, *arrays)
 
 
 def _has_kernel(activation: Activation, arrays) -> bool:
@@ -35,7 +35,7 @@ def _has_kernel(activation: Activation, arrays) -> bool:
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def _plain_layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
+def plain_layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
     """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
 
     The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
@@ -73,12 +73,12 @@ def _backward(_, activation, saved, d_out: Float[Array, "d b"]):
     return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
 
 
-_plain_layer.defvjp(_forward, _backward)
+plain_layer.defvjp(_forward, _backward)
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))
 def _kernel_layer(epsilon, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """`_plain_layer` with ReLU, each way in one call."""
+    """`plain_layer` with ReLU, each way in one call."""
     return _forward_kernel(epsilon, weight_in, gain, shift, weight_out, bias_out, z)[0]
 
 

@@ -11,7 +11,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import Hybrid, train_batch
-from hybrid_jax.integrate import RK4, along, rollout_minibatch
+from hybrid_jax.integrate import RK4, along
+from hybrid_jax.rollouts import rollout_minibatch
 
 
 class Minibatch(eqx.Module):

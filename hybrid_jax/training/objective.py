@@ -10,8 +10,9 @@ from jaxtyping import Array, Float, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running_stats
 from hybrid_jax.dynamics.batching import batch_norms
-from hybrid_jax.integrate import RK4, along, rollout_minibatch
+from hybrid_jax.integrate import RK4, along
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.rollouts import rollout_minibatch
 from hybrid_jax.training.loss import Minibatch, Regulariser
 from hybrid_jax.trajectories import Trajectories, check
 

@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from hybrid_jax.dynamics import base
-from hybrid_jax.integrate import RK4, rollout_minibatch
+from hybrid_jax.integrate import RK4
 from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.rollouts import rollout_minibatch
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 

@@ -13,7 +13,7 @@ from hybrid_jax import native
 from hybrid_jax.networks import normalised_layer as layers
 
 EPSILON = 1e-5
-PLAIN = partial(layers._plain_layer, EPSILON, layers.RELU)
+PLAIN = partial(layers.plain_layer, EPSILON, layers.RELU)
 # h, m, d, b: the paper's; samples that are no multiple of a vector; odd vectors of units; fewer and more than a vector.
 SIZES = [(64, 17, 13, 100), (64, 17, 13, 16), (16, 3, 2, 33), (48, 40, 20, 101), (32, 16, 16, 64)]
 CACHED = native._compiled, native._obstacle, native._digest
@@ -103,7 +103,7 @@ def test_other_layers_are_plain_jax(change):
 def test_other_activations_are_plain_jax():
     arrays, _ = layer(32, 5, 3, 20)
     found = layers.normalised_layer(EPSILON, jnp.tanh, *arrays)
-    np.testing.assert_array_equal(found, layers._plain_layer(EPSILON, jnp.tanh, *arrays))
+    np.testing.assert_array_equal(found, layers.plain_layer(EPSILON, jnp.tanh, *arrays))
 
 
 def test_arrays_that_do_not_fit_are_refused():

@@ -8,8 +8,9 @@ import pytest
 from pendulum import pendulum
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.integrate import RK4, along, rollout_batch, rollout_minibatch
+from hybrid_jax.integrate import RK4, along, rollout_batch
 from hybrid_jax.networks.mlp import residual_network, zero_output
+from hybrid_jax.rollouts import rollout_minibatch
 from hybrid_jax.training.loss import REGULARISERS, cosine
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories

@@ -1,5 +1,7 @@
 // Vectors of V numbers in single precision, as GCC's vector extensions have them; what the kernels share.
 
+#pragma once
+
 #include <algorithm>
 #include <cstdint>
 

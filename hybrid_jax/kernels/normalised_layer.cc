@@ -1,0 +1,175 @@
+// The layer of normalised_layer.h, and the same on one minibatch in one call each way: `_forward_kernel` and
+// `_backward_kernel` of normalised_layer.py.
+
+#include "normalised_layer.h"
+
+#include <cmath>
+#include <cstring>
+
+Layer::Layer(int64_t m, int64_t b, int64_t h, int64_t d, float epsilon, const float* weight_in, const float* gain,
+             const float* shift, const float* w2)
+    : m(m), b(b), h(h), d(d), epsilon(epsilon), gain(gain), shift(shift), w2(w2) {
+  std::memcpy(w1, weight_in, h * m * sizeof(float));
+  transpose(w1, m, w1t, h, h, m);
+  transpose(w2, h, w2t, D(), d, h);
+}
+
+// Calls act(2, i) for two vectors of hidden units from i on, and act(1, i) for a last one.
+template <class Act>
+void Layer::all_units(Act act) const {
+  int64_t i = 0;
+  for (; i + V < h; i += 2 * V) act(std::integral_constant<int, 2>{}, i);
+  if (i < h) act(std::integral_constant<int, 1>{}, i);
+}
+
+template <int N>
+void Layer::units_forward(int64_t i, const float* centred, float* inverse, float* y) const {
+  constexpr int64_t W = N * V;
+  const int64_t b = this->b, D = this->D();
+  float* const hidden = this->hidden;
+  Vec scale[N], move[N];
+  strip<N>({centred, 1, b}, {w1t + i, h}, b, m, 0, [&](int64_t r, int64_t c, Vec v) { store(hidden + r * W + c, v); });
+  for (int n = 0; n < N; ++n) {
+    const Vec squares = over_rows(b, [&](int64_t j) { Vec v = load(hidden + j * W + n * V); return v * v; });
+    const Vec root = inverse_root(squares / float(b) + epsilon);
+    store(inverse + i + n * V, root);
+    scale[n] = root * load(gain + i + n * V);
+    move[n] = load(shift + i + n * V);
+  }
+  for (int64_t j = 0; j < b; ++j)
+    for (int n = 0; n < N; ++n) {
+      float* at = hidden + j * W + n * V;
+      store(at, relu(scale[n] * load(at) + move[n]));
+    }
+  product({hidden, W, 1}, {w2t + i * D, D}, b, W, D, [&](int64_t r, int64_t c, Vec v) {
+    float* at = y + r * D + c;
+    store(at, v + (i ? load(at) : load(bias + c)));
+  });
+}
+
+template <int N>
+void Layer::units_backward(int64_t i, const float* centred, const float* inverse, const float* d_y, Gradients to,
+                    float* d_zt, float* others) const {
+  constexpr int64_t W = N * V;
+  const int64_t m = this->m, b = this->b, h = this->h, M = this->M();
+  float *const hidden = this->hidden, *const active = this->active;
+  Vec scale[N], move[N], by_scale[N], by_shift[N];
+  for (int n = 0; n < N; ++n) {
+    scale[n] = load(inverse + i + n * V) * load(gain + i + n * V);
+    move[n] = load(shift + i + n * V);
+  }
+  // The hidden units again: that takes less than to keep them for forty evaluations.
+  strip<N>({centred, 1, b}, {w1t + i, h}, b, m, 0, [&](int64_t r, int64_t c, Vec v) {
+    store(hidden + r * W + c, v);
+    store(active + r * W + c, relu(scale[c / V] * v + move[c / V]));
+  });
+  strip<N>({d_y, b, 1}, {active, W}, d, b, 0, [&](int64_t r, int64_t c, Vec v) { add(to.w2 + r * h + i + c, v); });
+  // From here `active` holds the derivative with respect to the units before the activation.
+  strip<N>({d_y, 1, b}, {w2 + i, h}, b, d, 0, [&](int64_t r, int64_t c, Vec v) {
+    float* at = active + r * W + c;
+    store(at, load(at) > 0 ? v : Vec{});
+  });
+  for (int n = 0; n < N; ++n) {
+    const Vec root = load(inverse + i + n * V);
+    const float *before = hidden + n * V, *d_before = active + n * V;
+    by_scale[n] = over_rows(b, [&](int64_t j) { return load(d_before + j * W) * load(before + j * W); });
+    by_shift[n] = over_rows(b, [&](int64_t j) { return load(d_before + j * W); });
+    add(to.gain + i + n * V, by_scale[n] * root);
+    add(to.shift + i + n * V, by_shift[n]);
+    // Through 1 / √(mean h² + ε); and less the mean, as ∂z is: that of h is zero.
+    by_scale[n] *= -load(gain + i + n * V) * root * root * root / float(b);
+    by_shift[n] *= scale[n] / float(b);
+  }
+  for (int64_t j = 0; j < b; ++j)
+    for (int n = 0; n < N; ++n) {
+      const int64_t at = j * W + n * V;
+      store(active + at, scale[n] * load(active + at) + (by_scale[n] * load(hidden + at) - by_shift[n]));
+    }
+  strip<N>({centred, b, 1}, {active, W}, m, b, 0, [&](int64_t r, int64_t c, Vec v) { add(to.w1t + r * h + i + c, v); });
+  product({active, W, 1}, {w1 + i * m, m}, b, W, M, [&](int64_t r, int64_t c, Vec v) {
+    float* at = d_zt + r * M + c;
+    store(at, i ? load(at) + v : v);
+  });
+  for (int64_t r = 0; r < rest(); ++r) {
+    const float* row = w1t + (m - rest() + r) * h + i;
+    for (int64_t j = 0; j < b; ++j) {
+      float* at = others + (r * b + j) * V;
+      Vec v = i ? load(at) : Vec{};
+      for (int n = 0; n < N; ++n) v += load(active + j * W + n * V) * load(row + n * V);
+      store(at, v);
+    }
+  }
+}
+void Layer::forward(const float* centred, const float* bias_out, float* inverse, float* y) const {
+  float* rows = scratch(ROWS, b * D());
+  std::memcpy(bias, bias_out, d * sizeof(float));
+  all_units([&](auto n, int64_t i) { units_forward<n>(i, centred, inverse, rows); });
+  transpose(rows, D(), y, b, b, d);
+}
+
+void Layer::backward(const float* centred, const float* inverse, const float* d_y, Gradients to, float* d_z) const {
+  float *rows = scratch(ROWS, b * M()), *others = scratch(REST, rest() * b * V);
+  all_units([&](auto n, int64_t i) { units_backward<n>(i, centred, inverse, d_y, to, rows, others); });
+  for (int64_t r = 0; r < d; ++r) to.bias[r] += sum(d_y + r * b, b);
+  transpose(rows, M(), d_z, b, b, m - rest());
+  for (int64_t r = 0; r < rest(); ++r) sums(others + r * b * V, b, d_z + (m - rest() + r) * b);
+}
+
+void Layer::clear(Gradients to) const {
+  std::fill_n(to.w1t, m * h, 0.0f), std::fill_n(to.w2, d * h, 0.0f), std::fill_n(to.bias, d, 0.0f);
+  std::fill_n(to.gain, h, 0.0f), std::fill_n(to.shift, h, 0.0f);
+}
+
+void Layer::to_rows(const float* w1t, float* d_w1) const {
+  float* rows = scratch(ROWS, h * m);
+  transpose(w1t, h, rows, m, m, h);
+  std::memcpy(d_w1, rows, h * m * sizeof(float));
+}
+
+namespace {
+
+// Sizes of a lane, the lanes of a sweep, which are the axes before, and where the arrays of a lane begin.
+struct Sizes {
+  int64_t m, b, h, d, lanes;
+  Sizes(const Array& w1, const Array& w2, const Array& columns) : b(columns.dimensions().back()) {
+    const auto in = w1.dimensions(), out = w2.dimensions();
+    m = in[in.size() - 1], h = in[in.size() - 2], d = out[out.size() - 2], lanes = w1.element_count() / (m * h);
+  }
+  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
+  float* of(Result& all, int64_t lane) const { return of(*all, lane); }
+};
+
+// `kept` is z̃, and behind it 1 / √(mean (W₁ z̃)² + ε).
+ffi::Error forward_call(float epsilon, Array w1, Array gain, Array shift, Array w2, Array b2, Array z, Result out,
+                        Result kept) {
+  const Sizes s(w1, w2, z);
+  for (int64_t i = 0; i < s.lanes; ++i) {
+    const Layer layer(s.m, s.b, s.h, s.d, epsilon, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
+    float* centred = s.of(kept, i);
+    centre(s.of(z, i), centred, s.m, s.b);
+    layer.forward(centred, s.of(b2, i), centred + s.m * s.b, s.of(out, i));
+  }
+  return ffi::Error::Success();
+}
+
+ffi::Error backward_call(Array w1, Array gain, Array shift, Array w2, Array kept, Array d_out, Result d_w1,
+                         Result d_gain, Result d_shift, Result d_w2, Result d_b2, Result d_z) {
+  const Sizes s(w1, w2, d_out);
+  float* d_w1t = scratch(D_W1T, s.m * s.h);
+  for (int64_t i = 0; i < s.lanes; ++i) {
+    const Layer layer(s.m, s.b, s.h, s.d, 0, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
+    const Gradients to{d_w1t, s.of(d_gain, i), s.of(d_shift, i), s.of(d_w2, i), s.of(d_b2, i)};
+    layer.clear(to);
+    const float* centred = s.of(kept, i);
+    layer.backward(centred, centred + s.m * s.b, s.of(d_out, i), to, s.of(d_z, i));
+    layer.to_rows(d_w1t, s.of(d_w1, i));
+  }
+  return ffi::Error::Success();
+}
+
+}  // namespace
+
+#define SIX(KIND) .KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>()
+XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_forward, forward_call,
+                              ffi::Ffi::Bind().Attr<float>("epsilon") SIX(Arg).Ret<Array>().Ret<Array>());
+XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_backward, backward_call, ffi::Ffi::Bind() SIX(Arg) SIX(Ret));

@@ -1,0 +1,114 @@
+// Windows predicted by RK4 with a trained network, in one call: `_predict` of rollout_kernels.py.
+//
+//   ẋ = f_p(x, u) + W₂ max(W₁ z + c, 0) + b₂, z = ([x, u] − offset) slope: a rigid body, or nothing, plus one hidden
+//   layer with ReLU.
+//
+// A block of windows goes through all of its intervals before the next one begins, so that it stays in the first cache.
+
+#include "rigid_body.h"
+#include "rk4.h"
+
+namespace {
+
+constexpr int64_t BLOCK = 64;  // windows
+
+struct Sizes {
+  int64_t windows, steps, d, r, h, m, lanes;
+  Sizes(const Array& w1, const Array& x0, const Array& u) {
+    const auto weights = w1.dimensions(), state = x0.dimensions(), input = u.dimensions();
+    h = weights[weights.size() - 2], m = weights[weights.size() - 1];
+    windows = state[state.size() - 2], d = state[state.size() - 1];
+    steps = input[input.size() - 2], r = input[input.size() - 1];
+    lanes = w1.element_count() / (h * m);
+  }
+  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
+  int64_t D() const { return (d + V - 1) / V * V; }  // numbers of ẋ in whole vectors
+};
+
+// The vector field of a lane, on b columns of x and u.
+struct Field {
+  const Sizes& s;
+  int64_t b;
+  const float *theta, *offset, *factor, *c;
+  Constants constants;
+  float *w1t = scratch(W1T, s.m * s.h), *w2t = scratch(W2T, s.h * s.D()), *bias = scratch(BIAS, s.D());
+  float *hidden = scratch(HIDDEN, 2 * V * b), *rows = scratch(ROWS, b * s.D()), *network = scratch(NETWORK, s.d * b);
+  float* z = scratch(D_Z, s.m * b);
+
+  // Some rows of z, from those of [x, u].
+  void scale(int64_t begin, int64_t end, const float* from) const {
+    for (int64_t r = begin; r < end; ++r, from += b)
+      for (int64_t j = 0; j < b; ++j) z[r * b + j] = (from[j] - offset[r]) * factor[r];
+  }
+
+  // ẋ at x; that part of z which is of u is there already.
+  void operator()(const float* x, const float* u, float* slope) const {
+    scale(0, s.d, x);
+    int64_t i = 0;
+    for (; i + V < s.h; i += 2 * V) units<2>(i);
+    if (i < s.h) units<1>(i);
+    const bool alone = constants.size() == 0;
+    transpose(rows, s.D(), alone ? slope : network, b, b, s.d);
+    if (!alone) forward_columns(Body(theta, constants, x, u, b), network, slope);
+  }
+
+  template <int N>
+  void units(int64_t i) const {
+    constexpr int64_t W = N * V;
+    const int64_t D = s.D();
+    float *const hidden = this->hidden, *const rows = this->rows;
+    Vec shift[N];
+    for (int n = 0; n < N; ++n) shift[n] = load(c + i + n * V);
+    strip<N>({z, 1, b}, {w1t + i, s.h}, b, s.m, 0,
+             [&](int64_t r, int64_t column, Vec v) { store(hidden + r * W + column, relu(v + shift[column / V])); });
+    product({hidden, W, 1}, {w2t + i * D, D}, b, W, D, [&](int64_t r, int64_t column, Vec v) {
+      float* at = rows + r * D + column;
+      store(at, v + (i ? load(at) : load(bias + column)));
+    });
+  }
+};
+
+// to[j, i] = from[i, j], of few columns, which may be shorter than a vector.
+void turn(const float* from, int64_t from_row, float* to, int64_t to_row, int64_t rows, int64_t columns) {
+  for (int64_t i = 0; i < rows; ++i)
+    for (int64_t j = 0; j < columns; ++j) to[j * to_row + i] = from[i * from_row + j];
+}
+
+void predict_block(const Field& field, float dt, const float* x0, const float* u, float* states) {
+  const Sizes& s = field.s;
+  const int64_t b = field.b, n = s.d * b;
+  float *x = scratch(D_X, n), *next = scratch(SUM, n), *point = scratch(POINT, n), *held = scratch(D_U, s.r * b);
+  turn(x0, s.d, x, b, b, s.d);
+  for (int64_t t = 0; t < s.steps; ++t, std::swap(x, next)) {
+    turn(u + t * s.r, s.steps * s.r, held, b, b, s.r);
+    field.scale(s.d, s.m, held);
+    rk4_step(
+        n, Stages(dt), x, next, [&](int) { return point; }, [&](int, float* slope) { field(point, held, slope); });
+    turn(next, b, states + t * s.d, s.steps * s.d, s.d, b);
+  }
+}
+
+ffi::Error call(float dt, Constants constants, Array theta, Array offset, Array factor, Array w1, Array c, Array w2,
+                Array b2, Array x0, Array u, Result states) {
+  const Sizes s(w1, x0, u);
+  const int64_t b = std::min(BLOCK, s.windows);
+  for (int64_t i = 0; i < s.lanes; ++i) {
+    const Field field{s, b, s.of(theta, i), s.of(offset, i), s.of(factor, i), s.of(c, i), constants};
+    float* copy = scratch(W1, s.h * s.m);  // with room for a vector behind it
+    std::copy_n(s.of(w1, i), s.h * s.m, copy), std::copy_n(s.of(b2, i), s.d, field.bias);
+    transpose(copy, s.m, field.w1t, s.h, s.h, s.m);
+    transpose(s.of(w2, i), s.h, field.w2t, s.D(), s.d, s.h);
+    for (int64_t begin = 0; begin < s.windows; begin += b) {
+      const int64_t at = std::min(begin, s.windows - b);  // the last block overlaps the one before
+      predict_block(field, dt, s.of(x0, i) + at * s.d, s.of(u, i) + at * s.steps * s.r,
+                    s.of(*states, i) + at * s.steps * s.d);
+    }
+  }
+  return ffi::Error::Success();
+}
+
+}  // namespace
+
+XLA_FFI_DEFINE_HANDLER_SYMBOL(prediction, call,
+                              ffi::Ffi::Bind().Attr<float>("dt").Attr<Constants>("constants").Arg<Array>().Arg<Array>()
+                                  .Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Ret<Array>());

@@ -1,0 +1,208 @@
+"""Rollouts of the paper's models by the kernels of `hybrid_jax.native`: all intervals in one call, and its derivative.
+
+A model is a rigid body, a network with one hidden layer and ReLU, or their sum, in single precision, by RK4.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import native
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, apply_residual
+from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, newton_euler
+from hybrid_jax.integrate import RK4, Solver, integrate
+from hybrid_jax.networks.mlp import ResidualNetwork
+from hybrid_jax.networks.normalisation import BatchNorm, Bias, ChannelScaling, InputScaling
+from hybrid_jax.networks.normalised_layer import RELU, plain_layer
+from hybrid_jax.state import STATE_SIZE
+from hybrid_jax.vehicle import Vehicle
+
+
+class Constants(NamedTuple):
+    """What a kernel is compiled for besides shapes."""
+
+    dt: float
+    vehicle: Vehicle | None  # of the rigid body, if there is one
+    epsilon: float  # of batch normalisation
+
+    def attributes(self) -> dict[str, np.ndarray | np.float32]:
+        """dt, and the vehicle as rigid_body.h has it."""
+        numbers = []
+        if (vehicle := self.vehicle) is not None:
+            rotors = [(*position, spin) for position, spin in zip(vehicle.rotor_positions, vehicle.spin, strict=True)]
+            body = vehicle.mass, vehicle.gravity, vehicle.inertia[2], vehicle.torque_coefficient
+            numbers = [*body, *np.ravel(rotors)]
+        return {"dt": np.float32(self.dt), "constants": np.array(numbers, np.float32)}
+
+    def physics(self, theta: Float[Array, " 3"], x, u) -> Float[Array, "d b"] | float:
+        """ẋ of the rigid body."""
+        if self.vehicle is None:
+            return 0.0
+        return newton_euler(self.vehicle, dict(zip(LEARNED, theta, strict=True)), tuple(x), tuple(u))
+
+
+class KernelField(NamedTuple):
+    """A field for which there are kernels."""
+
+    physics: RigidBody | None
+    network: ResidualNetwork | None
+
+    def serves(self, x0: Array | np.ndarray, u: Array | np.ndarray, windows_axis: int) -> bool:
+        """Whether the kernels are for these arrays, of which they check no shapes themselves."""
+        if (x0.ndim, u.ndim) != (2, 3) or x0.shape[windows_axis] != u.shape[windows_axis]:
+            return False
+        arrays = jax.tree.leaves((eqx.filter((self.physics, self.network), eqx.is_array), x0, u))
+        single = all(array.dtype == jnp.float32 for array in arrays)
+        fits = self._fits(x0.shape[1 + windows_axis], u.shape[2 + windows_axis])
+        return single and fits and x0.shape[windows_axis] >= native.VECTOR and native.prefix() is not None
+
+    def _fits(self, d: int, inputs: int) -> bool:
+        """Whether states of d numbers and so many inputs are those of physics and network."""
+        if (network := self.network) is not None:
+            h = len(network.weight_in)
+            shapes = network.weight_in.shape, network.weight_out.shape, network.bias_out.shape
+            of_norm = [array.shape for array in jax.tree.leaves(network.norm)]
+            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % native.VECTOR:
+                return False
+        if self.physics is None:
+            return True
+        scalars = all(jnp.ndim(ratio) == 0 for ratio in self.physics.log_ratios.values())
+        return scalars and (d, inputs) == (STATE_SIZE, self.physics.vehicle.rotors)
+
+    def rollout(self, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float) -> Float[Array, "t d b"]:
+        """In training mode, in which batch normalisation takes the scaling's offset away."""
+        d, m, network = len(x0), len(x0) + u.shape[1], self.network
+        layers, epsilon = [jnp.zeros(shape, jnp.float32) for shape in ((0, m), 0, 0, (d, 0), d)], 0.0
+        if network is not None:
+            assert isinstance(network.norm, BatchNorm)
+            weight_in, epsilon = network.weight_in * _input_scaling(network, d)[1], network.norm.epsilon
+            layers = [weight_in, network.norm.gain, network.norm.shift, *self._output_layer(network, x0)]
+        return _rollout(self._constants(dt, epsilon), self._theta(), *layers, x0, u)
+
+    def predict(self, x0: Float[Array, "n d"], u: Float[Array, "n t m"], dt: float) -> Float[Array, "n t d"]:
+        """In inference mode."""
+        network = self.network
+        assert network is not None
+        assert isinstance(network.norm, BatchNorm | Bias)
+        layers = *network.norm.fold(network.weight_in), *self._output_layer(network, x0.T)
+        return _predict(self._constants(dt), self._theta(), *_input_scaling(network, x0.shape[1]), *layers, x0, u)
+
+    def _constants(self, dt: float, epsilon: float = 0.0) -> Constants:
+        return Constants(float(dt), self.physics.vehicle if self.physics else None, epsilon)
+
+    def _theta(self) -> Float[Array, " 3"]:
+        known = self.physics.theta() if self.physics else dict.fromkeys(LEARNED, jnp.zeros((), jnp.float32))
+        return jnp.stack([known[name] for name in LEARNED])
+
+    def _output_layer(self, network: ResidualNetwork, x: Float[Array, "d b"]) -> list[Array]:
+        """W₂ and b₂ with what scaling and physics do to the network's output, which are factors of its rows."""
+        layer = [network.scaling.outputs(part) for part in (network.weight_out, network.bias_out)]
+        return layer if self.physics is None else [apply_residual(self.physics, x, part) for part in layer]
+
+
+def _input_scaling(network: ResidualNetwork, d: int) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
+    """z = ([x, u] − offset) factor."""
+    sizes = d, network.weight_in.shape[1] - d
+    zeros, ones = (tuple(jnp.full(size, value, jnp.float32) for size in sizes) for value in (0, 1))
+    at_zero, factor = jax.jvp(network.scaling.concatenate, zeros, ones)
+    return -at_zero / factor, factor
+
+
+def training_kernel(field: AbstractVectorField, solver: Solver, substeps: int = 1) -> KernelField | None:
+    """The field for `KernelField.rollout`; None if that is not for it, or not for the solver."""
+    own = _kernel_field(field, solver, substeps)
+    return own if own and (own.network is None or type(own.network.norm) is BatchNorm) else None
+
+
+def prediction_kernel(field: AbstractVectorField, solver: Solver) -> KernelField | None:
+    """The same for `KernelField.predict`. Physics alone is not for it: XLA makes one kernel of that."""
+    own = _kernel_field(field, solver, 1)
+    return own if own and own.network and type(own.network.norm) in (BatchNorm, Bias) else None
+
+
+def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> KernelField | None:
+    alone = (field, None) if isinstance(field, RigidBody) else (None, field)
+    physics, network = (field.physics, field.residual) if type(field) is Hybrid else alone
+    if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1):
+        return None
+    if type(physics) not in (type(None), RigidBody, ForcedBody):
+        return None
+    if network is not None:
+        if type(network) is not ResidualNetwork or network.activation != "relu":
+            return None
+        if type(network.scaling) not in (InputScaling, ChannelScaling):
+            return None
+    return KernelField(physics, network)  # pyright: ignore[reportArgumentType]
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _rollout(constants: Constants, *arrays: Array) -> Float[Array, "t d b"]:
+    """`_plain_rollout`, each way in one call."""
+    return _forward(constants, *arrays)[0]
+
+
+def _plain_rollout(constants: Constants, theta, weight_in, gain, shift, weight_out, bias_out, x0, u):
+    layers = weight_in, gain, shift, weight_out, bias_out
+
+    def field(x, u):
+        y: Array = plain_layer(constants.epsilon, RELU, *layers, jnp.concatenate([x, u]))  # pyright: ignore[reportAssignmentType]
+        return constants.physics(theta, x, u) + y
+
+    return integrate(field, x0, u, constants.dt, RK4())
+
+
+def _forward(constants: Constants, *arrays: Array):
+    (h, m), x0, u = arrays[1].shape, *arrays[-2:]
+    kept = len(u) * 4 * (x0.size + (m * x0.shape[1] + h if h else 0))  # of every stage, see rollout.cc
+    results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
+
+    def kernel(*arrays):
+        epsilon = np.float32(constants.epsilon)
+        return native.call("rollout_forward", results, *arrays, epsilon=epsilon, **constants.attributes())
+
+    def plain(*arrays):
+        return [_plain_rollout(constants, *arrays), jnp.zeros(kept, x0.dtype)]
+
+    states, saved = native.with_derivative(kernel, plain)(*arrays)
+    return states, (*arrays, saved)
+
+
+def _backward(constants: Constants, saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
+    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
+
+    def kernel(*arrays):
+        return tuple(native.call("rollout_backward", results, *arrays, **constants.attributes()))
+
+    def plain(*arrays):
+        *arrays, _, d_states = arrays
+        return jax.vjp(partial(_plain_rollout, constants), *arrays)[1](d_states)
+
+    return native.with_derivative(kernel, plain)(*saved, d_states)
+
+
+_rollout.defvjp(_forward, _backward)
+
+
+def _predict(constants: Constants, *arrays: Array) -> Float[Array, "n t d"]:
+    x0, u = arrays[-2:]
+    states = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype)
+
+    def kernel(*arrays):
+        return native.call("prediction", states, *arrays, **constants.attributes())
+
+    return native.with_derivative(kernel, partial(_plain_prediction, constants))(*arrays)
+
+
+def _plain_prediction(constants: Constants, theta, offset, factor, weight_in, bias_in, weight_out, bias_out, x0, u):
+    def field(x, u):
+        z = (jnp.concatenate([x, u]) - offset[:, None]) * factor[:, None]
+        hidden = RELU(weight_in @ z + bias_in[:, None])
+        return constants.physics(theta, x, u) + weight_out @ hidden + bias_out[:, None]
+
+    states = integrate(field, jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1), constants.dt, RK4())
+    return jnp.moveaxis(states, -1, 0)

@@ -1,0 +1,53 @@
+"""Trajectories of many windows at once: of a minibatch in training mode, and predicted in inference mode.
+
+By the kernels of rollout_kernels.py where they serve, else by JAX.
+"""
+
+import diffrax
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.dynamics.base import AbstractVectorField, features_first, train_batch
+from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
+from hybrid_jax.integrate import RK4, Solver, integrate, rollout_batch
+from hybrid_jax.rollout_kernels import prediction_kernel, training_kernel
+
+# Traced once for all stages of a step, not once for each; the compiler inlines it again.
+_train, _evaluate = eqx.filter_jit(train_batch), eqx.filter_jit(lambda field, x, u: field(x, u))
+
+
+def rollout_minibatch(
+    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
+) -> Float[Array, "t d b"]:
+    """The trajectories of a minibatch in training mode, features first: batch normalisation sees all of its windows.
+
+    A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
+    """
+    own = training_kernel(field, solver, substeps)
+    if own and own.serves(x0, u, windows_axis=-1):
+        return own.rollout(x0, u, dt)
+    implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
+    if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations
+        return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
+    alone = training_mode(field)
+
+    def one_window(x0, u):
+        return integrate(lambda x, held: _evaluate(alone, x, held), x0, u, dt, solver, substeps)
+
+    return over_samples(one_window)(x0, u)
+
+
+def predict(
+    field: AbstractVectorField,
+    x0: Float[Array | np.ndarray, "n d"],
+    u: Float[Array | np.ndarray, "n t m"],
+    dt: float,
+    solver: Solver | None = None,
+) -> Float[Array, "n t d"]:
+    """`rollout_batch`."""
+    own = prediction_kernel(field, RK4() if solver is None else solver)
+    if own and own.serves(x0, u, windows_axis=0):
+        return own.predict(jnp.asarray(x0), jnp.asarray(u), dt)
+    return rollout_batch(field, x0, u, dt, solver)

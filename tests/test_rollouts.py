@@ -1,0 +1,200 @@
+"""The kernels of whole rollouts do what JAX does, and JAX does it where they do not serve."""
+
+from dataclasses import replace
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from systems import ODD
+
+from benchmarks.subjects import DT, untrained
+from hybrid_jax import native, rollouts
+from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody
+from hybrid_jax.integrate import RK4, integrate, rollout_batch
+from hybrid_jax.networks.mlp import residual_network
+from hybrid_jax.networks.normalisation import ChannelScaling
+from hybrid_jax.vehicle import IRIS
+
+HEXACOPTER = replace(
+    ODD,
+    rotor_positions=tuple((float(0.2 * np.cos(angle)), float(0.3 * np.sin(angle))) for angle in 0.1 + np.arange(6)),
+    spin=(1.0, -1.0) * 3,
+)
+THETA = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
+needs_kernels = pytest.mark.skipif(native.prefix() is None, reason=native.status())
+
+
+def network(d, r, hidden=32, **options):
+    """A network whose running statistics and biases are not those of the start, with scalings of all channels."""
+    offset, scale, output = map(tuple, np.random.default_rng(d).uniform(0.5, 2, (3, d + r)).tolist())
+    scaling = ChannelScaling(offset, scale, output[:d])
+    made = residual_network(d, r, jax.random.key(r), hidden=hidden, scaling=scaling, **options)
+    rng = np.random.default_rng(r)
+    arrays, rest = eqx.partition(made, eqx.is_array)
+    return eqx.combine(jax.tree.map(lambda a: a + rng.uniform(-0.2, 0.2, a.shape).astype(np.float32), arrays), rest)
+
+
+FIELDS = {
+    "the paper's": untrained("hybrid"),
+    "physics alone": RigidBody(THETA, ODD),
+    "no physics": network(3, 2, hidden=16),
+    "no input": network(5, 0, hidden=48),
+    "a force and a torque": Hybrid(ForcedBody(THETA, HEXACOPTER), network(13, 6)),
+}
+FIELD = FIELDS["the paper's"]
+
+
+def windows(field, b, steps=3, lanes=()):
+    """x0 and u of a minibatch, and a derivative of its trajectories."""
+    body = getattr(field, "physics", field if isinstance(field, RigidBody) else None)
+    d, r = (13, body.vehicle.rotors) if body else (field.state_size, field.input_size)
+    rng = np.random.default_rng(b)
+    x0, d_states = rng.normal(size=(*lanes, d, b)), rng.normal(size=(*lanes, steps, d, b))
+    u = rng.normal(size=(*lanes, steps, r, b))
+    if body:
+        u = body.vehicle.hover_speed * (1 + 0.1 * u)
+    return tuple(part.astype(np.float32) for part in (x0, u, d_states))
+
+
+def trained(field, x0, u, dt=DT):
+    return rollouts.rollout_minibatch(field, x0, u, dt, RK4())
+
+
+def trained_by_jax(field, x0, u):
+    return integrate(field.train_batch, x0, u, DT, RK4())
+
+
+def both_ways(function, field, x0, u, d_states):
+    """The trajectories, and the derivatives with respect to what is learned, x0 and u."""
+    arrays, rest = eqx.partition(field, eqx.is_array)
+    states, pullback = jax.vjp(lambda arrays, x0, u: function(eqx.combine(arrays, rest), x0, u), arrays, x0, u)
+    return states, pullback(d_states)
+
+
+def doubled(tree):
+    return jax.tree.map(lambda leaf: np.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, tree)
+
+
+def calls(function, *arguments):
+    return "rollout_forward" in eqx.filter_jit(function).lower(*arguments).as_text()
+
+
+@needs_kernels
+@pytest.mark.parametrize("b", [16, 33])
+@pytest.mark.parametrize("name", FIELDS)
+def test_values_and_derivatives_are_those_of_jax_in_double_precision(name, b):
+    field = FIELDS[name]
+    arguments = windows(field, b)
+    assert calls(trained, field, *arguments[:2])
+    found = eqx.filter_jit(partial(both_ways, trained))(field, *arguments)
+    with jax.enable_x64(True):
+        exact = both_ways(trained_by_jax, *doubled((field, *arguments)))
+        for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
+            # Twelve evaluations of sums of up to a hundred terms, each rounded at 6e-8. Those of θ_p cancel in part.
+            tolerance = 5e-6 if other.ndim else 5e-5
+            np.testing.assert_allclose(one, other, rtol=0, atol=tolerance * np.abs(other).max(initial=0) + 1e-30)
+
+
+@needs_kernels
+def test_a_lane_is_the_same_alone_to_the_bit():
+    lanes = windows(FIELD, 20, lanes=(2, 3))
+    function = partial(both_ways, trained, FIELD)
+    together = jax.jit(jax.vmap(jax.vmap(function)))(*lanes)
+    single = jax.jit(function)(*(part[1, 2] for part in lanes))
+    for one, other in zip(jax.tree.leaves(together), jax.tree.leaves(single), strict=True):
+        np.testing.assert_array_equal(one[1, 2], other)
+
+
+@needs_kernels
+def test_a_second_derivative_is_that_of_jax(monkeypatch):
+    field = FIELDS["no physics"]
+    x0, u, d_states = windows(field, 16, steps=2)
+
+    def curvature(function):
+        slope = jax.grad(lambda x0: jnp.sum(d_states * jnp.square(function(field, x0, u))))
+        return jax.grad(lambda x0: jnp.sum(jnp.square(slope(x0))))(x0)
+
+    found = curvature(trained)
+    monkeypatch.setattr(native, "prefix", lambda: None)
+    expected = curvature(trained)
+    np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
+
+
+@needs_kernels
+def test_a_state_that_is_no_number_shows_in_the_result():
+    # Or a run that diverged would go on.
+    x0, u, d_states = windows(FIELD, 20)
+    x0[4, 17] = np.nan
+    states, (gradient, *_) = both_ways(trained, FIELD, x0, u, d_states)
+    assert np.isnan(states[:, 3:7, 17]).all()
+    assert np.isnan(gradient.residual.weight_out).any()
+
+
+class Own(RigidBody):
+    def train_batch(self, x, u):
+        return 2 * super().train_batch(x, u)
+
+
+OTHERS = {
+    "physics of one's own": (Hybrid(Own(THETA, IRIS), FIELD.residual), {}),
+    "few windows": (FIELD, {"b": 9}),
+    "odd hidden units": (Hybrid(FIELD.physics, network(13, 4, hidden=20)), {}),
+    "another activation": (Hybrid(FIELD.physics, network(13, 4, activation="tanh")), {}),
+    "layer norm": (Hybrid(FIELD.physics, network(13, 4, norm="layer")), {}),
+}
+
+
+@pytest.mark.parametrize(("field", "options"), OTHERS.values(), ids=OTHERS)
+def test_others_are_plain_jax(field, options):
+    x0, u, _ = windows(FIELD, **{"b": 16} | options)
+    assert not calls(trained, field, x0, u)
+
+
+@pytest.mark.parametrize("solver", [RK4(substeps=2), RK4(scanned=True)])
+def test_only_one_step_of_rk4_an_interval_is_a_kernel(solver):
+    x0, u, _ = windows(FIELD, 16)
+    found = calls(lambda field, x0, u: rollouts.rollout_minibatch(field, x0, u, DT, solver), FIELD, x0, u)
+    assert found == (solver.substeps == 1 and native.prefix() is not None)
+
+
+def test_arrays_that_do_not_fit_are_refused():
+    x0, u, _ = windows(FIELD, 16)
+    with pytest.raises((TypeError, ValueError)):
+        trained(FIELD, x0, u[..., :9])
+
+
+@needs_kernels
+@pytest.mark.parametrize("norm", ["batch", "none"])
+@pytest.mark.parametrize("name", sorted(FIELDS.keys() - {"physics alone"}))
+def test_windows_are_predicted_as_by_jax_in_double_precision(name, norm):
+    field = FIELDS[name]
+    if norm == "none":
+        own = field.residual if isinstance(field, Hybrid) else field
+        plain = network(own.state_size, own.input_size, norm="none")
+        field = Hybrid(field.physics, plain) if isinstance(field, Hybrid) else plain
+    x0, u, _ = windows(field, 150, steps=5)  # more than a block of windows, and no multiple of it
+    x0, u = x0.T, np.moveaxis(u, -1, 0)
+    function = eqx.filter_jit(rollouts.predict)
+    assert "prediction" in function.lower(field, x0, u, DT).as_text()
+    found = function(field, x0, u, DT)
+    with jax.enable_x64(True):
+        exact = rollout_batch(*doubled((field, x0, u)), DT)
+    np.testing.assert_allclose(found, exact, rtol=0, atol=5e-6 * np.abs(exact).max())
+
+
+@needs_kernels
+def test_a_prediction_has_the_derivative_of_jax():
+    field = FIELDS["a force and a torque"]
+    x0, u, _ = windows(field, 16)
+    x0, u = x0.T, np.moveaxis(u, -1, 0)
+
+    def slopes(predict):
+        arrays, rest = eqx.partition(field, eqx.is_array)
+        return jax.grad(lambda arrays: jnp.sum(jnp.square(predict(eqx.combine(arrays, rest), x0, u, DT))))(arrays)
+
+    for one, other in zip(*map(jax.tree.leaves, (slopes(rollouts.predict), slopes(rollout_batch))), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-5 * np.abs(other).max())
