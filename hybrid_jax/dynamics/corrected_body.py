@@ -67,10 +67,10 @@ def simplified(field: AbstractVectorField) -> AbstractVectorField:
     """The field without corrections and disturbances that are zero; outside of compiled code."""
 
     def plain(node):
-        none = isinstance(node, CorrectedBody) and not (
-            np.asarray(node.log_efficiency).any() or np.asarray(node.drag).any()
-        )
-        return node.body if none else node
+        if not isinstance(node, CorrectedBody):
+            return node
+        changed = any(np.asarray(part).any() for part in (node.log_efficiency, node.drag))
+        return node if changed else node.body
 
     field = jax.tree.map(plain, field, is_leaf=_is_body)
     found = disturbance_of(field)
