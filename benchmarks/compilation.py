@@ -9,7 +9,6 @@ Then `hybrid_jax.adapt` of a rigid body to a hundred windows, the whole process:
 
 import json
 import os
-import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -85,33 +84,27 @@ def waited(stages: list[tuple[str, float, float]]) -> float:
     return total
 
 
-def measure_run(preset: Preset, cache: Path, folder: Path) -> dict[str, Any]:
-    """One run of the experiment."""
+def measure_run(preset: Preset, programs: Path, folder: Path) -> dict[str, Any]:
+    """One run of the experiment, with nothing but these programs."""
     probe = folder / "probe.json"
-    arguments = [f"experiments.{preset.experiment}", "--preset", "smoke", "--out", str(folder), "--cache", str(cache)]
-    command = ["-c", PROBE.replace("MODULE", repr(arguments[0])), *arguments[1:], *preset.options]
-    # PROGRAMS would name a cache that is not empty.
-    elsewhere = {name: value for name, value in os.environ.items() if name != PROGRAMS}
-    run_together(preset.experiment, [command], elsewhere | {"HYBRID_JAX_PROBE": str(probe)})
+    probed = PROBE.replace("MODULE", repr(f"experiments.{preset.experiment}"))
+    folders = "--out", str(folder), "--cache", str(folder / "cache")
+    command = ["-c", probed, "--preset", "smoke", *folders, *preset.options]
+    run_together(preset.experiment, [command], os.environ | {PROGRAMS: str(programs), "HYBRID_JAX_PROBE": str(probe)})
     found = json.loads(probe.read_text())
-    programs = sum(name.endswith("backend_compile_duration") for name, *_ in found["stages"])
-    return {"programs": programs, "waited_seconds": waited(found["stages"]), "run_seconds": found["seconds"]}
+    count = sum(name.endswith("backend_compile_duration") for name, *_ in found["stages"])
+    return {"programs": count, "waited_seconds": waited(found["stages"]), "run_seconds": found["seconds"]}
 
 
 def measure(preset: Preset) -> Findings:
     """From nothing, then with the programs alone."""
     rows = []
     with TemporaryDirectory() as folder:
-        cache = Path(folder) / "cache"
         for case in ("cold", "cached"):
             out = Path(folder) / case
             out.mkdir()
-            rows.append({"case": case, "experiment": preset.experiment, **measure_run(preset, cache, out)})
-            for found in cache.iterdir():
-                if found.is_file():
-                    found.unlink()
-                elif found.name != "programs":
-                    shutil.rmtree(found)
+            measured = measure_run(preset, Path(folder) / "programs", out)
+            rows.append({"case": case, "experiment": preset.experiment, **measured})
     cold, cached = (row["waited_seconds"] for row in rows)
     with TemporaryDirectory() as folder:
         adapted = [json.loads(run_together("adapt", [["-c", ADAPT, folder]])[0].splitlines()[-1]) for _ in range(2)]

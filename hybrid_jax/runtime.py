@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import numpy as np
+import platformdirs
 from jaxlib import lapack
 
 PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
@@ -32,27 +33,29 @@ if version("jaxlib").split(".")[:2] == ["0", "10"]:
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
 EXECUTABLE = ".executable"  # the suffix of a kept program, see programs.py
 UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
+MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"
 _kept: list[Path] = []  # the folder that `configure` was given last
 
 
-def configure(cache: Path) -> None:
+def configure(folder: Path | None = None) -> None:
     """Configure JAX. Call it before the first array is made, which fixes JAX's devices.
 
     Args:
-        cache: compiled programs are kept in its subfolder `programs`, unless JAX_COMPILATION_CACHE_DIR is set.
+        folder: compiled programs are kept in it, by default in `programs` of the user's cache folder for hybrid_jax.
+            JAX_COMPILATION_CACHE_DIR goes first.
 
     Raises:
-        ValueError: the folder cannot be created.
+        ValueError: the folder cannot be written.
     """
-    programs = Path(os.environ.get(PROGRAMS) or cache / "programs")
+    default = Path(platformdirs.user_cache_dir("hybrid_jax")) / "programs"
+    programs = Path(os.environ.get(PROGRAMS) or folder or default)
     try:
         programs.mkdir(parents=True, exist_ok=True)
         _delete_truncated(programs)
         _delete_unused(programs)
     except OSError as error:
-        where = f"{PROGRAMS} {programs}" if os.environ.get(PROGRAMS) else f"--cache {cache}"
-        raise ValueError(f"{where}: cannot be written: {error.strerror}") from error
+        raise ValueError(f"{programs}: cannot be written: {error.strerror}; set {PROGRAMS}") from error
     if EXTRA not in (flags := os.environ.get(FLAGS, "")):
         os.environ[FLAGS] = f"{flags} {WHOLE_LOOPS}".strip()
     jax.config.update("jax_num_cpu_devices", cores())
@@ -134,10 +137,13 @@ def _delete_truncated(programs: Path) -> None:
 
 
 def _delete_unused(programs: Path) -> None:
-    """Delete kept programs of other sources or versions, which nothing will ask for again."""
-    for path in programs.glob(f"*{EXECUTABLE}"):
-        with contextlib.suppress(FileNotFoundError):
-            if time.time() - path.stat().st_mtime > UNUSED:
+    """Delete programs of other sources or versions, which nothing will ask for again, and what exceeds `MOST`."""
+    with contextlib.suppress(FileNotFoundError):  # deleted by another process
+        used = {path: path.stat() for name in (f"*{EXECUTABLE}*", "*-cache") for path in programs.glob(name)}
+        size = 0
+        for path, found in sorted(used.items(), key=lambda each: each[1].st_mtime, reverse=True):
+            size += found.st_size
+            if size > MOST or time.time() - found.st_mtime > UNUSED:
                 path.unlink()
 
 

@@ -32,7 +32,7 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))
     # Devices are fixed by now, and other tests keep the flags that they began with.
-    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda cache: None)
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)
     name = f"page_{page.stem}"
     path = tmp_path / f"{name}.py"
     path.write_text("\n".join(blocks(page)))

@@ -1,6 +1,7 @@
 """Programs that are kept on disk are found again without tracing, and only where nothing differs."""
 
 import os
+import time
 from pathlib import Path
 from uuid import uuid4
 
@@ -181,3 +182,13 @@ def test_programs_that_nobody_used_for_a_month_are_deleted(folder):
     os.utime(old, (0, 0))
     runtime._delete_unused(folder)
     assert kept(folder) == [new]
+
+
+def test_programs_used_longest_ago_make_room(folder, monkeypatch):
+    for factor in (2.0, 3.0, 4.0):
+        called(factor, np.ones(3))
+    old, *others = kept(folder)
+    os.utime(old, (now := time.time(), now - 60))
+    monkeypatch.setattr(runtime, "MOST", sum(path.stat().st_size for path in others))
+    runtime._delete_unused(folder)
+    assert kept(folder) == others

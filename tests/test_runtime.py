@@ -14,7 +14,7 @@ import sys
 from pathlib import Path
 import jax
 from hybrid_jax.runtime import configure, cores
-configure(Path(sys.argv[1]))
+configure(*map(Path, sys.argv[1:]))
 """
 PROGRAM = f"""{CONFIGURED}
 events = []
@@ -44,9 +44,9 @@ print(len(names))
 """
 
 
-def printed(program, cache, **more):
+def printed(program, *cache, **more):
     own = {name: value for name, value in os.environ.items() if name != PROGRAMS}  # not the cache of all tests
-    return [int(number) for number in script("-c", program, cache, env=own | more).split()]
+    return [int(number) for number in script("-c", program, *cache, env=own | more).split()]
 
 
 def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
@@ -62,6 +62,13 @@ def test_products_are_in_single_precision_on_every_device(tmp_path):
     assert printed(PRECISION, tmp_path) == [1]
 
 
+def test_programs_are_kept_in_the_users_cache_folder(tmp_path):
+    user = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    _, compiled = printed(PROGRAM, **user)
+    assert printed(PROGRAM, **user) == [compiled, 0]
+    assert list(tmp_path.rglob("hybrid_jax/programs/*-cache"))
+
+
 def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
     hits, compiled = printed(PROGRAM, tmp_path / "here")
     assert hits == 0
@@ -72,7 +79,7 @@ def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
 
 def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
     _, compiled = printed(PROGRAM, tmp_path)
-    whole, empty = sorted((tmp_path / "programs").glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
+    whole, empty = sorted(tmp_path.glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
     os.truncate(whole, whole.stat().st_size - 1)
     os.truncate(empty, 0)
     assert printed(PROGRAM, tmp_path) == [compiled - 2, 2]

@@ -154,7 +154,7 @@ def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, d
     fields = {Agent("nominal").name: rigid_body(IRIS)}
     for model in ("hybrid", "invariant"):
         fields[Agent(model, few).name] = lane(trained[model].adapted[PARAMETER_SHIFT.name, few], 0)
-    return on_one_core(fields, config.controller(), config.calls, config.cache)
+    return on_one_core(fields, config.controller(), config.calls)
 
 
 def write(

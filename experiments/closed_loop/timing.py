@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from multiprocessing import get_context
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -21,7 +20,7 @@ WARM_UP = 10  # calls that are not counted
 
 
 def on_one_core(
-    fields: Mapping[str, AbstractVectorField], controller: Controller, calls: int, cache: Path
+    fields: Mapping[str, AbstractVectorField], controller: Controller, calls: int
 ) -> dict[str, dict[str, float]]:
     """`call_times` of each field, in a process with one CPU core: more do not make its small matrix products faster.
 
@@ -29,18 +28,18 @@ def on_one_core(
     """
     # Spawned, not forked: JAX already runs threads here and has fixed the devices.
     timed = partial(call_times, controller=controller, calls=calls)
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (cache,)) as process:
+    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core) as process:
         times = process.map(timed, map(jax.device_get, fields.values()))
         return dict(zip(fields, times, strict=True))
 
 
-def use_one_core(cache: Path) -> None:
+def use_one_core() -> None:
     """Bind this process to one core and configure JAX, before its first array."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     if hasattr(os, "sched_setaffinity"):
         os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
     jax.config.update("jax_platforms", "cpu")
-    configure(cache)
+    configure()
 
 
 def call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:

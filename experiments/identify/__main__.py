@@ -72,8 +72,6 @@ class Config:
     """Column map of CSV logs."""
     motor_order: tuple[int, ...] = ()
     """Which motor of the log, from 0, each rotor of the vehicle is."""
-    cache: Path = Path("runs/cache")
-    """Folder for compiled programs."""
 
     @property
     def layout(self) -> Layout:
@@ -107,7 +105,7 @@ def field_of(config: Config, logs: list[Recording]):
 
 def run(config: Config) -> None:
     checks.writable_folder("--out", config.out)
-    runtime.configure(config.cache)
+    runtime.configure()
     console, began = Console(stderr=True), time.perf_counter()
     logs, left_out = recordings(config)
     field = field_of(config, logs)

@@ -167,6 +167,6 @@ def main(folder: Path) -> None:
 
 
 if __name__ == "__main__":
-    runtime.configure(Path("runs/cache"))
+    runtime.configure()
     with command._exit_codes("identify.crazypad", "interrupted"):
         main(Path(sys.argv[1]))

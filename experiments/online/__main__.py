@@ -46,7 +46,7 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     bandwidths = {"observer": config.bandwidth, "l1": config.l1_cutoff}
     run = flown(own, config.agents, config.changes, config.references, config.seeds, bandwidths, console)
     rows = results_of(run, own)
-    step = step_time(config.cache, config.hardware(), own.period)
+    step = step_time(config.hardware(), own.period)
     spent = sum(taken for name, taken in run.seconds.items() if name.startswith("flying"))
     evidence = Evidence(rows, step, spent, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)

@@ -3,7 +3,6 @@
 import time
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -17,9 +16,9 @@ from hybrid_jax.vehicle import IRIS
 STEPS = 1000  # that are timed
 
 
-def step_time(cache: Path, hardware: Hardware, period: float) -> float:
+def step_time(hardware: Hardware, period: float) -> float:
     """Processor time of a step of the filter on one core [ms]."""
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (cache,)) as process:
+    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core) as process:
         return process.submit(_step_time, hardware, period).result()
 
 

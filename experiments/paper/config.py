@@ -277,8 +277,8 @@ def column(size: int) -> int:
 
 PAPER = AdaptationConfig()
 QUICK = replace(
-    PAPER, preset="quick", seeds=2, sizes=(100, 1000), models=(HYBRID, NO_PHYSICS, CONSTANT_DISTURBANCE),
-    source_train=3000, validation=300, test=300, max_epochs=400,
+    PAPER, preset="quick", seeds=3, sizes=(100, 300), models=(HYBRID, NO_PHYSICS, CONSTANT_DISTURBANCE),
+    source_train=1000, validation=200, test=200, max_epochs=200,
 )  # fmt: skip
 SMOKE = replace(
     PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=10, batch_size=20, max_epochs=3,

@@ -49,7 +49,8 @@ def run(
     with _exit_codes(name, f"interrupted; the same command{fresh} goes on from here"):
         config = read(name, about, given, presets)
         checks.writable_folder("--out", config.out)
-        configure(config.cache)
+        checks.writable_folder("--cache", config.cache)
+        configure()
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
         signal.signal(signal.SIGTERM, _interrupt)

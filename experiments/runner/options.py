@@ -27,11 +27,12 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """paper: the full protocol. quick: two seeds, two sizes, about three minutes. smoke: a functional check."""
+    """paper: the full protocol. quick: few seeds and sizes, a minute or some. smoke: a functional check."""
     out: Path = Path("runs")
     """Folder for the report, the figures and the models; a subfolder named after the experiment is created in it."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
-    """Folder for flights, finished stages and compiled programs."""
+    """Folder for flights and finished stages. Compiled programs are kept in the user's cache folder, or in
+    JAX_COMPILATION_CACHE_DIR."""
     fresh: bool = False
     """Start anew: earlier results in --out and unfinished sweeps are moved to a backup; nothing is deleted."""
     paper: bool = False

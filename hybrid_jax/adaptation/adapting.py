@@ -29,7 +29,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import load_lapack
+from hybrid_jax.runtime import FAST_COMPILE, load_lapack
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
@@ -215,14 +215,14 @@ def adapt(
     )
 
 
-_mse = kept_jit(rollout_mse)
+_mse = kept_jit(rollout_mse, compiler_options=FAST_COMPILE)
 
 
 def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any]:
     """The attributes of `Adaptation` that say what was chosen, and the errors to expect of it."""
     seconds = windows.horizon * windows.dt
     chain = seconds * longest_chain(windows, choice.errors.mse.shape[1])
-    ends = np.asarray(choice.errors.ends[choice.taken])
+    ends = np.asarray(choice.errors.ends)[choice.taken]
     return {
         "candidates": dict(zip(choice.names, geometric_mean(choice.errors.mse).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
@@ -233,7 +233,7 @@ def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any
 
 def _fitted(choice: Choice, adapted: AbstractVectorField) -> np.ndarray:
     """Which parameters of the adapted field were fitted (p,)."""
-    free = dict(zip(choice.parameters, np.asarray(choice.free[choice.taken]).tolist(), strict=True))
+    free = dict(zip(choice.parameters, np.asarray(choice.free)[choice.taken].tolist(), strict=True))
     return np.array([free[name] for name in named_parameters(adapted)])
 
 

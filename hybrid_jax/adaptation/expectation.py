@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 
 import numpy as np
-import scipy
+import scipy  # not scipy.stats, which takes half a second to import
 from jaxtyping import Float
 
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -33,7 +33,7 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
     """
     groups = QUANTITIES if rigid else {f"x[{i}]": (slice(i, i + 1), 1.0, "") for i in range(squares.shape[-1])}
     blocks = len(squares)
-    reach = scipy.stats.t.ppf((1 + LEVEL) / 2, blocks - 1) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
+    reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
 
     def around(group: slice, factor: float, horizon: int) -> tuple[float, float, float]:
         power = np.maximum(factor**2 * squares[:, horizon, group].sum(axis=-1), np.finfo(np.float32).tiny)

@@ -159,4 +159,4 @@ def scale_of(objective: Objective, d: int) -> Scale:
     scale = np.full(d, np.inf)  # a state in no channel does not count
     for channel in objective.channels:
         scale[channel.start : channel.stop] = channel.scale
-    return jnp.asarray(scale, float)
+    return jnp.asarray(scale.astype(jnp.result_type(float)))  # JAX would compile a program that converts it

@@ -62,7 +62,7 @@ def combined(
     ours = share**2 / (m - 1)
     own = (degrees + 3) / (degrees + 1) / degrees / (1 - share) if np.isfinite(degrees) and share < 1 else 0.0
     freedom = max(1 / (ours + own), min(m - 1, degrees)) if ours + own > 0 else np.inf
-    return float(np.mean(estimates)), float(scipy.stats.t.ppf((1 + level) / 2, freedom) * np.sqrt(total))
+    return float(np.mean(estimates)), float(scipy.special.stdtrit(freedom, (1 + level) / 2) * np.sqrt(total))
 
 
 def _estimates(result: Adaptation) -> dict[str, tuple[float, float]]:

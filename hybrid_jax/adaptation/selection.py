@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_free, ravel_parameters
-from hybrid_jax.adaptation.uncertainty import CHUNK, has_effect, inverses, masked, normal_equations
+from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
+from hybrid_jax.adaptation.uncertainty import equations_of, has_effect, inverses, masked
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.programs import kept_jit
@@ -66,9 +66,9 @@ def fit_candidates(
     own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], windows)
 
     def one(free: Bool[Array, " p"]):
-        found = fit_free(field, windows, solver, max_steps, scale, free)
+        found, jacobian, r = fit_and_linearise(field, windows, solver, max_steps, scale, free)
         theta = ravel_parameters(found.field)[0]
-        equations = normal_equations(found.field, windows, solver, CHUNK, None, scale)
+        equations = jax.vmap(equations_of)(jacobian, r)
         equations = masked(equations, free & has_effect(equations, windows, scale))
         without = theta + left_out_steps(equations.gram, equations.score, places, counted)
         errors = jax.lax.map(lambda a: predict_block(at(a[0]), a[1], a[2], solver, scale), (without, own, counted))
@@ -158,6 +158,7 @@ def simplest(errors: Float[Array, "c b"], sizes: Int[np.ndarray, " c"]) -> Int[A
     return jnp.argmin(jnp.where(near, order, np.iinfo(np.int32).max))
 
 
+@jax.jit  # as one small program, not four
 def geometric_mean(errors: Float[Array, "c b"]) -> Float[Array, " c"]:
     """Over the blocks."""
     return jnp.exp(jnp.mean(_logarithm(errors), axis=1))

@@ -139,14 +139,22 @@ def normal_equations(
             return r, r
 
         jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
-        bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
-        if error is not None:
-            bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
-            slope = jax.vmap(jax.grad(error))(r)
-        effect, r = jacobian.reshape(-1, theta.size), r.ravel()
-        return NormalEquations(effect.T @ bent.reshape(-1, theta.size), effect.T @ slope.ravel(), r @ r)
+        return equations_of(jacobian, r, error)
 
     return in_chunks(jax.vmap(one), windows, chunk)
+
+
+def equations_of(
+    jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
+) -> NormalEquations:
+    """The normal equations of one window, from its errors and their Jacobian."""
+    bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
+    if error is not None:
+        bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
+        slope = jax.vmap(jax.grad(error))(r)
+    p = jacobian.shape[-1]
+    effect, r = jacobian.reshape(-1, p), r.ravel()
+    return NormalEquations(effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r)
 
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:

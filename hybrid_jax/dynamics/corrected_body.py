@@ -67,12 +67,14 @@ def simplified(field: AbstractVectorField) -> AbstractVectorField:
     """The field without corrections and disturbances that are zero; outside of compiled code."""
 
     def plain(node):
-        none = isinstance(node, CorrectedBody) and not (np.any(node.log_efficiency) or np.any(node.drag))
-        return node.body if none else node
+        if not isinstance(node, CorrectedBody):
+            return node
+        changed = any(np.asarray(part).any() for part in (node.log_efficiency, node.drag))
+        return node if changed else node.body
 
     field = jax.tree.map(plain, field, is_leaf=_is_body)
     found = disturbance_of(field)
-    if found is None or np.all(found.value):
+    if found is None or np.asarray(found.value).all():
         return field
     size = np.shape(found.value)[0]
     kept = np.flatnonzero(found.value)

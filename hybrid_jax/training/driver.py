@@ -13,8 +13,6 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, trainable
@@ -209,6 +207,10 @@ def _reporting(progress: Report | bool | None, most: int) -> Iterator[Report]:
     elif callable(progress):
         yield progress
     else:
+        # Not above: it would add to the time that `import hybrid_jax` takes.
+        from rich.console import Console
+        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+
         columns = "epoch", MofNCompleteColumn(), BarColumn(), "{task.description}"
         clocks = TimeElapsedColumn(), "at most", TimeRemainingColumn()
         with Progress(*columns, *clocks, console=Console(stderr=True)) as bar:

@@ -95,6 +95,7 @@ def test_the_residual_of_a_hybrid_is_held():
 def test_it_is_the_minimum_of_l_mse():
     found = fit_least_squares(pendulum(0.8), DAMPED)
     assert found.converged
+    assert found.steps <= 8  # more would be lost in rounding, which hides what they gain
     np.testing.assert_allclose(found.mse, _mse(found.field, DAMPED), rtol=1e-6)  # another order of sums
     best = found.field.log_length
     for shift in (-1e-2, 1e-2):
@@ -108,7 +109,7 @@ def test_a_lane_is_the_run_alone_and_a_lost_lane_harms_no_other():
     np.testing.assert_array_equal(together.converged, [True, True, False, True])
     for i in (0, 1, 3):
         alone = fit_least_squares(pendulum(lengths[i]), DAMPED)
-        # Another program for the same sums; one step below the tolerance of 6e-6 may be taken or not.
+        # Another program for the same sums; one step more may be taken or not, where rounding hides its gain.
         np.testing.assert_allclose(together.field.log_length[i], alone.field.log_length, rtol=1e-5)
         np.testing.assert_allclose(together.mse[i], alone.mse, rtol=1e-5)
 

@@ -32,7 +32,7 @@ motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
 @pytest.fixture
 def files(tmp_path, monkeypatch):
     """A rig that shakes its thrust: k is a tenth more than nominal, the lag 0.08 s."""
-    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda cache: None)  # JAX has begun in this process
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
     rng, dt = np.random.default_rng(0), 0.01
     t = dt * np.arange(1600)
     c = np.repeat(rng.uniform(0.45, 0.75, 100), 16)
@@ -49,7 +49,7 @@ def files(tmp_path, monkeypatch):
         np.savetxt(path, table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
     (tmp_path / "vehicle.toml").write_text(VEHICLE)
     (tmp_path / "columns.toml").write_text(COLUMNS)
-    options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "out": "out", "cache": "cache"}
+    options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "out": "out"}
     return tmp_path, [str(tmp_path / "logs"), *(f"--{key}={tmp_path / value}" for key, value in options.items())]
 
 
