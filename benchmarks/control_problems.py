@@ -4,6 +4,7 @@ The cost is that of `Controller`: weighted deviations from a reference, and chan
 """
 
 from dataclasses import dataclass
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -35,6 +36,7 @@ class Problem:
     wind: Float[np.ndarray, "6"]
 
 
+@cache
 def problems() -> dict[str, Problem]:
     """The problems by name."""
 

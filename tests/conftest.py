@@ -4,6 +4,7 @@
 core that a process may use, and those of two processes wait for each other.
 """
 
+import gc
 import os
 import shutil
 import signal
@@ -37,6 +38,16 @@ def pytest_configure(config):
         config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
     for name, value in (KEEP_ALL | {"XLA_FLAGS": QUICK}).items():
         os.environ.setdefault(name, value)
+
+
+def pytest_collection_finish():
+    """Collect garbage seldom: to look through a million objects of JAX takes seconds, and most are there to stay."""
+    gc.freeze()
+    gc.set_threshold(50_000, 20, 20)
+
+
+def pytest_sessionfinish():
+    gc.freeze()  # pytest collects garbage once more, which takes seconds, too
 
 
 @pytest.fixture(scope="module")

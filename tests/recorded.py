@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import jax
 import numpy as np
 
 import hybrid_jax
@@ -16,13 +17,18 @@ DT, SAMPLES = 0.01, 90
 CONFIG = RealFlightConfig(horizon=(5,), n=(100,), validation=10)
 
 
+@jax.jit
+def _flown(x0, u):
+    return rollout_batch(hybrid_jax.rigid_body(IRIS), x0, u, DT)
+
+
 def flights(names, seed=0):
     """Short flights near hover, of a rigid body."""
     rng = np.random.default_rng(seed)
     x0 = np.zeros((len(names), 13), np.float32)
     x0[:, 3], x0[:, 2], x0[:, 7:] = 1, 2, rng.normal(0, 0.1, (len(names), 6))
     u = IRIS.hover_speed + rng.normal(0, 5, (len(names), SAMPLES - 1, 4)).astype(np.float32)
-    x = np.concatenate([x0[:, None], rollout_batch(hybrid_jax.rigid_body(IRIS), x0, u, DT)], axis=1)
+    x = np.concatenate([x0[:, None], _flown(x0, u)], axis=1)
     u = np.concatenate([u, u[:, -1:]], axis=1)
     return [FlightLog(DT * np.arange(SAMPLES), *both, name) for *both, name in zip(x, u, names, strict=True)]
 

@@ -1,6 +1,7 @@
 """Imports point down only, between the packages of the library and from the programs to the library."""
 
 import ast
+from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
 
@@ -30,6 +31,7 @@ def imported(path):
     return {name for name in found if (ROOT / name.replace(".", "/")).with_suffix(".py").exists()}
 
 
+@cache
 def modules(package):
     """Dotted name → imported modules, for every module of a package but those that only export."""
     files = sorted(path for path in (ROOT / package).rglob("*.py") if path.name != "__init__.py")

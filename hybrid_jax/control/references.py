@@ -32,7 +32,7 @@ def sample(path: Path, controller: Controller, duration: float) -> Float[Array, 
     checks.positive("duration", duration, "a positive number of seconds")
     count = round(duration / controller.period) + controller.steps * controller.stride + 1
     times = controller.period * jnp.arange(count)
-    return jax.vmap(lambda t: reference_state(path, t, controller.vehicle.gravity))(times)
+    return jax.jit(jax.vmap(lambda t: reference_state(path, t, controller.vehicle.gravity)))(times)
 
 
 def reference_state(path: Path, t: Scalar, gravity: float) -> State:

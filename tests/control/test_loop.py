@@ -7,7 +7,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from choices import slow
 from smoke import ROOT
 
 import hybrid_jax as hj
@@ -163,8 +162,14 @@ def test_invalid_arguments_are_refused():
             control.fly(plant(BODY), BODY, reference, reference[0], CONTROLLER, bandwidth)
 
 
-@pytest.mark.parametrize("evaluate", [jax.eval_shape, *slow(lambda both, *x: jax.jit(both)(*x))])
-@pytest.mark.parametrize(("start", "wanted"), [(np.float32, np.float64), (np.float64, np.float32)])
+@pytest.mark.parametrize(
+    ("start", "wanted", "evaluate"),
+    [
+        (np.float32, np.float64, jax.eval_shape),
+        (np.float64, np.float32, jax.eval_shape),
+        pytest.param(np.float32, np.float64, lambda both, *x: jax.jit(both)(*x), marks=pytest.mark.slow),
+    ],
+)
 def test_mixed_precision_is_promoted(start, wanted, evaluate):
     with jax.enable_x64(True):
         controller, body = control.Controller(hj.IRIS, steps=2), hj.rigid_body(hj.IRIS)

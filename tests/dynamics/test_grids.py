@@ -1,6 +1,7 @@
 """Fields on periodic grids: the Laplacian, networks on them, and what they refuse."""
 
 from dataclasses import replace
+from functools import cache, partial
 
 import equinox as eqx
 import jax
@@ -59,10 +60,16 @@ def test_a_network_on_a_grid_moves_with_the_state(kernel, input_size):
         return jnp.roll(GRID.fields(states), (2, -3), (1, 2)).reshape(states.shape)
 
     u = u[:input_size] if input_size else u  # one that reads none accepts any
-    slope = train_batch(network, x, u)
-    np.testing.assert_allclose(train_batch(network, shifted(x), u), shifted(slope), atol=1e-5)
-    np.testing.assert_allclose(network(x[:, 1], u[:, 1]), slope[:, 1], atol=1e-5)
-    effect = jax.jacobian(network)(x[:, 0], u[:, 0])[: GRID.points, : GRID.points]
+
+    @jax.jit
+    def evaluated(x, u):
+        slopes = train_batch(network, x, u), train_batch(network, shifted(x), u)
+        return slopes, network(x[:, 1], u[:, 1]), jax.jacobian(network)(x[:, 0], u[:, 0])
+
+    (slope, of_shifted), alone, effect = evaluated(x, u)
+    np.testing.assert_allclose(of_shifted, shifted(slope), atol=1e-5)
+    np.testing.assert_allclose(alone, slope[:, 1], atol=1e-5)
+    effect = effect[: GRID.points, : GRID.points]
     assert int((jnp.abs(effect[0]) > 0).sum()) == kernel**2
 
 
@@ -83,14 +90,16 @@ def test_a_kernel_of_three_is_a_convolution():
     )
 
 
+@cache
 def decays(count=6, steps=8, dt=0.1, extra=1.0):
     """Windows of diffusion and a linear decay, which the model below does not know."""
     truth = lambda x, u: hj.diffusion(GRID, (0.02, 0.01))(x, u) - extra * x  # noqa: E731
     x0 = np.random.default_rng(0).normal(size=(count, GRID.size)).astype(np.float32)
     u = np.zeros((count, steps, 0), np.float32)
-    return hj.Trajectories(x0, u, np.asarray(hj.rollout_batch(truth, x0, u, dt)), dt)
+    return hj.Trajectories(x0, u, np.asarray(jax.jit(partial(hj.rollout_batch, truth, dt=dt))(x0, u)), dt)
 
 
+@cache
 def hybrid(kernel=1):
     return hj.Hybrid(hj.diffusion(GRID, (0.03, 0.006)), hj.grid_network(GRID, 0, KEY, kernel=kernel, hidden=3))
 

@@ -50,6 +50,7 @@ def moved(field, size=0.1, seed=2):
     return jax.tree.unflatten(structure, [leaf + size * rng.normal(size=leaf.shape) for leaf in leaves])
 
 
+@eqx.filter_jit
 def one_by_one(field, x, u):
     return jax.vmap(field, -1, -1)(x, u)
 
@@ -103,9 +104,9 @@ def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
     weights = jnp.asarray(np.random.default_rng(2).normal(size=(13, 6)))
 
     def slope(evaluate):
-        return jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2))(field, x, u)
+        return jax.jit(jax.grad(lambda field, x, u: jnp.sum(weights * evaluate(field, x, u)), (0, 1, 2)))(field, x, u)
 
-    for evaluate in (train_batch, infer_batch):
+    for evaluate in map(eqx.filter_jit, (train_batch, infer_batch)):
         np.testing.assert_allclose(evaluate(field, x, u), one_by_one(field, x, u), rtol=1e-12, atol=1e-11)
     for ours, theirs in zip(jax.tree.leaves(slope(train_batch)), jax.tree.leaves(slope(one_by_one)), strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-11, atol=1e-11)
@@ -121,8 +122,9 @@ def test_all_terms_are_recovered_from_flights_made_with_them():
         return rollout_batch(rebuild(parameters), x.T, u.T[:, None], 0.02).ravel()
 
     found, data = start, flown(ravel_pytree(truth)[0])
+    slopes = jax.jit(jax.jacfwd(flown))
     for _ in range(6):  # Gauss and Newton's steps
-        found = found + jnp.linalg.lstsq(jax.jacfwd(flown)(found), data - flown(found))[0]
+        found = found + np.linalg.lstsq(slopes(found), data - flown(found))[0]
     for name, value in truth.theta().items():
         np.testing.assert_allclose(rebuild(found).theta()[name], value, rtol=1e-6, err_msg=name)
 
@@ -138,11 +140,13 @@ def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
     field = around(multirotor(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
     thrust = one_by_one(multirotor(IRIS, ()), x, u)[VELOCITY]
     behind = jnp.asarray([0.3, -0.2, 0.0])  # v − v̂ in the body
+    alone = lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]  # noqa: E731
+    evaluations = [*map(eqx.filter_jit, (train_batch, infer_batch, alone))]
     for state, inputs, known in zip(x.T, u.T, thrust.T, strict=True):
         velocity = state[VELOCITY] + rotation.rotate(state[QUATERNION], behind)
         estimator = known + (velocity - state[VELOCITY]) / lag
         push = jnp.concatenate([estimator - field(state, inputs)[VELOCITY], jnp.zeros(3)])
-        for evaluate in (train_batch, infer_batch, lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]):
+        for evaluate in evaluations:
             found = evaluate(disturbed(field, push), state[:, None], inputs[:, None])[:, 0]
             np.testing.assert_allclose(found[POSITION], velocity, rtol=1e-12, atol=1e-12)
             np.testing.assert_allclose(found[VELOCITY], estimator, rtol=1e-12, atol=1e-12)

@@ -1,5 +1,6 @@
 """Scores of recorded flight are what their definitions say, and baselines fly as they should."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -24,7 +25,7 @@ def states(count, seed=0):
 def flights(count=7, steps=4):
     u = np.random.default_rng(1).uniform(600, 700, (count, steps, 4)).astype(np.float32)
     x0 = states(count)
-    return Trajectories(x0, u, np.asarray(rollout_batch(rigid_body(IRIS), x0, u, 0.01)), 0.01)
+    return Trajectories(x0, u, np.asarray(jax.jit(rollout_batch)(rigid_body(IRIS), x0, u, 0.01)), 0.01)
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-4, 0.3, 3.0])
@@ -57,7 +58,7 @@ def test_windows_of_other_states_are_refused():
 def test_baselines_hold_the_state_or_freeze_rates():
     x, u = jnp.asarray(states(5).T), jnp.full((4, 5), 650.0)
     plain = rigid_body(IRIS)
-    for evaluate in (train_batch, infer_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u)):
+    for evaluate in map(eqx.filter_jit, (train_batch, infer_batch, lambda field, x, u: jax.vmap(field, -1, -1)(x, u))):
         assert (evaluate(HoldState(), x, u) == 0).all()
         frozen, whole = evaluate(FrozenRates(plain), x, u), evaluate(plain, x, u)
         assert (frozen[BODY_RATES] == 0).all()

@@ -1,7 +1,7 @@
 """Identification from commands and measurements recovers a simulated vehicle, and says what a log does not tell."""
 
 from dataclasses import replace
-from functools import partial
+from functools import cache
 
 import jax
 import jax.numpy as jnp
@@ -26,17 +26,12 @@ NOISE = {"rates": 0.01, "specific_force": 0.05, "attitude": 0.005, "velocity": 0
 LAYOUT = Layout(DT, 20, 60, span=0.05)
 
 
-def recorded(vehicle=TRUTH, tau=0.07, delay=0.0, seed=0, noise=1.0, hold=20, smooth=0.0):
-    """A hover shaken in thrust, roll and pitch, with a pilot that keeps it level, and all that can be measured.
-
-    The shakes are held for `hold` steps and filtered by 1 / (1 − smooth z⁻¹).
-    """
-    field = actuated(hj.multirotor(vehicle, ()), replace(ACTUATOR, time_constants=tau))
-    rng, n, late = np.random.default_rng(seed), round(SECONDS / DT), round(delay / DT)
-    hover = (vehicle.hover_speed - 100) / 900
-    roll, pitch = np.sign(np.array(vehicle.rotor_positions)[:, 1]), -np.sign(np.array(vehicle.rotor_positions)[:, 0])
-    shakes = np.repeat(rng.normal(size=(n // hold + 1, 3)) * [0.06, 0.01, 0.01], hold, axis=0)[:n]
-    shakes = scipy.signal.lfilter([np.sqrt(1 - smooth**2)], [1.0, -smooth], shakes, axis=0)
+@cache
+def pilot_of(late):
+    """A program from shakes to the commands that a pilot gives, which act `late` steps later, and measurements."""
+    field = actuated(hj.multirotor(TRUTH, ()), replace(ACTUATOR, time_constants=0.07))
+    hover = (TRUTH.hover_speed - 100) / 900
+    roll, pitch = np.sign(np.array(TRUTH.rotor_positions)[:, 1]), -np.sign(np.array(TRUTH.rotor_positions)[:, 0])
 
     def pilot(x, shake):
         tilt = 2 * x[4:6]
@@ -47,14 +42,26 @@ def recorded(vehicle=TRUTH, tau=0.07, delay=0.0, seed=0, noise=1.0, hold=20, smo
         x, queue = carry
         queue = jnp.concatenate([pilot(x, shake)[None], queue])
         x = hj.rollout(field, x, queue[late][None], DT)[0]
-        return (x.at[3:7].set(x[3:7] / jnp.linalg.norm(x[3:7])), queue[:-1]), (x, queue[0], queue[late])
+        measured = {name: measure(name, field, x, queue[late]) for name in NOISE}
+        return (x.at[3:7].set(x[3:7] / jnp.linalg.norm(x[3:7])), queue[:-1]), (queue[0], measured)
 
-    x0 = jnp.concatenate([jnp.zeros(STATE_SIZE).at[3].set(1.0), jnp.full(4, vehicle.hover_speed)])
+    x0 = jnp.concatenate([jnp.zeros(STATE_SIZE).at[3].set(1.0), jnp.full(4, TRUTH.hover_speed)])
     start = x0, jnp.full((late + 1, 4), hover)
-    _, (x, told, felt) = jax.jit(partial(jax.lax.scan, tick))(start, jnp.asarray(shakes))
+    return jax.jit(lambda shakes: jax.lax.scan(tick, start, shakes)[1])
+
+
+def recorded(delay=0.0, noise=1.0, hold=20, smooth=0.0):
+    """A hover shaken in thrust, roll and pitch, with a pilot that keeps it level, and all that can be measured.
+
+    The shakes are held for `hold` steps and filtered by 1 / (1 − smooth z⁻¹).
+    """
+    rng, n = np.random.default_rng(0), round(SECONDS / DT)
+    shakes = np.repeat(rng.normal(size=(n // hold + 1, 3)) * [0.06, 0.01, 0.01], hold, axis=0)[:n]
+    shakes = scipy.signal.lfilter([np.sqrt(1 - smooth**2)], [1.0, -smooth], shakes, axis=0)
+    told, measured = pilot_of(round(delay / DT))(jnp.asarray(shakes))
     t, signals = DT * np.arange(1, n + 1), {}
     for name, size in NOISE.items():
-        y = np.array(jax.vmap(partial(measure, name, field))(x, felt))
+        y = np.array(measured[name])
         y += noise * size * rng.normal(size=y.shape)
         axes = ("w", "x", "y", "z") if name == "attitude" else ("x", "y", "z")
         y = y / np.linalg.norm(y, axis=1, keepdims=True) if name == "attitude" else y
