@@ -27,7 +27,7 @@ class Run:
     """Results are written to --out. Flights and finished stages are kept in --cache and reused by later runs."""
 
     preset: Literal["paper", "quick", "smoke"] = "paper"
-    """paper: the full protocol. quick: few seeds and sizes, a minute or some. smoke: a functional check."""
+    """paper: the full protocol. quick: few seeds, sizes and epochs, about a minute. smoke: a functional check."""
     out: Path = Path("runs")
     """Folder for the report, the figures and the models; a subfolder named after the experiment is created in it."""
     cache: Path = field(default_factory=lambda: Path(platformdirs.user_cache_dir("hybrid_jax")))
