@@ -65,8 +65,8 @@ def test_true_field_equals_the_simulator_in_the_mean_wind(domain):
 
 @pytest.mark.slow
 @pytest.mark.skipif(not hasattr(os, "sched_setaffinity"), reason="this system cannot bind a process to a core")
-def test_calls_are_timed_on_one_core(tmp_path):
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core, (tmp_path,)) as process:
+def test_calls_are_timed_on_one_core():
+    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core) as process:
         assert process.submit(cores).result() == 1
     assert cores() == len(os.sched_getaffinity(0))
 
