@@ -3,8 +3,9 @@
 The step is that of training_step.py. Rivals start from our parameters: PyTorch with torchdiffeq, one interval after
 another; PyTorch with an RK4 by hand; the same with its loss under `torch.compile`. Loss, gradient and running
 statistics must agree; torchdiffeq's rk4 is the 3/8 rule, so it is compared with our step by that rule. A turn is steps
-in a row, as in training: ours in one compiled loop, the rivals in a Python loop. The first call, in which PyTorch
-compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes, most of it compiling.
+in a row, as in training, and as many before that are not timed: ours in one compiled loop, the rivals in a Python loop.
+The first call, in which PyTorch compiles, is apart. smoke: `torch.compile` generates no code. full: some five minutes,
+most of it compiling.
 """
 
 # PyTorch is of the extra `peers`.
@@ -50,7 +51,7 @@ class Preset:
 
 
 PRESETS = {
-    "full": Preset(100, 10, 20, "inductor", turns=20),
+    "full": Preset(100, 10, 20, "inductor", turns=10),
     "smoke": Preset(100, 2, 2, "aot_eager", turns=2),
 }
 
@@ -189,7 +190,7 @@ def measure(preset: Preset) -> Findings:
     with TemporaryDirectory() as cache:
         os.environ["TORCHINDUCTOR_CACHE_DIR"] = cache  # empty, so that compilation is timed
         programs, differences = prepare(preset, names)
-        times = in_turns({name: steps.call for name, steps in programs.items()}, preset.turns)
+        times = in_turns({name: steps.call for name, steps in programs.items()}, preset.turns, warm=True)
     rows = [row_of(name, steps, differences, times, preset) for name, steps in programs.items()]
     ratios = [
         Ratio(f"{row['program']} / ours, one core", row["times_ours"], at_least=REACH.get(row["program"]))
