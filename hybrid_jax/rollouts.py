@@ -46,7 +46,7 @@ def predict(
     dt: float,
     solver: Solver | None = None,
 ) -> Float[Array, "n t d"]:
-    """`rollout_batch`."""
+    """What `rollout_batch` returns, to rounding; it raises the same."""
     own = prediction_kernel(field, RK4() if solver is None else solver)
     if own and own.serves(x0, u, windows_axis=0):
         return own.predict(jnp.asarray(x0), jnp.asarray(u), dt)

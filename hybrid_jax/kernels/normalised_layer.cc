@@ -128,15 +128,12 @@ void Layer::to_rows(const float* w1t, float* d_w1) const {
 
 namespace {
 
-// Sizes of a lane, the lanes of a sweep, which are the axes before, and where the arrays of a lane begin.
-struct Sizes {
-  int64_t m, b, h, d, lanes;
+struct Sizes : Lanes {
+  int64_t m, b, h, d;
   Sizes(const Array& w1, const Array& w2, const Array& columns) : b(columns.dimensions().back()) {
     const auto in = w1.dimensions(), out = w2.dimensions();
     m = in[in.size() - 1], h = in[in.size() - 2], d = out[out.size() - 2], lanes = w1.element_count() / (m * h);
   }
-  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
-  float* of(Result& all, int64_t lane) const { return of(*all, lane); }
 };
 
 // `kept` is z̃, and behind it 1 / √(mean (W₁ z̃)² + ε).

@@ -12,8 +12,8 @@ namespace {
 
 constexpr int64_t BLOCK = 64;  // windows
 
-struct Sizes {
-  int64_t windows, steps, d, r, h, m, lanes;
+struct Sizes : Lanes {
+  int64_t windows, steps, d, r, h, m;
   Sizes(const Array& w1, const Array& x0, const Array& u) {
     const auto weights = w1.dimensions(), state = x0.dimensions(), input = u.dimensions();
     h = weights[weights.size() - 2], m = weights[weights.size() - 1];
@@ -21,7 +21,6 @@ struct Sizes {
     steps = input[input.size() - 2], r = input[input.size() - 1];
     lanes = w1.element_count() / (h * m);
   }
-  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
   int64_t D() const { return (d + V - 1) / V * V; }  // numbers of ẋ in whole vectors
 };
 
@@ -101,7 +100,7 @@ ffi::Error call(float dt, Constants constants, Array theta, Array offset, Array 
     for (int64_t begin = 0; begin < s.windows; begin += b) {
       const int64_t at = std::min(begin, s.windows - b);  // the last block overlaps the one before
       predict_block(field, dt, s.of(x0, i) + at * s.d, s.of(u, i) + at * s.steps * s.r,
-                    s.of(*states, i) + at * s.steps * s.d);
+                    s.of(states, i) + at * s.steps * s.d);
     }
   }
   return ffi::Error::Success();

@@ -9,8 +9,8 @@
 
 namespace {
 
-struct Sizes {
-  int64_t steps, d, r, b, h, m, lanes;
+struct Sizes : Lanes {
+  int64_t steps, d, r, b, h, m;
   Sizes(const Array& w1, const Array& x0, const Array& u) {
     const auto weights = w1.dimensions(), state = x0.dimensions(), input = u.dimensions();
     h = weights[weights.size() - 2], m = weights[weights.size() - 1];
@@ -18,8 +18,6 @@ struct Sizes {
     steps = input[input.size() - 3], r = input[input.size() - 2];
     lanes = x0.element_count() / (d * b);
   }
-  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
-  float* of(Result& all, int64_t lane) const { return of(*all, lane); }
   int64_t state() const { return d * b; }
   int64_t input() const { return r * b; }
   int64_t kept() const { return state() + (h ? m * b + h : 0); }  // of an evaluation, see `Kept`

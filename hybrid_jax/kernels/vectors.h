@@ -24,6 +24,13 @@ typedef int32_t Places __attribute__((vector_size(4 * V)));
 using Array = ffi::Buffer<ffi::F32>;
 using Result = ffi::ResultBuffer<ffi::F32>;
 
+// The lanes of a sweep, which are the first axes of all arrays of a call, and where the part of a lane begins.
+struct Lanes {
+  int64_t lanes;
+  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
+  float* of(Result& all, int64_t lane) const { return of(*all, lane); }
+};
+
 INLINE Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
 INLINE void store(float* to, Vec v) { *reinterpret_cast<Vec*>(to) = v; }
 
