@@ -1,11 +1,10 @@
-"""How well windows determine θ_p, from the normal equations of L_MSE: covariance, intervals, a disturbance or none.
+"""How well windows determine θ_p, from its normal equations: covariance, intervals, a disturbance or none.
 
 The covariance is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are
 too narrow. It contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an
 amount that no interval shows; `experiments/coverage.py` measures both.
 """
 
-from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -18,7 +17,17 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax import checks
 from hybrid_jax.adaptation import least_squares
 from hybrid_jax.adaptation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
-from hybrid_jax.chunks import in_chunks
+from hybrid_jax.adaptation.normal_equations import (
+    CHUNK,
+    ErrorLoss,
+    NormalEquations,
+    has_effect,
+    inverse,
+    inverses,
+    left_out,
+    masked,
+    normal_equations,
+)
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
@@ -33,9 +42,6 @@ from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
 
 Kind = Literal["sandwich", "homoscedastic"]
-ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
-
-CHUNK = 250  # windows in memory at a time
 
 
 class Interval(NamedTuple):
@@ -44,14 +50,6 @@ class Interval(NamedTuple):
     value: Float[Array, "*runs"]
     low: Float[Array, "*runs"]
     high: Float[Array, "*runs"]
-
-
-class NormalEquations(NamedTuple):
-    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
-
-    gram: Float[Array, "n p p"]  # JᵀJ
-    score: Float[Array, "n p"]  # Jᵀr
-    square: Float[Array, " n"]  # rᵀr
 
 
 def covariance_of(
@@ -125,47 +123,9 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
     return n / (n - p) * half.T @ half
 
 
-# A program of its own: selecting a disturbance and the covariance share it.
-@kept_jit
-def normal_equations(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
-) -> NormalEquations:
-    """The normal equations of each window at a field's θ_p; for arguments see `covariance_of`."""
-    theta, unravel = ravel_parameters(field)
-
-    def one(window: Trajectories) -> NormalEquations:
-        def errors(theta):
-            r = least_squares.prediction_errors(unravel(theta), window, solver, scale)
-            return r, r
-
-        jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
-        return equations_of(jacobian, r, error)
-
-    return in_chunks(jax.vmap(one), windows, chunk)
-
-
-def equations_of(
-    jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
-) -> NormalEquations:
-    """The normal equations of one window, from its errors and their Jacobian."""
-    bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
-    if error is not None:
-        bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
-        slope = jax.vmap(jax.grad(error))(r)
-    p = jacobian.shape[-1]
-    effect, r = jacobian.reshape(-1, p), r.ravel()
-    return NormalEquations(effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r)
-
-
 def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:
     """H⁻¹ M H⁻¹ of `covariance_of`, of normal equations in which all but `fitted` parameters are `masked`."""
     return _covariance(equations, "sandwich", 1, fitted, cluster)
-
-
-def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
-    """The normal equations of the free parameters; of the others, such that they stay as they are."""
-    gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
-    return NormalEquations(gram, jnp.where(free, equations.score, 0.0), equations.square)
 
 
 def intervals(
@@ -231,23 +191,6 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
     }
 
 
-def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
-    """Which parameters change the predictions by more than rounding does."""
-    return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
-
-
-def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """The inverse of a positive definite matrix, scaled to a unit diagonal first: parameters differ in their effect."""
-    scale = jnp.sqrt(jnp.diagonal(matrix))
-    scales = scale[:, None] * scale
-    return jnp.linalg.inv(matrix / scales) / scales
-
-
-def inverses(matrices: Float[Array, "n p p"]) -> Float[Array, "n p p"]:
-    """The inverse of each, one after the other: two batches at once can wait for each other, see `matrices.solve`."""
-    return jax.lax.map(inverse, matrices)
-
-
 class DisturbanceSelection(eqx.Module):
     """The fit that was kept, with a disturbance of zero if none is needed, and why."""
 
@@ -292,14 +235,3 @@ def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], ho
     plain = eqx.tree_at(lambda fit: fit.field, plain, padded)
     kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
     return DisturbanceSelection(kept, needed, gain, error)
-
-
-def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
-    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they do not determine θ_p.
-
-    Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
-    """
-    gram, score, square = equations
-    steps = -jnp.einsum("npq,nq->np", inverses(jnp.sum(gram, axis=0) - gram), jnp.sum(score, axis=0) - score)
-    bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
-    return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

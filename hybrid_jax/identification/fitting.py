@@ -22,7 +22,8 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.adaptation import uncertainty
 from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.uncertainty import Interval, NormalEquations
+from hybrid_jax.adaptation.normal_equations import NormalEquations, masked
+from hybrid_jax.adaptation.uncertainty import Interval
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
@@ -260,8 +261,7 @@ def _covariance(equations: NormalEquations, cluster: int, moves, known) -> Array
     seen = (np.diagonal(gram) > NO_EFFECT) & moves
     found = np.zeros_like(gram)
     both = np.ix_(seen, seen)
-    masked = uncertainty.masked(equations, seen)
-    found[both] = np.asarray(uncertainty.sandwich(masked, int(seen.sum()), cluster))[both]
+    found[both] = np.asarray(uncertainty.sandwich(masked(equations, seen), int(seen.sum()), cluster))[both]
     if known is not None:
         fixed = ~moves & np.isfinite(np.diagonal(known))
         slope = np.linalg.lstsq(gram[both], gram[np.ix_(seen, fixed)], rcond=1e-12)[0]

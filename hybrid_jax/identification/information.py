@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.adaptation.least_squares import Solver, ravel_parameters
-from hybrid_jax.adaptation.uncertainty import inverse
+from hybrid_jax.adaptation.normal_equations import inverse
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 

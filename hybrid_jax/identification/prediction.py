@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.uncertainty import NormalEquations
+from hybrid_jax.adaptation.normal_equations import NormalEquations
 from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.actuators import Actuated, held_means
 from hybrid_jax.dynamics.base import AbstractVectorField

@@ -13,7 +13,8 @@ from test_least_squares import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import left_out, normal_equations, select_disturbance
+from hybrid_jax.adaptation.normal_equations import left_out, normal_equations
+from hybrid_jax.adaptation.uncertainty import select_disturbance
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.integrate import rollout_batch
