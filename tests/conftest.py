@@ -1,31 +1,32 @@
-"""Tests spend most of their time compiling: programs are compiled without optimisation and shared by all processes.
+"""Tests spend most of their time compiling: programs are compiled without optimisation, and kept for the next run.
 
-`XLA_FLAGS= pytest` compiles them as users do. Each process of tests keeps to one core: XLA starts a thread for every
-core that a process may use, and those of two processes wait for each other.
+`XLA_FLAGS= pytest` compiles them as users do. JAX finds a program by what it computes, so a change of the code compiles
+what it changes. Each process of tests keeps to one core: XLA starts a thread for every core that a process may use, and
+those of two processes wait for each other.
 """
 
 import gc
 import os
-import shutil
 import signal
-import tempfile
 from importlib.metadata import version
 
+import platformdirs
 import pytest
 
 pytest.register_assert_rewrite("any_system")
 
+# A quarter of the time to compile. A program in one part suits one core. XLA aborts on a flag that it does not know.
+QUICK = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
+if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
+    QUICK += " --xla_cpu_use_fusion_emitters=false"
 # JAX reads these when it is imported, so it must not be imported here. The last three are as in `runtime.configure`.
-PROGRAMS = "JAX_COMPILATION_CACHE_DIR"
-KEEP_ALL = {
+ENVIRONMENT = {
+    "XLA_FLAGS": QUICK,
+    "JAX_COMPILATION_CACHE_DIR": str(platformdirs.user_cache_path("hybrid_jax") / "tests"),
     "JAX_PERSISTENT_CACHE_ENABLE_XLA_CACHES": "none",
     "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
     "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
 }
-# A third of the time to compile. XLA aborts on a flag that it does not know.
-QUICK = "--xla_backend_optimization_level=0"
-if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
-    QUICK += " --xla_cpu_use_fusion_emitters=false"
 CORES = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []  # other systems bind no process
 
 
@@ -33,10 +34,7 @@ def pytest_configure(config):
     worker = os.environ.get("PYTEST_XDIST_WORKER", "")  # gw0, gw1, …
     if worker and CORES:
         os.sched_setaffinity(0, {CORES[int(worker.removeprefix("gw")) % len(CORES)]})
-    if PROGRAMS not in os.environ:
-        folder = os.environ[PROGRAMS] = tempfile.mkdtemp(prefix="hybrid_jax_programs_")
-        config.add_cleanup(lambda: shutil.rmtree(folder, ignore_errors=True))
-    for name, value in (KEEP_ALL | {"XLA_FLAGS": QUICK}).items():
+    for name, value in ENVIRONMENT.items():
         os.environ.setdefault(name, value)
 
 
