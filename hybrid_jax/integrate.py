@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_batch
+from hybrid_jax.programs import kept_jit
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
@@ -164,7 +165,11 @@ def rollout(
             or substeps that are not positive; a solver for other equations; or a field that does not accept x0 and u,
             or does not return ẋ of the shape of x0.
     """
-    x0, u, solver = checked(field, x0, u, dt, solver, substeps)
+    return _integrate(field, *checked(field, x0, u, dt, solver, substeps), dt, substeps)
+
+
+@kept_jit
+def _integrate(field, x0, u, solver, dt, substeps):
     return integrate(field, x0, u, dt, solver, substeps)
 
 
@@ -177,7 +182,11 @@ def rollout_batch(
     substeps: int = 1,
 ) -> Float[Array, "n t d"]:
     """`rollout` of each of n windows."""
-    x0, u, solver = checked(field, x0, u, dt, solver, substeps, windows=True)
+    return _integrate_batch(field, *checked(field, x0, u, dt, solver, substeps, windows=True), dt, substeps)
+
+
+@kept_jit
+def _integrate_batch(field, x0, u, solver, dt, substeps):
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field):
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)

@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -270,13 +271,15 @@ def ravel_learned(field: AbstractVectorField) -> tuple[Float[Array, " p"], Calla
     return theta, lambda theta: eqx.combine(unravel(theta), rest)
 
 
-def check_batch_norm(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> None:
+def check_batch_norm(
+    field: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
+) -> None:
     """Refuse a field whose batch normalisation would be trained, but whose running statistics could not be.
 
     Raises:
         ValueError: at any x and u it does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
     """
-    if _is_wrapped(field) and any(bool((seen[0] == 0).any()) for seen in moments_of(field, x, u)):
+    if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
         raise ValueError(
             f"field: {type(field).__name__} holds a BatchNorm whose minibatch statistics cannot be recorded, as under "
             "stop_gradient or jax.grad; use norm='layer' or 'none', or wrap it in Frozen"

@@ -66,8 +66,8 @@ def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
     return _replaced(tree, [norm.training_mode(one) for norm, one in zip(batch_norms(tree), seen, strict=True)])
 
 
-def moments_of(field, x: Batch, u: Float[Array, "m b"]) -> list[Moments]:
-    """What each `AbstractBatchNorm` records when the field is evaluated on a minibatch.
+def moments_of(field, x, u) -> list[Moments]:
+    """What each `AbstractBatchNorm` records when the field is evaluated on a minibatch, x (d, b) and u (m, b).
 
     The moments are the derivative with respect to an input that does nothing (`_record`): they add up through any jit,
     scan or vmap around the layer, where values stored during tracing would leak.

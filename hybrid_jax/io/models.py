@@ -19,7 +19,6 @@ from hybrid_jax.dynamics.rigid_body import check_start
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
-from hybrid_jax.programs import kept_jit
 
 FORMAT = "hybrid_jax model 2"
 FORMAT_1 = "hybrid_jax model 1"  # still read: see `_RENAMED` in structure.py
@@ -49,16 +48,13 @@ class Model:
         x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
         check_start(self.field, x0)
-        predicted = (_rollout if x0.ndim == 1 else _rollout_batch)(self.field, x0, u, dt)
+        predicted = (rollout if x0.ndim == 1 else rollout_batch)(self.field, x0, u, dt)
         diverged = ~np.isfinite(predicted).all(axis=-1)
         if diverged.any():
             *window, interval = np.argwhere(diverged)[0].tolist()
             where = f" of window {window[0]}, the first of {diverged.any(axis=-1).sum()}," if window else ""
             raise ValueError(f"the prediction{where} diverges: it is not finite from interval {interval} on")
         return predicted
-
-
-_rollout, _rollout_batch = kept_jit(rollout), kept_jit(rollout_batch)
 
 
 def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = None) -> None:

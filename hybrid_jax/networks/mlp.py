@@ -26,6 +26,7 @@ from hybrid_jax.networks.normalisation import (
     affine,
     product,
 )
+from hybrid_jax.programs import kept_jit
 
 
 class FusedNetwork(AbstractVectorField):
@@ -186,15 +187,19 @@ def residual_network(
         checks.count(name, size)
     checks.count("input_size", input_size, least=0)
     checks.key("key", key)
+    weights = _weights(key, state_size + input_size, hidden, outputs, norm)
+    return ResidualNetwork(*weights, scaling=ChannelScaling() if scaling is None else scaling, activation=activation)
+
+
+@kept_jit
+def _weights(key: PRNGKeyArray, fan_in: int, hidden: int, outputs: int, norm: str):
+    """W₁, the normalisation, W₂ and b₂."""
     key_in, key_out, key_bias = jax.random.split(key, 3)
-    fan_in = state_size + input_size
-    return ResidualNetwork(
-        weight_in=_uniform(key_in, (hidden, fan_in), fan_in),
-        norm=NORMS[norm](hidden, _uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
-        weight_out=_uniform(key_out, (outputs, hidden), hidden),
-        bias_out=_uniform(key_bias, (outputs,), hidden),
-        scaling=ChannelScaling() if scaling is None else scaling,
-        activation=activation,
+    return (
+        _uniform(key_in, (hidden, fan_in), fan_in),
+        NORMS[norm](hidden, _uniform(jax.random.fold_in(key, 3), (hidden,), fan_in)),
+        _uniform(key_out, (outputs, hidden), hidden),
+        _uniform(key_bias, (outputs,), hidden),
     )
 
 

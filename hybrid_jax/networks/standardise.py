@@ -4,7 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics import batching
 from hybrid_jax.dynamics.base import AbstractVectorField, unfreeze
@@ -13,6 +13,7 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
+from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
@@ -52,26 +53,34 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     """
     if not (networks := _unset(field)):
         return field
-    x0, u, after = (jnp.asarray(part) for part in (windows.x0, windows.u, windows.x))
-    before = jnp.concatenate([x0[:, None], after[:, :-1]], axis=1)
+    x0, u, after = (np.asarray(part) for part in (windows.x0, windows.u, windows.x))
+    before = np.concatenate([x0[:, None], after[:, :-1]], axis=1)
     every = -(-before.shape[0] * before.shape[1] // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
     samples = before.shape[0] * before.shape[1]
     x, u, after = (rows.reshape(samples, rows.shape[-1])[::every] for rows in (before, u, after))  # u may be empty
     zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
     probed = unfreeze(eqx.tree_at(_scalings, field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
 
-    predicted = rollout_batch(probed, x, u[:, None], windows.dt)[:, 0]
+    predicted = np.asarray(rollout_batch(probed, x, u[:, None], windows.dt))[:, 0]
     lacking, rate = (np.sqrt(np.mean(np.square(after - start), axis=0)) / windows.dt for start in (predicted, x))
     grids = [node for node in jax.tree.leaves(field, is_leaf=_is_grid) if _is_grid(node)]
 
-    seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x.T, u.T), strict=True)
-    moments = [np.asarray(part) for norm, part in seen if isinstance(norm, _Probe)]
     scalings = []
-    for network, (count, *sums) in zip(networks, moments, strict=True):
+    for network, moments in zip(networks, _seen(probed, x.T, u.T), strict=True):
+        count, *sums = np.asarray(moments)
         mean, variance = (part / np.maximum(count, 1) for part in sums)
         scale = _positive(np.sqrt(variance), FLOOR * np.abs(mean))
         scalings.append(ChannelScaling(tuple(mean.tolist()), scale, _output(network, grids, lacking, rate)))
     return eqx.tree_at(_scalings, field, scalings)
+
+
+@kept_jit
+def _seen(
+    probed: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
+) -> list[batching.Moments]:
+    """The moments of what each probe reads, in the order of the networks."""
+    seen = zip(batching.batch_norms(probed), batching.moments_of(probed, x, u), strict=True)
+    return [moments for norm, moments in seen if isinstance(norm, _Probe)]
 
 
 def _output(network: ResidualNetwork, grids: list[GridNetwork], lacking, rate) -> Channels | None:

@@ -7,7 +7,6 @@ Here each channel is divided by its error under a simple baseline: 1 is no bette
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -111,7 +110,7 @@ def channels_from(
     """
     size = check(windows, "windows").x.shape[-1]
     parts = _parts(size, size == STATE_SIZE) if parts is None else parts
-    predicted = eqx.filter_jit(rollout_batch)(baseline, windows.x0, windows.u, windows.dt)
+    predicted = rollout_batch(baseline, windows.x0, windows.u, windows.dt)
     difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
     scales = {name: _rms(difference[:, part]) for name, part in parts.items()}
     for name, scale in scales.items():

@@ -109,7 +109,7 @@ def fit(
     except (TypeError, ValueError) as error:
         expected = "a number, or a tree of them that begins as the field does"
         raise ValueError(f"rates must be {expected}, got {checks.short_repr(rates)}") from error
-    plan = make_run_config(each, jnp.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
+    plan = make_run_config(each, np.arange(len(data)), len(data), min_epochs, patience, max_epochs, weight)
     field = ready(field, train)  # scaling changes the tree of the field, but not what is learned
     plan = replace(plan, rates=jax.tree.structure(eqx.filter(field, trainable(field))).unflatten(plan.rates))
     return drive(fitting.start(field, key, shared[-1]), plan, data, shared, progress)
@@ -147,12 +147,12 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
     for name, windows in data.items():
         if isinstance(field, AbstractVectorField):
             try:
-                x0, u, _ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+                x0, *_ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
             if x0.dtype != jnp.result_type(windows.x0):
                 raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
-            check_batch_norm(field, x0[:2].T, u[:2, 0].T)
+            check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
         if moves_a_rigid_body(field):
             check_attitudes(windows, name)
 
