@@ -82,7 +82,7 @@ def _slopes(terms, y0, args, times, steps):
         slope = terms.vf(node[0], y0 + node[1] * before, args)
         return slope, slope
 
-    return jax.lax.scan(stage, jnp.zeros_like(y0), (times, steps))[1]
+    return jax.lax.scan(stage, y0, (times, steps))[1]  # the first step is 0, so that any slope will do
 
 
 def compact(solver: Solver | None) -> Solver:
@@ -121,7 +121,8 @@ def rk4_step(
     derivative: Derivative, x: Float[Array, " d *b"], u: Float[Array, " m *b"], dt: float
 ) -> Float[Array, " d *b"]:
     """The state after one step of RK4 over dt [s] with the input held, as in an interval of `rollout`."""
-    term = diffrax.ODETerm(lambda t, x, held: derivative(x, held))
+    traced = jax.jit(lambda x, held: derivative(x, held))  # once for the four stages; the compiler inlines it again
+    term = diffrax.ODETerm(lambda t, x, held: traced(x, held))
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
 
 

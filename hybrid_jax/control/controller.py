@@ -19,6 +19,7 @@ from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
 from hybrid_jax.control.sensitivities import advance_lagged, condensed, condensed_lagged
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
+from hybrid_jax.dynamics.batching import like
 from hybrid_jax.matrices import solve
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
 from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, Input, State
@@ -234,7 +235,7 @@ class Controller:
             gain = step @ gradient + damping * step @ step  # decrease of the quadratic model
             variables = plan.variables - step.reshape(plan.variables.shape)
             variables = jnp.clip(variables, -VARIABLE_BOUND, VARIABLE_BOUND)
-            states = jax.lax.scan(interval, start, variables)[1]
+            states = jax.lax.scan(interval, like(start, damping), variables)[1]
             cost = self._cost(reference, states, variables)
             return (Plan(variables, jnp.where(jnp.isfinite(cost), cost, jnp.inf), damping), states), gain
 

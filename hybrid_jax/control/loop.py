@@ -17,6 +17,7 @@ from hybrid_jax.control.observer import Observer
 from hybrid_jax.control.rotor_lag import rotor_speeds
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.batching import like
 from hybrid_jax.rotation import heading, normalise
 from hybrid_jax.state import POSITION, QUATERNION, Input, State
 
@@ -185,7 +186,7 @@ def fly(
         after, u = loop.tick(plant, reference, now, i)
         return after, (after.x, u, after.plan, now.estimate)
 
-    start = loop.begin(x0, plan, jax.random.key(0) if key is None else key)
+    start = like(loop.begin(x0, plan, jax.random.key(0) if key is None else key), x0)
     x, u, plans, estimates = jax.lax.scan(tick, start, jnp.arange(periods))[1]
     return Flight(jnp.concatenate([x0[None], x]), u, plans, estimates)
 

@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from typing import Any
 
 import diffrax
+import jax
 import numpy as np
 
 from hybrid_jax.integrate import RK4, Derivative
@@ -51,5 +52,6 @@ def lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarra
 
 def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) -> State:
     """One step of RK4 over dt [s] with these inputs at its start, middle and end."""
-    term = diffrax.ODETerm(lambda t, x, _: derivative(x, inputs[round(2 * float(t) / dt)]))
+    traced = jax.jit(lambda x, held: derivative(x, held))  # as in `rk4_step`
+    term = diffrax.ODETerm(lambda t, x, _: traced(x, inputs[round(2 * float(t) / dt)]))
     return RK4().step(term, 0.0, dt, x, None, None, made_jump=False)[0]

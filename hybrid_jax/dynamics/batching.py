@@ -60,6 +60,16 @@ def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
     return [node for node in jax.tree.leaves(tree, is_leaf=_stops) if isinstance(node, AbstractBatchNorm)]
 
 
+def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
+    """The tree as it is, but mapped under `vmap` wherever the leader is: for what a loop begins with.
+
+    JAX finds out which values of a loop are mapped by tracing its body again until nothing changes. In loops within
+    loops that doubles at every level.
+    """
+    one = jnp.ravel(leader)[0]
+    return jax.tree.map(lambda leaf: jnp.where(one == one, leaf, leaf), tree)
+
+
 def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
     """The tree with each `AbstractBatchNorm` in training mode, for use inside `over_samples`."""
     seen = [_nothing(norm) for norm in batch_norms(tree)] if seen is None else seen

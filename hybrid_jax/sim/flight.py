@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from hybrid_jax import checks
+from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FASTEST_COMPILE
@@ -86,7 +87,7 @@ def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], st
             x = truth.step(x, u, t, DT)
             return (integral, x, t + DT), (x, u)
 
-        _, (x, u) = jax.lax.scan(decide, (jnp.zeros(3), x0, start), plan)
+        _, (x, u) = jax.lax.scan(decide, (like(jnp.zeros(3), x0), x0, start), plan)
         states = jnp.concatenate([x0[None], x])
         altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
         return Flights(states, u, altitudes.min(axis=1), start)
