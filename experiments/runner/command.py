@@ -2,6 +2,7 @@
 
 import argparse
 import contextlib
+import gc
 import io
 import signal
 import sys
@@ -51,6 +52,8 @@ def run(
         checks.writable_folder("--out", config.out)
         checks.writable_folder("--cache", config.cache)
         configure()
+        gc.freeze()  # tracing makes millions of objects, and to look for garbage among them takes a tenth of its time
+        gc.set_threshold(50_000, 20, 20)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
         signal.signal(signal.SIGTERM, _interrupt)
