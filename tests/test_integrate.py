@@ -152,6 +152,27 @@ def test_a_batch_is_a_loop_of_rollouts():
     np.testing.assert_allclose(jnp.moveaxis(trained, -1, 0), alone, rtol=0, atol=1e-13)
 
 
+def test_a_second_prediction_compiles_nothing():
+    compiled = []
+
+    def listen(name, seconds, **about):
+        if name.endswith("backend_compile_duration"):
+            compiled.append(about.get("fun_name"))
+
+    def predict(length, seed):
+        x0, u = (np.random.default_rng(seed).normal(size=shape) for shape in ((3, 2), (3, 4, 1)))
+        return rollout_batch(pendulum(length), x0, u, DT), rollout(pendulum(length), x0[0], u[0], DT)
+
+    predict(1.0, 0)
+    jax.monitoring.register_event_duration_secs_listener(listen)
+    try:
+        many, one = predict(2.0, 1)
+    finally:
+        jax.monitoring.unregister_event_duration_listener(listen)
+    assert not compiled
+    np.testing.assert_allclose(many[0], one, rtol=1e-6)
+
+
 def test_along_pairs_each_input_with_the_state_it_found():
     rng = np.random.default_rng(0)
     x0, u, x = rng.normal(size=(2, 3)), rng.normal(size=(4, 1, 3)), rng.normal(size=(4, 2, 3))

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax.dynamics import base
+from hybrid_jax.dynamics.batching import like
 from hybrid_jax.integrate import RK4
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import rollout_minibatch
@@ -121,3 +122,11 @@ def test_a_function_is_a_field():
     np.testing.assert_allclose(value, field(x[:, 0], u[0, :, 0]), rtol=1e-12)
     np.testing.assert_array_equal(slope, -np.eye(STATES))
     assert base.update_running_stats(field, x, u[0]) is base.fuse_for_inference(field) is field
+
+
+@pytest.mark.parametrize("start", [jnp.zeros(3), jnp.int32(2), jax.random.key(0)], ids=["zeros", "count", "key"])
+def test_what_a_loop_begins_with_is_as_it_was_and_mapped(start):
+    assert eqx.tree_equal(like(start, jnp.asarray(jnp.nan)), start)
+    jax.vmap(lambda leader: start, out_axes=None)(jnp.arange(5.0))
+    with pytest.raises(ValueError, match="out_axes"):
+        jax.vmap(lambda leader: like(start, leader), out_axes=None)(jnp.arange(5.0))

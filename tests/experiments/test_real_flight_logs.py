@@ -1,0 +1,86 @@
+"""From folders of logs to flights: what is read and cleaned, and what is refused."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded import CONFIG, DT, LOGS, SAMPLES, write
+
+from experiments.real_flight.config import Cleaning
+from experiments.real_flight.logs import clean, load_logs, require_distinct
+from hybrid_jax.flights.windows import require_common_interval
+from hybrid_jax.vehicle import IRIS
+
+
+def test_logs_are_read_checked_and_cleaned(tmp_path):
+    source = write(tmp_path / "source", LOGS[:2])
+    cleaning = replace(CONFIG.cleaning, in_flight=True, resample=0.02, low_pass=20.0, delay=0.02)
+    found = load_logs("source", source, IRIS, 0.01, replace(CONFIG, cleaning=cleaning))
+    assert [record["flight"] for record in found.records] == ["chirp_run1", "chirp_run2"]
+    for record in found.records:
+        assert [line.split()[0] for line in record["done"]] == ["0", "resampled", "low-pass", "motors", "rotors"]
+        assert record["samples"] == SAMPLES
+        assert len(record["checks"]) == 8 + 12
+    assert require_common_interval(found.logs, "--cleaning.resample ") == 0.02
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"low_pass": 60.0}, r"low-pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
+        ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
+        ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
+    ],
+)
+def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
+    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: --cleaning.{message}"):
+        clean(LOGS[0], Cleaning(**options), IRIS)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("resample", 0.0, "positive"),
+        ("low_pass", -1.0, "positive"),
+        ("longest_gap", -0.1, "finite number of at least 0"),
+        ("delay", np.nan, "finite"),
+    ],
+)
+def test_invalid_cleaning_options_are_refused(option, value, expected):
+    with pytest.raises(ValueError, match=f"^--cleaning.{option.replace('_', '-')} must be a {expected}.*{value}$"):
+        Cleaning(**{"resample": 0.01, option: value})
+
+
+@pytest.mark.parametrize(
+    ("times", "message"),
+    [
+        (lambda t: 2 * t, r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"),
+        (lambda t: t + DT / 3 * (np.arange(SAMPLES) == 10), r"chirp_run2.*resample the log first"),
+    ],
+)
+def test_uneven_samples_and_different_intervals_are_refused(times, message):
+    with pytest.raises(ValueError, match=message):
+        require_common_interval([LOGS[0], replace(LOGS[1], t=times(LOGS[1].t))], "--cleaning.resample ")
+
+
+def test_hidden_files_and_folders_are_ignored(tmp_path):
+    source = write(tmp_path, LOGS[:1])
+    (source / "._chirp_run1.csv").write_bytes(b"\x00\x05\x16\x07")  # macOS writes such files on other disks
+    (source / "old.csv").mkdir()
+    assert len(load_logs("source", source, IRIS, 0.0, CONFIG).logs) == 1
+
+
+def test_duplicate_flights_are_refused(tmp_path):
+    same = replace(LOGS[0], name="/logs/chirp_run9.csv")
+    source = load_logs("source", write(tmp_path / "source", LOGS[:2]), IRIS, 0.0, CONFIG)
+    twice = load_logs("source", write(tmp_path / "twice", [LOGS[0], same]), IRIS, 0.0, CONFIG)
+    test = load_logs("test", write(tmp_path / "test", [same]), IRIS, 0.0, CONFIG)
+    turns = replace(CONFIG, folds_by="manoeuvre")
+    require_distinct([source], CONFIG)
+    require_distinct([source, test], turns)
+    both = r"--test .*test/chirp_run9.csv.gz: the same flight as --source .*source/chirp_run1.csv.gz; leave one"
+    for config in (CONFIG, replace(turns, target=tmp_path)):
+        with pytest.raises(ValueError, match=both):
+            require_distinct([source, test], config)
+    with pytest.raises(ValueError, match=r"--source .*chirp_run9.*the same flight as --source .*chirp_run1"):
+        require_distinct([twice], turns)
