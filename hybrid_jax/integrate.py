@@ -6,6 +6,7 @@ a stage at the end of a step would read the next input.
 
 import dataclasses
 from collections.abc import Callable
+from functools import partial
 from typing import ClassVar
 
 import diffrax
@@ -121,9 +122,22 @@ def rk4_step(
     derivative: Derivative, x: Float[Array, " d *b"], u: Float[Array, " m *b"], dt: float
 ) -> Float[Array, " d *b"]:
     """The state after one step of RK4 over dt [s] with the input held, as in an interval of `rollout`."""
-    traced = jax.jit(lambda x, held: derivative(x, held))  # once for the four stages; the compiler inlines it again
-    term = diffrax.ODETerm(lambda t, x, held: traced(x, held))
+    evaluate = traced_once(derivative, x)
+    term = diffrax.ODETerm(lambda t, x, held: evaluate(x, held))
     return RK4().step(term, 0.0, dt, x, u, None, made_jump=False)[0]
+
+
+def traced_once(derivative: Derivative, x: Float[Array, " d *b"]) -> Derivative:
+    """The derivative, traced once for all stages of a step from x; the compiler puts it in line again."""
+    if isinstance(derivative, AbstractVectorField):
+        return partial(_evaluate, derivative)
+    # Outside of compiled code a function that is made for one step would be compiled at every call.
+    return jax.jit(lambda x, held: derivative(x, held)) if checks.is_traced(x) else derivative
+
+
+@eqx.filter_jit
+def _evaluate(field: AbstractVectorField, x, u):
+    return field(x, u)
 
 
 def _prepared(solver: Solver, dtype) -> Solver:

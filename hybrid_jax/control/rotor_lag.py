@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from typing import Any
 
 import diffrax
-import jax
 import numpy as np
 
-from hybrid_jax.integrate import RK4, Derivative
+from hybrid_jax.integrate import RK4, Derivative, traced_once
 from hybrid_jax.state import Input, State
 
 
@@ -52,6 +51,6 @@ def lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarra
 
 def step_of(derivative: Derivative, x: State, inputs: Sequence[Any], dt: float) -> State:
     """One step of RK4 over dt [s] with these inputs at its start, middle and end."""
-    traced = jax.jit(lambda x, held: derivative(x, held))  # as in `rk4_step`
-    term = diffrax.ODETerm(lambda t, x, _: traced(x, inputs[round(2 * float(t) / dt)]))
+    evaluate = traced_once(derivative, x)
+    term = diffrax.ODETerm(lambda t, x, _: evaluate(x, inputs[round(2 * float(t) / dt)]))
     return RK4().step(term, 0.0, dt, x, None, None, made_jump=False)[0]
