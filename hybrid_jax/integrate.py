@@ -128,7 +128,7 @@ def rk4_step(
 
 
 def traced_once(derivative: Derivative, x: Float[Array, " d *b"]) -> Derivative:
-    """The derivative, traced once for all stages of a step from x; the compiler puts it in line again."""
+    """The derivative, traced once for all stages of a step from x; the compiler inlines it again."""
     if isinstance(derivative, AbstractVectorField):
         return partial(_evaluate, derivative)
     # Outside of compiled code a function that is made for one step would be compiled at every call.

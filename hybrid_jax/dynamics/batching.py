@@ -61,13 +61,13 @@ def batch_norms(tree: PyTree) -> list[AbstractBatchNorm]:
 
 
 def like(tree: PyTree, leader: Float[Array, "..."]) -> PyTree:
-    """The tree as it is, but mapped under `vmap` wherever the leader is: for what a loop begins with.
+    """The tree unchanged, but batched under `vmap` where the leader is: for the initial carry of a scan.
 
-    JAX finds out which values of a loop are mapped by tracing its body again until nothing changes. In loops within
-    loops that doubles at every level.
+    JAX traces the body of a scan again when part of its carry turns out to be batched that was not at the start. In
+    nested scans that doubles at every level.
     """
-    one = jnp.ravel(leader)[0]
-    return jax.tree.map(lambda leaf: jnp.where(one == one, leaf, leaf), tree)
+    number = jnp.ravel(leader)[0]
+    return jax.tree.map(lambda leaf: jnp.where(number > 0, leaf, leaf), tree)
 
 
 def training_mode(tree: PyTree, seen: list[Moments] | None = None) -> PyTree:
