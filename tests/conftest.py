@@ -15,7 +15,8 @@ import pytest
 
 pytest.register_assert_rewrite("any_system")
 
-# A quarter of the time to compile. A program in one part suits one core. XLA aborts on a flag that it does not know.
+# Without optimisation a third of the time to compile, and three quarters of that in one part, as suits one core. XLA
+# aborts on a flag that it does not know.
 QUICK = "--xla_backend_optimization_level=0 --xla_cpu_parallel_codegen_split_count=1"
 if tuple(map(int, version("jaxlib").split(".")[:2])) <= (0, 10):
     QUICK += " --xla_cpu_use_fusion_emitters=false"

@@ -52,7 +52,7 @@ def run(
         checks.writable_folder("--out", config.out)
         checks.writable_folder("--cache", config.cache)
         configure()
-        gc.freeze()  # tracing makes millions of objects, and to look for garbage among them takes a tenth of its time
+        gc.freeze()  # tracing makes millions of objects, and to look for garbage among them takes an eighth of its time
         gc.set_threshold(50_000, 20, 20)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
