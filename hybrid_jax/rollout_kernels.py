@@ -67,7 +67,7 @@ class KernelField(NamedTuple):
             h = len(network.weight_in)
             shapes = network.weight_in.shape, network.weight_out.shape, network.bias_out.shape
             of_norm = [array.shape for array in jax.tree.leaves(network.norm)]
-            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % native.VECTOR:
+            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % native.UNITS:
                 return False
         if self.physics is None:
             return True

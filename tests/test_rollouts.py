@@ -41,8 +41,8 @@ def network(d, r, hidden=32, **options):
 FIELDS = {
     "the paper's": untrained("hybrid"),
     "physics alone": RigidBody(THETA, ODD),
-    "no physics": network(3, 2, hidden=16),
-    "no input": network(5, 0, hidden=48),
+    "no physics": network(3, 2, hidden=32),
+    "no input": network(5, 0, hidden=96),
     "a force and a torque": Hybrid(ForcedBody(THETA, HEXACOPTER), network(13, 6)),
 }
 FIELD = FIELDS["the paper's"]
@@ -142,7 +142,7 @@ class Own(RigidBody):
 OTHERS = {
     "physics of one's own": (Hybrid(Own(THETA, IRIS), FIELD.residual), {}),
     "few windows": (FIELD, {"b": 9}),
-    "odd hidden units": (Hybrid(FIELD.physics, network(13, 4, hidden=20)), {}),
+    "odd hidden units": (Hybrid(FIELD.physics, network(13, 4, hidden=48)), {}),
     "another activation": (Hybrid(FIELD.physics, network(13, 4, activation="tanh")), {}),
     "layer norm": (Hybrid(FIELD.physics, network(13, 4, norm="layer")), {}),
 }

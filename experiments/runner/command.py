@@ -6,6 +6,7 @@ import gc
 import io
 import signal
 import sys
+import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -16,7 +17,7 @@ from rich.console import Console
 
 from experiments.runner.options import Run
 from experiments.runner.run_record import OtherRun, recorded
-from hybrid_jax import checks
+from hybrid_jax import checks, native
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
@@ -56,6 +57,8 @@ def run(
         gc.set_threshold(50_000, 20, 20)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
+        # Where there are no kernels yet, GCC takes ten seconds for them, which imports and flights hardly use.
+        threading.Thread(target=native.status, daemon=True).start()
         signal.signal(signal.SIGTERM, _interrupt)
         main = hosts.is_main_process()  # it alone prints and writes
         console, folder = Console(stderr=True, quiet=not main), config.out / name

@@ -14,17 +14,7 @@ Layer::Layer(int64_t m, int64_t b, int64_t h, int64_t d, float epsilon, const fl
   transpose(w2, h, w2t, D(), d, h);
 }
 
-// Calls act(2, i) for two vectors of hidden units from i on, and act(1, i) for a last one.
-template <class Act>
-void Layer::all_units(Act act) const {
-  int64_t i = 0;
-  for (; i + V < h; i += 2 * V) act(std::integral_constant<int, 2>{}, i);
-  if (i < h) act(std::integral_constant<int, 1>{}, i);
-}
-
-template <int N>
 void Layer::units_forward(int64_t i, const float* centred, float* inverse, float* y) const {
-  constexpr int64_t W = N * V;
   const int64_t b = this->b, D = this->D();
   float* const hidden = this->hidden;
   Vec scale[N], move[N];
@@ -47,10 +37,8 @@ void Layer::units_forward(int64_t i, const float* centred, float* inverse, float
   });
 }
 
-template <int N>
 void Layer::units_backward(int64_t i, const float* centred, const float* inverse, const float* d_y, Gradients to,
-                    float* d_zt, float* others) const {
-  constexpr int64_t W = N * V;
+                           float* d_zt, float* others) const {
   const int64_t m = this->m, b = this->b, h = this->h, M = this->M();
   float *const hidden = this->hidden, *const active = this->active;
   Vec scale[N], move[N], by_scale[N], by_shift[N];
@@ -103,13 +91,13 @@ void Layer::units_backward(int64_t i, const float* centred, const float* inverse
 void Layer::forward(const float* centred, const float* bias_out, float* inverse, float* y) const {
   float* rows = scratch(ROWS, b * D());
   std::memcpy(bias, bias_out, d * sizeof(float));
-  all_units([&](auto n, int64_t i) { units_forward<n>(i, centred, inverse, rows); });
+  for (int64_t i = 0; i < h; i += W) units_forward(i, centred, inverse, rows);
   transpose(rows, D(), y, b, b, d);
 }
 
 void Layer::backward(const float* centred, const float* inverse, const float* d_y, Gradients to, float* d_z) const {
   float *rows = scratch(ROWS, b * M()), *others = scratch(REST, rest() * b * V);
-  all_units([&](auto n, int64_t i) { units_backward<n>(i, centred, inverse, d_y, to, rows, others); });
+  for (int64_t i = 0; i < h; i += W) units_backward(i, centred, inverse, d_y, to, rows, others);
   for (int64_t r = 0; r < d; ++r) to.bias[r] += sum(d_y + r * b, b);
   transpose(rows, M(), d_z, b, b, m - rest());
   for (int64_t r = 0; r < rest(); ++r) sums(others + r * b * V, b, d_z + (m - rest() + r) * b);

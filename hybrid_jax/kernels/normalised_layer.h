@@ -3,8 +3,8 @@
 //   y (d, b) = W₂ max(γ ĥ + β, 0) + b₂,  ĥ (h, b) = W₁ z̃ / √(mean (W₁ z̃)² + ε),  z̃ (m, b) = z less its row means.
 //
 // Hidden units lie along the vectors and samples along the rows, so that means over a minibatch need no sum within a
-// vector, and two vectors of units are taken at a time: what they need stays in the first cache. h is a multiple of V,
-// and b at least V, which the caller sees to, as to all shapes.
+// vector, and W units are taken at a time: what they need stays in the first cache. h is a multiple of W, and b at least
+// V, which the caller sees to, as to all shapes.
 
 #pragma once
 
@@ -21,7 +21,7 @@ struct Layer {
   float epsilon;
   const float *gain, *shift, *w2;
   float *w1 = scratch(W1, h * m), *w1t = scratch(W1T, m * h), *bias = scratch(BIAS, D()), *w2t = scratch(W2T, h * D());
-  float *hidden = scratch(HIDDEN, 2 * V * b), *active = scratch(ACTIVE, 2 * V * b);
+  float *hidden = scratch(HIDDEN, W * b), *active = scratch(ACTIVE, W * b);
 
   int64_t D() const { return (d + V - 1) / V * V; }  // numbers of an output in whole vectors
   int64_t rest() const { return m % V <= FEW ? m % V : 0; }  // inputs whose derivative is summed within vectors
@@ -40,11 +40,7 @@ struct Layer {
   void to_rows(const float* w1t, float* d_w1) const;  // W₁'s gradient as W₁ lies
 
  private:
-  template <class Act>
-  void all_units(Act act) const;
-  template <int N>
   void units_forward(int64_t i, const float* centred, float* inverse, float* y) const;
-  template <int N>
   void units_backward(int64_t i, const float* centred, const float* inverse, const float* d_y, Gradients to,
                       float* d_zt, float* others) const;
 };

@@ -31,7 +31,7 @@ struct Field {
   const float *theta, *offset, *factor, *c;
   Constants constants;
   float *w1t = scratch(W1T, s.m * s.h), *w2t = scratch(W2T, s.h * s.D()), *bias = scratch(BIAS, s.D());
-  float *hidden = scratch(HIDDEN, 2 * V * b), *rows = scratch(ROWS, b * s.D()), *network = scratch(NETWORK, s.d * b);
+  float *hidden = scratch(HIDDEN, W * b), *rows = scratch(ROWS, b * s.D()), *network = scratch(NETWORK, s.d * b);
   float* z = scratch(D_Z, s.m * b);
 
   // Some rows of z, from those of [x, u].
@@ -43,17 +43,13 @@ struct Field {
   // ẋ at x; that part of z which is of u is there already.
   void operator()(const float* x, const float* u, float* slope) const {
     scale(0, s.d, x);
-    int64_t i = 0;
-    for (; i + V < s.h; i += 2 * V) units<2>(i);
-    if (i < s.h) units<1>(i);
+    for (int64_t i = 0; i < s.h; i += W) units(i);
     const bool alone = constants.size() == 0;
     transpose(rows, s.D(), alone ? slope : network, b, b, s.d);
     if (!alone) forward_columns(Body(theta, constants, x, u, b), network, slope);
   }
 
-  template <int N>
   void units(int64_t i) const {
-    constexpr int64_t W = N * V;
     const int64_t D = s.D();
     float *const hidden = this->hidden, *const rows = this->rows;
     Vec shift[N];

@@ -12,6 +12,7 @@
 namespace {
 
 constexpr int ACCUMULATORS = V == 16 ? 20 : 12;  // vectors that a tile keeps in registers
+constexpr int N = 2, W = N * V;  // vectors of hidden units, and units, that are taken at a time
 
 #define UNROLL _Pragma("GCC unroll 16")
 
@@ -20,61 +21,59 @@ INLINE Vec relu(Vec v) { return v <= 0 ? Vec{} : v; }  // NaN stays
 struct Left { const float* at; int64_t row, step; };  // x[r, k] is at[r row + k step]
 struct Right { const float* at; int64_t row; };  // y[k, n] is at[k row + n]
 
-// Σ_k x[r, k] y[k, n] for R rows and N vectors of columns; each is handed to finish(row, column, sum).
-template <int R, int N, class Finish>
+// Σ_k x[r, k] y[k, n] for R rows and C vectors of columns; each is handed to finish(row, column, sum).
+template <int R, int C, class Finish>
 INLINE void tile(Left x, Right y, int64_t depth, int64_t row, int64_t column, Finish finish) {
-  Vec sum[R][N] = {};
+  Vec sum[R][C] = {};
   const float *left = x.at + row * x.row, *right = y.at + column;
   for (int64_t k = 0; k < depth; ++k, left += x.step, right += y.row) {
-    Vec loaded[N];
-    UNROLL for (int n = 0; n < N; ++n) loaded[n] = load(right + n * V);
+    Vec loaded[C];
+    UNROLL for (int n = 0; n < C; ++n) loaded[n] = load(right + n * V);
     UNROLL for (int r = 0; r < R; ++r) {
       const float factor = left[r * x.row];
-      UNROLL for (int n = 0; n < N; ++n) sum[r][n] += factor * loaded[n];
+      UNROLL for (int n = 0; n < C; ++n) sum[r][n] += factor * loaded[n];
     }
   }
   UNROLL for (int r = 0; r < R; ++r)
-    UNROLL for (int n = 0; n < N; ++n) finish(row + r, column + n * V, sum[r][n]);
+    UNROLL for (int n = 0; n < C; ++n) finish(row + r, column + n * V, sum[r][n]);
 }
 
 // A tile of at most R rows.
-template <int R, int N, class Finish>
+template <int R, int C, class Finish>
 INLINE void up_to(int64_t rows, Left x, Right y, int64_t depth, int64_t row, int64_t column, Finish finish) {
-  if (rows == R) return tile<R, N>(x, y, depth, row, column, finish);
-  if constexpr (R > 1) up_to<R - 1, N>(rows, x, y, depth, row, column, finish);
+  if (rows == R) return tile<R, C>(x, y, depth, row, column, finish);
+  if constexpr (R > 1) up_to<R - 1, C>(rows, x, y, depth, row, column, finish);
 }
 
 // The same for all rows, in tiles of about equal height.
-template <int N, class Finish>
+template <int C, class Finish>
 INLINE void strip(Left x, Right y, int64_t rows, int64_t depth, int64_t column, Finish finish) {
-  constexpr int most = std::min(ACCUMULATORS / N, 10);
+  constexpr int most = std::min(ACCUMULATORS / C, 10);
   const int64_t tiles = (rows + most - 1) / most;
   for (int64_t i = 0; i < tiles; ++i) {
     const int64_t row = rows * i / tiles;
-    up_to<most, N>(rows * (i + 1) / tiles - row, x, y, depth, row, column, finish);
+    up_to<most, C>(rows * (i + 1) / tiles - row, x, y, depth, row, column, finish);
   }
 }
 
 template <class Finish>
 INLINE void product(Left x, Right y, int64_t rows, int64_t depth, int64_t columns, Finish finish) {
-  int64_t column = 0;
-  for (; column + V < columns; column += 2 * V) strip<2>(x, y, rows, depth, column, finish);
-  if (column < columns) strip<1>(x, y, rows, depth, column, finish);
+  for (int64_t column = 0; column < columns; column += V) strip<1>(x, y, rows, depth, column, finish);
 }
 
-// Transposes V rows by exchanging blocks of W × W, 2W × 2W, …
-template <int W>
+// Transposes V rows by exchanging blocks of B × B, 2B × 2B, …
+template <int B>
 INLINE void exchange(Vec (&rows)[V]) {
-  if constexpr (W < V) {
+  if constexpr (B < V) {
     for (int i = 0; i < V; ++i) {
-      if (i & W) continue;
+      if (i & B) continue;
       Places low, high;
-      for (int j = 0; j < V; ++j) low[j] = j & W ? V + j - W : j, high[j] = low[j] + W;
-      const Vec a = rows[i], b = rows[i + W];
+      for (int j = 0; j < V; ++j) low[j] = j & B ? V + j - B : j, high[j] = low[j] + B;
+      const Vec a = rows[i], b = rows[i + B];
       rows[i] = __builtin_shuffle(a, b, low);
-      rows[i + W] = __builtin_shuffle(a, b, high);
+      rows[i + B] = __builtin_shuffle(a, b, high);
     }
-    exchange<2 * W>(rows);
+    exchange<2 * B>(rows);
   }
 }
 

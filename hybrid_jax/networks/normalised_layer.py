@@ -31,7 +31,7 @@ def _has_kernel(activation: Activation, arrays) -> bool:
     (h, m), d, b = arrays[0].shape, len(arrays[4]), arrays[5].shape[1]
     fits = [array.shape for array in arrays] == [(h, m), (h,), (h,), (d, h), (d,), (m, b)]
     single = all(array.dtype == jnp.float32 for array in arrays)
-    return fits and single and activation is RELU and h % native.VECTOR == 0 and b >= native.VECTOR
+    return fits and single and activation is RELU and h % native.UNITS == 0 and b >= native.VECTOR
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))

@@ -143,7 +143,7 @@ jax.monitoring.register_event_duration_secs_listener(
     lambda name, _, **about: traced.append(about.get("fun_name")) if name.endswith("trace_duration") else None
 )
 windows = make_windows(20, 2)
-fitted = training.fit(untrained("no_physics", hidden=16), windows, windows, jax.random.key(0), max_epochs=3)
+fitted = training.fit(untrained("no_physics", hidden=32), windows, windows, jax.random.key(0), max_epochs=3)
 print([float(loss) for loss in fitted.history.train], fitted.best.weight_in.sum())
 print(native.status())
 print([name for name in traced if name and "run" in name])
