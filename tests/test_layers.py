@@ -6,6 +6,9 @@ from graphlib import TopologicalSorter
 from pathlib import Path
 
 import pytest
+from smoke import script
+
+import hybrid_jax
 
 ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
@@ -77,3 +80,13 @@ def test_the_test_sees_imports():
     assert "hybrid_jax.dynamics.base" in LIBRARY["hybrid_jax.dynamics.rigid_body"]
     assert "hybrid_jax.sim.domain" in modules("experiments")["experiments.render"]
     assert "hybrid_jax.training.fitting" in modules("experiments")["experiments.paper.conditions"]
+
+
+def test_names_are_imported_when_they_are_used():
+    loaded = "print('jax' in sys.modules)"
+    assert script("-c", f"import sys, hybrid_jax; {loaded}; hybrid_jax.rollout; {loaded}").split() == ["False", "True"]
+
+
+def test_every_name_is_where_the_stub_says():
+    for name in hybrid_jax.__all__:
+        assert getattr(hybrid_jax, name) is not None

@@ -1,0 +1,59 @@
+"""The names of `hybrid_jax` and where they are, for type checkers and for __init__.py."""
+
+from . import runtime
+from .adaptation import (
+    METHODS,
+    Adaptation,
+    Cause,
+    FineTune,
+    LeastSquares,
+    Method,
+    OnlineAdaptation,
+    Ridge,
+    Solution,
+    Source,
+    adapt,
+    covariance_of,
+    fit_least_squares,
+    intervals,
+    pool,
+)
+from .dynamics import (
+    AbstractVectorField,
+    Actuator,
+    Diffusion,
+    Frozen,
+    Grid,
+    Hybrid,
+    Multirotor,
+    RigidBody,
+    actuated,
+    check_grid,
+    diffusion,
+    multirotor,
+    rigid_body,
+    with_disturbance,
+)
+from .flights import load_log, load_windows
+from .identification import Excitation, FlightBounds, InputBounds, excitation
+from .integrate import RK4, SOLVERS, rollout, rollout_batch
+from .io import Model, check_savable, load, portable, save
+from .networks import grid_network, residual_network
+from .networks.standardise import with_scaling
+from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
+from .trajectories import Trajectories
+from .vehicle import IRIS, Vehicle, load_vehicle
+
+__version__: str
+
+__all__ = ["Trajectories", "__version__", "runtime"]
+__all__ += ["AbstractVectorField", "Frozen", "Hybrid", "with_disturbance"]
+__all__ += ["IRIS", "Multirotor", "RigidBody", "Vehicle", "load_vehicle", "multirotor", "rigid_body"]
+__all__ += ["Actuator", "actuated"]
+__all__ += ["Diffusion", "Grid", "check_grid", "diffusion", "fit_gauss_newton", "grid_network"]
+__all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "with_scaling"]
+__all__ += ["Model", "check_savable", "load", "portable", "save"]
+__all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
+__all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
+__all__ += ["Cause", "Excitation", "FlightBounds", "InputBounds", "OnlineAdaptation", "excitation"]
+__all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
