@@ -14,8 +14,8 @@ from hybrid_jax.networks import normalised_layer as layers
 
 EPSILON = 1e-5
 PLAIN = partial(layers.plain_layer, EPSILON, layers.RELU)
-# h, m, d, b: the paper's; samples that are no multiple of a vector; odd vectors of units; fewer and more than a vector.
-SIZES = [(64, 17, 13, 100), (64, 17, 13, 16), (16, 3, 2, 33), (48, 40, 20, 101), (32, 16, 16, 64)]
+# h, m, d, b: the paper's, whose samples are no multiple of a vector; one vector of samples; few inputs and many.
+SIZES = [(64, 17, 13, 100), (64, 17, 13, 16), (32, 3, 2, 33), (96, 40, 20, 101), (32, 16, 16, 64)]
 CACHED = native._compiled, native._obstacle, native._digest
 
 needs_kernels = pytest.mark.skipif(native.prefix() is None, reason=native.status())
@@ -69,14 +69,14 @@ def test_a_lane_is_the_same_alone_to_the_bit():
 @needs_kernels
 def test_weights_that_are_no_numbers_show_in_the_result():
     # Or a run that diverged would go on.
-    (weight, *others), _ = layer(16, 3, 2, 20)
+    (weight, *others), _ = layer(32, 3, 2, 20)
     weight[5, 1] = np.nan
     assert np.isnan(layers._kernel_layer(EPSILON, weight, *others)).all()
 
 
 @needs_kernels
 def test_a_second_derivative_is_that_of_jax():
-    arrays, d_out = layer(16, 3, 2, 20)
+    arrays, d_out = layer(32, 3, 2, 20)
 
     def curvature(function, z):
         slope = jax.grad(lambda z: jnp.sum(d_out * jnp.square(function(*arrays[:-1], z))))
@@ -124,7 +124,7 @@ WITHOUT = {
 def test_without_kernels_jax_does_the_same(variables, reason, anew, tmp_path, monkeypatch):
     for name, value in (variables | {"XDG_CACHE_HOME": str(tmp_path)}).items():
         monkeypatch.setenv(name, value)
-    arrays, _ = layer(16, 3, 2, 20)
+    arrays, _ = layer(32, 3, 2, 20)
     np.testing.assert_array_equal(layers.normalised_layer(EPSILON, layers.RELU, *arrays), PLAIN(*arrays))
     assert reason in native.status()
     assert not list(tmp_path.rglob("*.so"))
