@@ -51,7 +51,7 @@ finally:
 """
 
 
-# The same for a user's script: seconds of the import, with all modules that it needs, of the first call and of a second.
+# The same for a user's script: seconds of the import with all that it needs, of the first call and of a second one.
 ADAPT = """
 import json, sys, time
 began = time.monotonic()

@@ -19,8 +19,9 @@ import numpy as np
 
 from benchmarks.subjects import DT, make_flights
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compiled, in_turns, run, table
-from hybrid_jax.sim.domain import Quadrotor, build_model
+from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.forces import Force, drag, ground_effect, parameters_of
+from hybrid_jax.sim.scene import build_model
 from hybrid_jax.vehicle import IRIS
 
 # Of the largest state. C MuJoCo's RK4 is of 2nd order in orientation, ours of 4th; the difference is its error.

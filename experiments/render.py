@@ -61,7 +61,7 @@ def _render(poses: list[list[float]], height: int, width: int, place: list[float
     """Images of the Iris, with a red mark and a camera that looks at it if a place is given."""
     import mujoco
 
-    from hybrid_jax.sim.domain import build_model
+    from hybrid_jax.sim.scene import build_model
     from hybrid_jax.vehicle import IRIS
 
     model = build_model(IRIS)

@@ -4,9 +4,6 @@ Raises ImportError if mujoco or mujoco-mjx is missing or of an unsupported versi
 differently across versions, and mujoco-mjx sets no upper bound on mujoco.
 """
 
-import contextlib
-import io
-
 from hybrid_jax.io.datasets import versions
 
 
@@ -20,10 +17,6 @@ def check_versions(found: dict[str, str]) -> None:
 
 
 check_versions(versions("mujoco", "mujoco-mjx"))
-
-# Importing mjx prints a message about its optional Warp backend to stdout.
-with contextlib.redirect_stdout(io.StringIO()):
-    import mujoco.mjx  # noqa: F401
 
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain, Quadrotor  # noqa: E402
 from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402

@@ -5,19 +5,13 @@ freezes xfrc_applied within a step, which makes any of its integrators first ord
 recomputes the forces.
 """
 
-# MuJoCo's compiled modules carry no type stubs.
-# pyright: reportAttributeAccessIssue=false
-
 from dataclasses import asdict, dataclass, replace
-from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import mujoco
 from jaxtyping import Array, Float
-from mujoco import mjx
 
 from hybrid_jax import checks
 from hybrid_jax.rotation import derivative as quaternion_derivative
@@ -31,52 +25,6 @@ CHUNK = 64  # flights per vmap: the most that fit into the cache of one core
 _DERIVED: Any = None  # a default that depends on the vehicle
 
 
-def build_model(vehicle: Vehicle) -> mujoco.MjModel:
-    """The scene for C MuJoCo: one free body whose controls are the squared rotor speeds [(rad/s)²]."""
-    spec = mujoco.MjSpec.from_file(str(Path(__file__).with_name("iris.xml")))
-    spec.option.gravity = [0.0, 0.0, -vehicle.gravity]
-    body = spec.body("vehicle")
-    for i in range(vehicle.rotors, 4):
-        spec.delete(spec.actuator(f"rotor{i}"))
-        spec.delete(spec.site(f"rotor{i}"))
-    for i in range(4, vehicle.rotors):
-        body.add_site(name=f"rotor{i}")
-        spec.add_actuator(name=f"rotor{i}", target=f"rotor{i}", trntype=mujoco.mjtTrn.mjTRN_SITE)
-    body.mass, body.inertia = vehicle.mass, vehicle.inertia
-    reaction = vehicle.torque_coefficient / vehicle.thrust_coefficient
-    for i, (x, y) in enumerate(vehicle.rotor_positions):
-        spec.site(f"rotor{i}").pos = [x, y, 0.0]
-        actuator = spec.actuator(f"rotor{i}")
-        actuator.gainprm[0] = vehicle.thrust_coefficient
-        actuator.gear = [0, 0, 1, 0, 0, vehicle.spin[i] * reaction]
-    return spec.compile()
-
-
-def traced_model(p: Parameters) -> mjx.Model:
-    """The scene for MJX, in the current precision, with the parameters of a vehicle, which may be traced."""
-    # Concrete even while tracing, so that MJX sees the model's structure as constants.
-    with jax.ensure_compile_time_eval():
-        model = mjx.put_model(build_model(_placeholder(len(p.spin))))
-    thrust, reaction = jnp.array([0.0, 0, 1, 0, 0, 0]), jnp.array([0.0, 0, 0, 0, 0, 1])
-    ratio = p.spin * p.torque_coefficient / p.thrust_coefficient
-    replaced: dict[str, Any] = {
-        "opt.gravity": jnp.array([0.0, 0.0, -1.0]) * p.gravity,
-        "body_mass": model.body_mass.at[1].set(p.mass),
-        "body_subtreemass": model.body_subtreemass.at[:].set(p.mass),
-        "body_inertia": model.body_inertia.at[1].set(p.inertia),
-        "site_pos": p.rotor_positions,
-        "actuator_gear": thrust + ratio[:, None] * reaction,
-        "actuator_gainprm": model.actuator_gainprm.at[:, 0].set(p.thrust_coefficient),
-    }
-    return cast(mjx.Model, model.tree_replace(replaced))
-
-
-def _placeholder(rotors: int) -> Vehicle:
-    """The Iris with another number of rotors, wherever they are."""
-    places, spin = ((each * rotors)[:rotors] for each in (IRIS.rotor_positions, IRIS.spin))
-    return replace(IRIS, rotor_positions=places, spin=spin)
-
-
 class Quadrotor(eqx.Module):
     """ẋ = f(x, u, t) of one vehicle under a sum of forces."""
 
@@ -85,13 +33,13 @@ class Quadrotor(eqx.Module):
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
         """ẋ for rotor speeds u [rad/s] at time t [s]."""
+        # Not above: to import MJX takes half as long as JAX, and a program that was kept does without.
+        from hybrid_jax.sim import scene
+
         wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
         applied = sum(wrenches, jnp.zeros_like(x, shape=6))
-        model = traced_model(self.parameters)
-        forces = jnp.stack([jnp.zeros_like(applied), applied])
-        data = mjx.make_data(model).replace(qpos=x[:7], qvel=x[7:], ctrl=u**2, xfrc_applied=forces)
         turning = quaternion_derivative(x[QUATERNION], x[BODY_RATES])
-        return jnp.concatenate([x[VELOCITY], turning, mjx.forward(model, data).qacc])
+        return jnp.concatenate([x[VELOCITY], turning, scene.accelerations(self.parameters, x, u, applied)])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
         """The state after dt [s] with u held from time t on: one step of classical RK4."""

@@ -10,8 +10,8 @@ from smoke import script
 
 from experiments.render import picture
 from hybrid_jax.sim import check_versions
-from hybrid_jax.sim.domain import build_model, traced_model
 from hybrid_jax.sim.forces import parameters_of
+from hybrid_jax.sim.scene import build_model, traced_model
 from hybrid_jax.vehicle import IRIS
 
 OTHER = replace(

@@ -13,8 +13,9 @@ from systems import ODD
 
 from hybrid_jax.rotation import derivative as quaternion_derivative
 from hybrid_jax.rotation import rotate
-from hybrid_jax.sim.domain import Quadrotor, build_model
+from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.forces import drag, ground_effect, parameters_of, wind
+from hybrid_jax.sim.scene import build_model
 from hybrid_jax.vehicle import IRIS
 
 ALL = (drag, ground_effect, wind)
