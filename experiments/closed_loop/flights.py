@@ -168,6 +168,7 @@ def flown(
     for key, n in most.items():
         width = min(WIDTH.get(jax.default_backend(), -(-n // jax.device_count())), n)
         programs[key] = LaneMap(partial(_simulate, controller, hardware), width, min_capacity=n)
+    compiled: set[tuple] = set()
     found = []
     for scenario in scenarios:
         path = (
@@ -177,7 +178,7 @@ def flown(
         origin = "as found in the cache"
         if about is None:
             with Line(scenario.name, console) as line:
-                arrays, spent = _fly(scenario, programs, shared, line)
+                arrays, spent = _fly(scenario, programs, compiled, shared, line)
             about = spent | {"devices": jax.device_count(), "versions": versions(*MADE_BY)}
             origin = clock(about["seconds"])
             if hosts.is_main_process():
@@ -208,23 +209,29 @@ def _cached(path: Path, console: Console, fresh: bool) -> tuple[dict[str, Any] |
 
 
 def _fly(
-    scenario: Scenario, programs: Mapping[tuple, LaneMap], shared: tuple, line: Line
+    scenario: Scenario, programs: Mapping[tuple, LaneMap], compiled: set[tuple], shared: tuple, line: Line
 ) -> tuple[Arrays, dict[str, Any]]:
-    """Results of all flights of a scenario, one per row, and the time they took without compiling [s]."""
+    """Results of all flights of a scenario, one per row, and the time they took without compiling [s].
+
+    The structures of the programs that were compiled for them are added to `compiled`.
+    """
     groups, flights = defaultdict(list), list(scenario.flights())
     for i, flight in enumerate(flights):
         groups[flight.structure()].append(i)
-    runs = [
-        partial(programs[key], stack([flights[i] for i in own]), shared, np.ones(len(own)))
+    runs = {
+        key: partial(programs[key], stack([flights[i] for i in own]), shared, np.ones(len(own)))
         for key, own in groups.items()
-    ]
-    line.say(f"compiling {len(runs)} programs for {len(flights)} flights")
+    }
+    new = [run for key, run in runs.items() if key not in compiled]
+    line.say(f"compiling {len(new)} programs for {len(flights)} flights")
     # Processes of one run must compile in the same order.
     with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
-        list(pool.map(lambda run: run([]), runs))  # compile: fly nothing
+        # Compile: fly nothing. Where all flights are one chunk, XLA flies it nevertheless.
+        list(pool.map(lambda run: run([]), new))
+    compiled |= runs.keys()
     began, worked = time.perf_counter(), time.process_time()
     found, flown = [], 0
-    for run, own in zip(runs, groups.values(), strict=True):
+    for run, own in zip(runs.values(), groups.values(), strict=True):
         line.show_share("flying", flown / len(flights))
         found.append(run(range(len(own))))
         flown += len(own)
