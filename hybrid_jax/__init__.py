@@ -14,7 +14,7 @@ from importlib.metadata import PackageNotFoundError, version
 
 import lazy_loader
 
-# Names are imported when they are first used (Scientific Python's SPEC 1): all of them together take as long as JAX.
+# Names are imported when they are first used (Scientific Python's SPEC 1). To import all takes longer than JAX itself.
 __getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
 
 try:

@@ -26,7 +26,7 @@ from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
 VECTOR = 16  # numbers in a vector, at most: of samples the kernels take at least so many
-UNITS = 2 * VECTOR  # hidden units that are taken at a time: of them the kernels take a multiple
+UNITS = 2 * VECTOR  # hidden units that a kernel works on at once, at most: their number is a multiple of it
 FOLDER = Path(__file__).parent / "kernels"
 SOURCES = [FOLDER / f"{name}.cc" for name in ("normalised_layer", "rollout", "prediction")]
 HANDLERS = "normalised_layer_forward", "normalised_layer_backward", "rollout_forward", "rollout_backward", "prediction"

@@ -226,7 +226,7 @@ def _fly(
     line.say(f"compiling {len(new)} programs for {len(flights)} flights")
     # Processes of one run must compile in the same order.
     with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
-        # Compile: fly nothing. Where all flights are one chunk, XLA flies it nevertheless.
+        # Compile by flying nothing. XLA computes a single chunk nevertheless, so no program is run twice for this.
         list(pool.map(lambda run: run([]), new))
     compiled |= runs.keys()
     began, worked = time.perf_counter(), time.process_time()

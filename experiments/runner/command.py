@@ -57,7 +57,7 @@ def run(
         gc.set_threshold(50_000, 20, 20)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
-        # Where there are no kernels yet, GCC takes ten seconds for them, which imports and flights hardly use.
+        # Compiles the kernels beside what comes first, if there are none yet: GCC takes some ten seconds.
         threading.Thread(target=native.status, daemon=True).start()
         signal.signal(signal.SIGTERM, _interrupt)
         main = hosts.is_main_process()  # it alone prints and writes

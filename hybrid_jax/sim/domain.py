@@ -33,7 +33,7 @@ class Quadrotor(eqx.Module):
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
         """ẋ for rotor speeds u [rad/s] at time t [s]."""
-        # Not above: to import MJX takes half as long as JAX, and a program that was kept does without.
+        # Not above: MJX takes as long to import as JAX, and a program that was kept needs no MJX.
         from hybrid_jax.sim import scene
 
         wrenches = [jnp.concatenate(force(x, u, t, self.parameters)) for force in self.forces]
