@@ -3,6 +3,7 @@
 A dataset holds windows in splits of disjoint flights, with statistics and configuration.
 """
 
+import math
 import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Array, Float, Key, PRNGKeyArray
 
 from hybrid_jax import checks
@@ -28,6 +30,7 @@ from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 DT = pilot.PERIOD  # s
+AXIS = "flights"
 CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of the wind
 
 # Bounds of a sound flight of the Iris; those of other vehicles are scaled.
@@ -61,18 +64,24 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
     checks.key("key", key)
     steps = round(seconds / DT)
     checks.count(f"intervals of {DT} s in seconds={seconds}", steps)
-    cpu = jax.devices("cpu")[0]
-    with jax.enable_x64(True), jax.default_device(cpu):
-        truth = domain.quadrotor()
-        keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpu)))(jnp.arange(-(-flights // CHUNK) * CHUNK))
+    cpus = jax.local_devices(backend="cpu")
+    mesh = Mesh(np.array(cpus[: math.gcd(CHUNK, len(cpus))]), (AXIS,))
+    with jax.enable_x64(True), jax.default_device(cpus[0]):
+        numbers = jnp.arange(-(-flights // CHUNK) * CHUNK)
+        keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpus[0])))(numbers)
+        vehicles = domain.quadrotor(), parameters_of(domain.nominal)
+        vehicles = jax.device_put(vehicles, NamedSharding(mesh, PartitionSpec()))
         # Chunks of one size share one compilation.
-        nominal = parameters_of(domain.nominal)
-        parts = [_fly_chunk(truth, nominal, chunk, steps, domain.nominal) for chunk in keys.reshape(-1, CHUNK)]
+        chunks = jax.device_put([*keys.reshape(-1, CHUNK)], NamedSharding(mesh, PartitionSpec(AXIS)))
+        parts = [_fly_chunk(*vehicles, chunk, steps, domain.nominal, mesh) for chunk in chunks]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
 @partial(kept_jit, compiler_options=FASTEST_COMPILE)
-def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle) -> Flights:
+def _fly_chunk(
+    truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle, mesh: Mesh
+) -> Flights:
+    """A flight for each key, an even share of them on each device of the mesh."""
     scale = pilot.scale_of(vehicle)
 
     def one_flight(key: PRNGKeyArray) -> Flights:
@@ -92,7 +101,8 @@ def _fly_chunk(truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], st
         altitudes = jax.vmap(rotor_altitudes, in_axes=(0, None))(states, truth.parameters.rotor_positions)
         return Flights(states, u, altitudes.min(axis=1), start)
 
-    return jax.vmap(one_flight)(keys)
+    split = PartitionSpec(AXIS)
+    return jax.shard_map(jax.vmap(one_flight), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)(keys)
 
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
