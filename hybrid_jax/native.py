@@ -20,6 +20,7 @@ from functools import cache
 from pathlib import Path
 
 import jax
+import numpy as np
 import platformdirs
 
 from hybrid_jax import runtime
@@ -33,6 +34,8 @@ HANDLERS = "normalised_layer_forward", "normalised_layer_backward", "rollout_for
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
+
+Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
 _REGISTERED: list[str] = []  # with XLA, which takes a name once
 _LOCK = threading.Lock()  # programs are traced in several threads
 
@@ -60,10 +63,13 @@ def register() -> None:
             _register()
 
 
-def call(handler: str, results: jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct], *arrays, **attributes):
-    """What a kernel makes of the arrays, whose shapes it does not check. Lanes under `vmap` are one call."""
+def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
+    """What a kernel makes of the arrays, whose number, type and shapes it does not check, and of some fixed numbers.
+
+    Lanes under `vmap` are one call.
+    """
     kernel = jax.ffi.ffi_call(f"{prefix()}{handler}", results, vmap_method="broadcast_all")
-    return kernel(*arrays, **attributes)
+    return kernel(*arrays, numbers=np.array(numbers, np.float32))
 
 
 def with_derivative(kernel: Callable, plain: Callable) -> Callable:

@@ -30,14 +30,14 @@ class Constants(NamedTuple):
     vehicle: Vehicle | None  # of the rigid body, if there is one
     epsilon: float  # of batch normalisation
 
-    def attributes(self) -> dict[str, np.ndarray | np.float32]:
-        """dt, and the vehicle as rigid_body.h has it."""
-        numbers = []
+    def numbers(self) -> list[float]:
+        """dt, ε, and the vehicle as rigid_body.h has it."""
+        numbers = [self.dt, self.epsilon]
         if (vehicle := self.vehicle) is not None:
             rotors = [(*position, spin) for position, spin in zip(vehicle.rotor_positions, vehicle.spin, strict=True)]
             body = vehicle.mass, vehicle.gravity, vehicle.inertia[2], vehicle.torque_coefficient
-            numbers = [*body, *np.ravel(rotors)]
-        return {"dt": np.float32(self.dt), "constants": np.array(numbers, np.float32)}
+            numbers += [*body, *np.ravel(rotors)]
+        return numbers
 
     def physics(self, theta: Float[Array, " 3"], x, u) -> Float[Array, "d b"] | float:
         """ẋ of the rigid body."""
@@ -162,8 +162,7 @@ def _forward(constants: Constants, *arrays: Array):
     results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
 
     def kernel(*arrays):
-        epsilon = np.float32(constants.epsilon)
-        return native.call("rollout_forward", results, *arrays, epsilon=epsilon, **constants.attributes())
+        return native.call("rollout_forward", results, *arrays, numbers=constants.numbers())
 
     def plain(*arrays):
         return [_plain_rollout(constants, *arrays), jnp.zeros(kept, x0.dtype)]
@@ -176,7 +175,7 @@ def _backward(constants: Constants, saved: tuple[Array, ...], d_states: Float[Ar
     results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
 
     def kernel(*arrays):
-        return tuple(native.call("rollout_backward", results, *arrays, **constants.attributes()))
+        return tuple(native.call("rollout_backward", results, *arrays, numbers=constants.numbers()))
 
     def plain(*arrays):
         *arrays, _, d_states = arrays
@@ -193,7 +192,7 @@ def _predict(constants: Constants, *arrays: Array) -> Float[Array, "n t d"]:
     states = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype)
 
     def kernel(*arrays):
-        return native.call("prediction", states, *arrays, **constants.attributes())
+        return native.call("prediction", states, *arrays, numbers=constants.numbers())
 
     return native.with_derivative(kernel, partial(_plain_prediction, constants))(*arrays)
 

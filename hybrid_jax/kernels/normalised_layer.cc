@@ -116,45 +116,47 @@ void Layer::to_rows(const float* w1t, float* d_w1) const {
 
 namespace {
 
-struct Sizes : Lanes {
-  int64_t m, b, h, d;
-  Sizes(const Array& w1, const Array& w2, const Array& columns) : b(columns.dimensions().back()) {
-    const auto in = w1.dimensions(), out = w2.dimensions();
-    m = in[in.size() - 1], h = in[in.size() - 2], d = out[out.size() - 2], lanes = w1.element_count() / (m * h);
-  }
+// The arguments of both kernels: of the way back, those from z on are what is kept and the derivative with respect to y.
+enum Argument { WEIGHT_IN, GAIN, SHIFT, WEIGHT_OUT, BIAS_OUT, Z, KEPT = BIAS_OUT, D_Y };
+
+struct Sizes {
+  int64_t m, b, h, d, lanes;
+  Sizes(Array w1, Array w2, Array columns)
+      : m(w1.size(-1)), b(columns.size(-1)), h(w1.size(-2)), d(w2.size(-2)), lanes(w1.count() / (m * h)) {}
 };
 
-// `kept` is z̃, and behind it 1 / √(mean (W₁ z̃)² + ε).
-ffi::Error forward_call(float epsilon, Array w1, Array gain, Array shift, Array w2, Array b2, Array z, Result out,
-                        Result kept) {
-  const Sizes s(w1, w2, z);
-  for (int64_t i = 0; i < s.lanes; ++i) {
-    const Layer layer(s.m, s.b, s.h, s.d, epsilon, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
-    float* centred = s.of(kept, i);
-    centre(s.of(z, i), centred, s.m, s.b);
-    layer.forward(centred, s.of(b2, i), centred + s.m * s.b, s.of(out, i));
-  }
-  return ffi::Error::Success();
+Layer layer_of(const Sizes& s, const Lane& lane, float epsilon) {
+  return Layer(s.m, s.b, s.h, s.d, epsilon, lane.argument(WEIGHT_IN), lane.argument(GAIN), lane.argument(SHIFT),
+               lane.argument(WEIGHT_OUT));
 }
 
-ffi::Error backward_call(Array w1, Array gain, Array shift, Array w2, Array kept, Array d_out, Result d_w1,
-                         Result d_gain, Result d_shift, Result d_w2, Result d_b2, Result d_z) {
-  const Sizes s(w1, w2, d_out);
+// Results: y; z̃ and behind it 1 / √(mean (W₁ z̃)² + ε). The number: ε.
+void normalised_layer_forward_call(const Call& call) {
+  const Sizes s(call.argument(WEIGHT_IN), call.argument(WEIGHT_OUT), call.argument(Z));
+  for (int64_t i = 0; i < s.lanes; ++i) {
+    const Lane lane{call, i, s.lanes};
+    float *y = lane.result(0), *centred = lane.result(1);
+    centre(lane.argument(Z), centred, s.m, s.b);
+    layer_of(s, lane, call.numbers()[0]).forward(centred, lane.argument(BIAS_OUT), centred + s.m * s.b, y);
+  }
+}
+
+// Results: the derivatives with respect to W₁, γ, β, W₂, b₂, z.
+void normalised_layer_backward_call(const Call& call) {
+  const Sizes s(call.argument(WEIGHT_IN), call.argument(WEIGHT_OUT), call.argument(D_Y));
   float* d_w1t = scratch(D_W1T, s.m * s.h);
   for (int64_t i = 0; i < s.lanes; ++i) {
-    const Layer layer(s.m, s.b, s.h, s.d, 0, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
-    const Gradients to{d_w1t, s.of(d_gain, i), s.of(d_shift, i), s.of(d_w2, i), s.of(d_b2, i)};
+    const Lane lane{call, i, s.lanes};
+    const Layer layer = layer_of(s, lane, 0);
+    const Gradients to{d_w1t, lane.result(GAIN), lane.result(SHIFT), lane.result(WEIGHT_OUT), lane.result(BIAS_OUT)};
     layer.clear(to);
-    const float* centred = s.of(kept, i);
-    layer.backward(centred, centred + s.m * s.b, s.of(d_out, i), to, s.of(d_z, i));
-    layer.to_rows(d_w1t, s.of(d_w1, i));
+    const float* centred = lane.argument(KEPT);
+    layer.backward(centred, centred + s.m * s.b, lane.argument(D_Y), to, lane.result(Z));
+    layer.to_rows(d_w1t, lane.result(WEIGHT_IN));
   }
-  return ffi::Error::Success();
 }
 
 }  // namespace
 
-#define SIX(KIND) .KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>()
-XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_forward, forward_call,
-                              ffi::Ffi::Bind().Attr<float>("epsilon") SIX(Arg).Ret<Array>().Ret<Array>());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(normalised_layer_backward, backward_call, ffi::Ffi::Bind() SIX(Arg) SIX(Ret));
+HANDLER(normalised_layer_forward)
+HANDLER(normalised_layer_backward)

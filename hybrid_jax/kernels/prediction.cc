@@ -12,15 +12,11 @@ namespace {
 
 constexpr int64_t BLOCK = 64;  // windows
 
-struct Sizes : Lanes {
-  int64_t windows, steps, d, r, h, m;
-  Sizes(const Array& w1, const Array& x0, const Array& u) {
-    const auto weights = w1.dimensions(), state = x0.dimensions(), input = u.dimensions();
-    h = weights[weights.size() - 2], m = weights[weights.size() - 1];
-    windows = state[state.size() - 2], d = state[state.size() - 1];
-    steps = input[input.size() - 2], r = input[input.size() - 1];
-    lanes = w1.element_count() / (h * m);
-  }
+struct Sizes {
+  int64_t windows, steps, d, r, h, m, lanes;
+  Sizes(Array w1, Array x0, Array u)
+      : windows(x0.size(-2)), steps(u.size(-2)), d(x0.size(-1)), r(u.size(-1)), h(w1.size(-2)), m(w1.size(-1)),
+        lanes(w1.count() / (h * m)) {}
   int64_t D() const { return (d + V - 1) / V * V; }  // numbers of ẋ in whole vectors
 };
 
@@ -44,7 +40,7 @@ struct Field {
   void operator()(const float* x, const float* u, float* slope) const {
     scale(0, s.d, x);
     for (int64_t i = 0; i < s.h; i += W) units(i);
-    const bool alone = constants.size() == 0;
+    const bool alone = constants.size == 0;
     transpose(rows, s.D(), alone ? slope : network, b, b, s.d);
     if (!alone) forward_columns(Body(theta, constants, x, u, b), network, slope);
   }
@@ -83,27 +79,30 @@ void predict_block(const Field& field, float dt, const float* x0, const float* u
   }
 }
 
-ffi::Error call(float dt, Constants constants, Array theta, Array offset, Array factor, Array w1, Array c, Array w2,
-                Array b2, Array x0, Array u, Result states) {
-  const Sizes s(w1, x0, u);
+enum Argument { THETA, OFFSET, FACTOR, WEIGHT_IN, BIAS_IN, WEIGHT_OUT, BIAS_OUT, X0, INPUTS };
+
+void predict_lane(const Sizes& s, const Lane& lane) {
+  const Numbers numbers = lane.call.numbers();  // dt, one that is not used, and the constants
   const int64_t b = std::min(BLOCK, s.windows);
-  for (int64_t i = 0; i < s.lanes; ++i) {
-    const Field field{s, b, s.of(theta, i), s.of(offset, i), s.of(factor, i), s.of(c, i), constants};
-    float* copy = scratch(W1, s.h * s.m);  // with room for a vector behind it
-    std::copy_n(s.of(w1, i), s.h * s.m, copy), std::copy_n(s.of(b2, i), s.d, field.bias);
-    transpose(copy, s.m, field.w1t, s.h, s.h, s.m);
-    transpose(s.of(w2, i), s.h, field.w2t, s.D(), s.d, s.h);
-    for (int64_t begin = 0; begin < s.windows; begin += b) {
-      const int64_t at = std::min(begin, s.windows - b);  // the last block overlaps the one before
-      predict_block(field, dt, s.of(x0, i) + at * s.d, s.of(u, i) + at * s.steps * s.r,
-                    s.of(states, i) + at * s.steps * s.d);
-    }
+  const Field field{s, b, lane.argument(THETA), lane.argument(OFFSET), lane.argument(FACTOR), lane.argument(BIAS_IN),
+                    numbers.from(2)};
+  float* copy = scratch(W1, s.h * s.m);  // with room for a vector behind it
+  std::copy_n(lane.argument(WEIGHT_IN), s.h * s.m, copy), std::copy_n(lane.argument(BIAS_OUT), s.d, field.bias);
+  transpose(copy, s.m, field.w1t, s.h, s.h, s.m);
+  transpose(lane.argument(WEIGHT_OUT), s.h, field.w2t, s.D(), s.d, s.h);
+  for (int64_t begin = 0; begin < s.windows; begin += b) {
+    const int64_t at = std::min(begin, s.windows - b);  // the last block overlaps the one before
+    predict_block(field, numbers[0], lane.argument(X0) + at * s.d, lane.argument(INPUTS) + at * s.steps * s.r,
+                  lane.result(0) + at * s.steps * s.d);
   }
-  return ffi::Error::Success();
+}
+
+// The result: the states.
+void prediction_call(const Call& call) {
+  const Sizes s(call.argument(WEIGHT_IN), call.argument(X0), call.argument(INPUTS));
+  for (int64_t i = 0; i < s.lanes; ++i) predict_lane(s, {call, i, s.lanes});
 }
 
 }  // namespace
 
-XLA_FFI_DEFINE_HANDLER_SYMBOL(prediction, call,
-                              ffi::Ffi::Bind().Attr<float>("dt").Attr<Constants>("constants").Arg<Array>().Arg<Array>()
-                                  .Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Arg<Array>().Ret<Array>());
+HANDLER(prediction)

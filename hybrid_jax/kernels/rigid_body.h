@@ -11,7 +11,7 @@ namespace {
 
 constexpr int STATE = 13, BEFORE_ROTORS = 4, OF_ROTOR = 3;
 
-using Constants = ffi::Span<const float>;  // m, g, Iz, c_m and, for each rotor, its x, y and spin; or nothing
+using Constants = Numbers;  // m, g, Iz, c_m and, for each rotor, its x, y and spin; or nothing
 
 // θ_p, and b columns of x (13, b) and u (rotors, b).
 struct Body {
@@ -20,8 +20,8 @@ struct Body {
   int64_t b, rotors;
 
   Body(const float* theta, Constants constants, const float* x, const float* u, int64_t b)
-      : ix(theta[0]), iy(theta[1]), k(theta[2]), constants(constants.begin()), x(x), u(u), b(b),
-        rotors((int64_t(constants.size()) - BEFORE_ROTORS) / OF_ROTOR) {}
+      : ix(theta[0]), iy(theta[1]), k(theta[2]), constants(constants.at), x(x), u(u), b(b),
+        rotors((constants.size - BEFORE_ROTORS) / OF_ROTOR) {}
 
   float mass() const { return constants[0]; }
   float gravity() const { return constants[1]; }

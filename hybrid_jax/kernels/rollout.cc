@@ -9,15 +9,11 @@
 
 namespace {
 
-struct Sizes : Lanes {
-  int64_t steps, d, r, b, h, m;
-  Sizes(const Array& w1, const Array& x0, const Array& u) {
-    const auto weights = w1.dimensions(), state = x0.dimensions(), input = u.dimensions();
-    h = weights[weights.size() - 2], m = weights[weights.size() - 1];
-    d = state[state.size() - 2], b = state[state.size() - 1];
-    steps = input[input.size() - 3], r = input[input.size() - 2];
-    lanes = x0.element_count() / (d * b);
-  }
+struct Sizes {
+  int64_t steps, d, r, b, h, m, lanes;
+  Sizes(Array w1, Array x0, Array u)
+      : steps(u.size(-3)), d(x0.size(-2)), r(u.size(-2)), b(x0.size(-1)), h(w1.size(-2)), m(w1.size(-1)),
+        lanes(x0.count() / (d * b)) {}
   int64_t state() const { return d * b; }
   int64_t input() const { return r * b; }
   int64_t kept() const { return state() + (h ? m * b + h : 0); }  // of an evaluation, see `Kept`
@@ -37,7 +33,7 @@ struct Field {
   const float *bias, *theta;
   Constants constants;
 
-  bool has_body() const { return constants.size() > 0; }
+  bool has_body() const { return constants.size > 0; }
   bool has_network() const { return s.h > 0; }
 
   // ẋ at kept.x, and the rest of what is kept.
@@ -100,40 +96,45 @@ void backward_lane(const Field& field, float dt, const float* u, float* all_kept
   }
 }
 
-ffi::Error forward_call(float dt, Constants constants, float epsilon, Array theta, Array w1, Array gain, Array shift,
-                        Array w2, Array bias, Array x0, Array u, Result states, Result kept) {
-  const Sizes s(w1, x0, u);
-  for (int64_t i = 0; i < s.lanes; ++i) {
-    const Layer layer(s.m, s.b, s.h, s.d, epsilon, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
-    const Field field{s, layer, s.of(bias, i), s.of(theta, i), constants};
-    forward_lane(field, dt, s.of(x0, i), s.of(u, i), s.of(states, i), s.of(kept, i));
-  }
-  return ffi::Error::Success();
+// The arguments of both kernels; the results of the way back are the derivatives with respect to those up to u.
+enum Argument { THETA, WEIGHT_IN, GAIN, SHIFT, WEIGHT_OUT, BIAS_OUT, X0, U, KEPT, D_STATES };
+// Their numbers: dt, ε, and the constants.
+enum Number { DT, EPSILON, CONSTANTS };
+
+Layer layer_of(const Sizes& s, const Lane& lane) {
+  return Layer(s.m, s.b, s.h, s.d, lane.call.numbers()[EPSILON], lane.argument(WEIGHT_IN), lane.argument(GAIN),
+               lane.argument(SHIFT), lane.argument(WEIGHT_OUT));
 }
 
-ffi::Error backward_call(float dt, Constants constants, Array theta, Array w1, Array gain, Array shift,
-                         Array w2, Array bias, Array x0, Array u, Array kept, Array d_states, Result d_theta,
-                         Result d_w1, Result d_gain, Result d_shift, Result d_w2, Result d_bias, Result d_x0,
-                         Result d_u) {
-  const Sizes s(w1, x0, u);
+Field field_of(const Sizes& s, const Lane& lane) {
+  return {s, layer_of(s, lane), lane.argument(BIAS_OUT), lane.argument(THETA), lane.call.numbers().from(CONSTANTS)};
+}
+
+// Results: the states, and what is kept.
+void rollout_forward_call(const Call& call) {
+  const Sizes s(call.argument(WEIGHT_IN), call.argument(X0), call.argument(U));
+  for (int64_t i = 0; i < s.lanes; ++i) {
+    const Lane lane{call, i, s.lanes};
+    forward_lane(field_of(s, lane), call.numbers()[DT], lane.argument(X0), lane.argument(U), lane.result(0),
+                 lane.result(1));
+  }
+}
+
+void rollout_backward_call(const Call& call) {
+  const Sizes s(call.argument(WEIGHT_IN), call.argument(X0), call.argument(U));
   float* d_w1t = scratch(D_W1T, s.m * s.h);
   for (int64_t i = 0; i < s.lanes; ++i) {
-    const Layer layer(s.m, s.b, s.h, s.d, 0, s.of(w1, i), s.of(gain, i), s.of(shift, i), s.of(w2, i));
-    const Field field{s, layer, s.of(bias, i), s.of(theta, i), constants};
-    const Gradients to{d_w1t, s.of(d_gain, i), s.of(d_shift, i), s.of(d_w2, i), s.of(d_bias, i)};
-    layer.clear(to), std::fill_n(s.of(d_theta, i), 3, 0.0f);
-    backward_lane(field, dt, s.of(u, i), s.of(kept, i), s.of(d_states, i), to, s.of(d_theta, i), s.of(d_x0, i),
-                  s.of(d_u, i));
-    layer.to_rows(d_w1t, s.of(d_w1, i));
+    const Lane lane{call, i, s.lanes};
+    const Field field = field_of(s, lane);
+    const Gradients to{d_w1t, lane.result(GAIN), lane.result(SHIFT), lane.result(WEIGHT_OUT), lane.result(BIAS_OUT)};
+    field.layer.clear(to), std::fill_n(lane.result(THETA), 3, 0.0f);
+    backward_lane(field, call.numbers()[DT], lane.argument(U), lane.argument(KEPT), lane.argument(D_STATES), to,
+                  lane.result(THETA), lane.result(X0), lane.result(U));
+    field.layer.to_rows(d_w1t, lane.result(WEIGHT_IN));
   }
-  return ffi::Error::Success();
 }
 
 }  // namespace
 
-#define EIGHT(KIND) .KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>() \
-                    .KIND<Array>().KIND<Array>().KIND<Array>().KIND<Array>()
-#define BOTH ffi::Ffi::Bind().Attr<float>("dt").Attr<Constants>("constants")
-XLA_FFI_DEFINE_HANDLER_SYMBOL(rollout_forward, forward_call,
-                              BOTH.Attr<float>("epsilon") EIGHT(Arg).Ret<Array>().Ret<Array>());
-XLA_FFI_DEFINE_HANDLER_SYMBOL(rollout_backward, backward_call, BOTH EIGHT(Arg).Arg<Array>().Arg<Array>() EIGHT(Ret));
+HANDLER(rollout_forward)
+HANDLER(rollout_backward)

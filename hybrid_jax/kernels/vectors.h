@@ -1,13 +1,11 @@
-// Vectors of V numbers in single precision, as GCC's vector extensions have them; what the kernels share.
+// Vectors of V numbers in single precision, as GCC's vector extensions have them.
 
 #pragma once
 
 #include <algorithm>
 #include <cstdint>
 
-#include "xla/ffi/api/ffi.h"
-
-namespace ffi = xla::ffi;
+#include "arrays.h"
 
 namespace {
 
@@ -20,16 +18,6 @@ constexpr int V = 8;
 #define INLINE inline __attribute__((always_inline))
 typedef float Vec __attribute__((vector_size(4 * V), aligned(4), may_alias));
 typedef int32_t Places __attribute__((vector_size(4 * V)));
-
-using Array = ffi::Buffer<ffi::F32>;
-using Result = ffi::ResultBuffer<ffi::F32>;
-
-// The lanes of a sweep, which are the first axes of all arrays of a call, and where the part of a lane begins.
-struct Lanes {
-  int64_t lanes;
-  float* of(const Array& all, int64_t lane) const { return all.typed_data() + lane * all.element_count() / lanes; }
-  float* of(Result& all, int64_t lane) const { return of(*all, lane); }
-};
 
 INLINE Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
 INLINE void store(float* to, Vec v) { *reinterpret_cast<Vec*>(to) = v; }

@@ -7,7 +7,6 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import native
@@ -86,7 +85,7 @@ def _forward_kernel(epsilon, *arrays):
     def kernel(weight_in, gain, shift, weight_out, bias_out, z):
         results = _shape(bias_out, z), jax.ShapeDtypeStruct((z.size + len(gain),), z.dtype)
         arrays = weight_in, gain, shift, weight_out, bias_out, z
-        return tuple(native.call("normalised_layer_forward", results, *arrays, epsilon=np.float32(epsilon)))
+        return tuple(native.call("normalised_layer_forward", results, *arrays, numbers=[epsilon]))
 
     def plain(*arrays):
         y, (*_, centred, _, inverse_deviation) = _forward(epsilon, RELU, *arrays)
