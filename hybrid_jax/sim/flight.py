@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, Key, PRNGKeyArray
+from jaxtyping import Array, Float, PRNGKeyArray, UInt
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
@@ -35,7 +35,7 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of
 
 # Bounds of a sound flight of the Iris; those of other vehicles are scaled.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
-RECIPE = 1  # increment when the same configuration no longer gives the same flights
+RECIPE = 1  # increment when the shared configuration no longer gives the shared flights
 SECONDS = 11.0  # length of a flight
 LOW = (0.5, 0.2)  # m, mean altitudes over a window below which ground effect adds at least 0.4 % and 2.6 % of thrust
 PERCENTILES = (1, 50, 99)
@@ -66,26 +66,30 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
     checks.count(f"intervals of {DT} s in seconds={seconds}", steps)
     cpus = jax.local_devices(backend="cpu")
     mesh = Mesh(np.array(cpus[: math.gcd(CHUNK, len(cpus))]), (AXIS,))
+    numbers = np.arange(-(-flights // CHUNK) * CHUNK, dtype=np.uint32).reshape(-1, CHUNK)
     with jax.enable_x64(True), jax.default_device(cpus[0]):
-        numbers = jnp.arange(-(-flights // CHUNK) * CHUNK)
-        keys = jax.vmap(partial(jax.random.fold_in, jax.device_put(key, cpus[0])))(numbers)
         vehicles = domain.quadrotor(), parameters_of(domain.nominal)
-        vehicles = jax.device_put(vehicles, NamedSharding(mesh, PartitionSpec()))
+        shared = jax.device_put((*vehicles, key), NamedSharding(mesh, PartitionSpec()))
         # Chunks of one size share one compilation.
-        chunks = jax.device_put([*keys.reshape(-1, CHUNK)], NamedSharding(mesh, PartitionSpec(AXIS)))
-        parts = [_fly_chunk(*vehicles, chunk, steps, domain.nominal, mesh) for chunk in chunks]
+        chunks = [jax.device_put(chunk, NamedSharding(mesh, PartitionSpec(AXIS))) for chunk in numbers]
+        parts = [_fly_chunk(shared, chunk, steps, domain.nominal, mesh) for chunk in chunks]
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
 @partial(kept_jit, compiler_options=FASTEST_COMPILE)
 def _fly_chunk(
-    truth: Quadrotor, nominal: Parameters, keys: Key[Array, " n"], steps: int, vehicle: Vehicle, mesh: Mesh
+    shared: tuple[Quadrotor, Parameters, PRNGKeyArray],
+    numbers: UInt[Array, " n"],
+    steps: int,
+    vehicle: Vehicle,
+    mesh: Mesh,
 ) -> Flights:
-    """A flight for each key, an even share of them on each device of the mesh."""
+    """The flights of these numbers, an even share of them on each device of the mesh."""
+    truth, nominal, key = shared
     scale = pilot.scale_of(vehicle)
 
-    def one_flight(key: PRNGKeyArray) -> Flights:
-        key_plan, key_start, key_clock = jax.random.split(key, 3)
+    def one_flight(number: UInt[Array, ""]) -> Flights:
+        key_plan, key_start, key_clock = jax.random.split(jax.random.fold_in(key, number), 3)
         plan = pilot.draw_plan(key_plan, steps, scale)
         x0 = pilot.starting_state(key_start, plan, scale)
         start = jax.random.uniform(key_clock, maxval=CLOCK)
@@ -102,7 +106,7 @@ def _fly_chunk(
         return Flights(states, u, altitudes.min(axis=1), start)
 
     split = PartitionSpec(AXIS)
-    return jax.shard_map(jax.vmap(one_flight), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)(keys)
+    return jax.shard_map(jax.vmap(one_flight), mesh=mesh, in_specs=split, out_specs=split, check_vma=False)(numbers)
 
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:

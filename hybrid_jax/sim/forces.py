@@ -11,6 +11,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax.rotation import body_z, normalise, rotate
@@ -54,7 +55,9 @@ def parameters_of(vehicle: Vehicle, drag_coefficient: float = DRAG_COEFFICIENT) 
         "rotor_positions": [(x, y, 0.0) for x, y in vehicle.rotor_positions],
         "drag_coefficient": drag_coefficient,
     }
-    return Parameters(*(jnp.asarray(numbers[field.name]) for field in fields(Parameters)))
+    # By NumPy first: JAX would compile a program for the conversion of each shape.
+    precision = jnp.result_type(float)
+    return Parameters(*(jnp.asarray(np.asarray(numbers[field.name], precision)) for field in fields(Parameters)))
 
 
 Force = Callable[[State, Input, Scalar, Parameters], Wrench]
