@@ -17,7 +17,7 @@ import pickle
 import sys
 import threading
 import types
-from collections.abc import Callable, Hashable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
@@ -70,6 +70,12 @@ def kept_jit(function: Callable[P, R], **options: Any) -> Callable[P, R]:
     return functools.update_wrapper(_Kept(function, options), function)  # pyright: ignore[reportReturnType]
 
 
+def prepare(kept: Callable[P, Any], *args: P.args, **kwargs: P.kwargs) -> None:
+    """Compile, or read, the program of what `kept_jit` returned for later calls with arguments of these shapes."""
+    if isinstance(kept, _Kept):
+        kept.bound(args, kwargs)
+
+
 class _Kept:
     """See `kept_jit`."""
 
@@ -77,12 +83,17 @@ class _Kept:
         self._name = function.__name__.strip("_")
         self._function, self._options = function, options
         self._jit = eqx.filter_jit(function, **options)
-        self._programs: dict[Hashable, Callable] = {}  # by what a call has in common with another one
+        self._programs: dict[Hashable, Callable | None] = {}  # by what a call has in common with another one
 
     def __call__(self, *args, **kwargs):
+        return self.bound(args, kwargs)()
+
+    def bound(self, args: tuple, kwargs: Mapping[str, Any]) -> Callable[[], Any]:
+        """The call with these arguments. It compiles nothing, unless the program cannot be kept."""
+        plain = functools.partial(self._jit, *args, **kwargs)
         leaves, structure = jax.tree.flatten((args, kwargs))
         if runtime.kept_programs() is None or jax.process_count() > 1 or any(map(checks.is_traced, leaves)):
-            return self._jit(*args, **kwargs)
+            return plain
         fixed = tuple(None if eqx.is_array(leaf) else (type(leaf), leaf) for leaf in leaves)
         arrays = [leaf for leaf in leaves if eqx.is_array(leaf)]
         key = structure, fixed, tuple(map(_kind, arrays)), _context()
@@ -90,16 +101,16 @@ class _Kept:
             if len(self._programs) == IN_MEMORY:
                 self._programs.pop(next(iter(self._programs)))
             self._programs[key] = self._program(leaves, structure)
-        return self._programs[key](args, kwargs, arrays)
+        program = self._programs[key]
+        return plain if program is None else functools.partial(program, arrays)
 
-    def _program(self, leaves: list, structure) -> Callable:
-        """A function of (args, kwargs, arrays): the program from its file, or compiled now."""
+    def _program(self, leaves: list, structure) -> Callable | None:
+        """The program from its file, or compiled now; None if it cannot be kept."""
         try:
             path = self._path(leaves, structure)
         except (pickle.PicklingError, AttributeError, TypeError):  # all that pickle raises
-            return lambda args, kwargs, arrays: self._jit(*args, **kwargs)
-        program = _read(path) or self._compile(leaves, structure, path)
-        return lambda args, kwargs, arrays: program(arrays)
+            return None
+        return _read(path) or self._compile(leaves, structure, path)
 
     def _path(self, leaves: list, structure) -> Path:
         shapes = jax.tree.unflatten(structure, [_kind(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves])

@@ -63,6 +63,14 @@ def test_a_kept_program_gives_the_same_result_without_tracing(folder):
     np.testing.assert_array_equal(again["x"], 2 * x)
 
 
+def test_a_program_that_was_prepared_is_not_traced_when_it_is_called(folder):
+    function, x = kept_jit(scaled), np.arange(3.0, dtype=np.float32)
+    programs.prepare(function, 2.0, x)
+    assert TRACED == [2.0]
+    np.testing.assert_array_equal(function(2.0, -x)["x"], -2 * x)
+    assert TRACED == [2.0]
+
+
 @pytest.mark.parametrize("other", [(3.0, np.ones(3, "f4")), (2.0, np.ones(4, "f4")), (2.0, np.ones(3, "i4"))])
 def test_other_arguments_ask_for_another_program(folder, other):
     called(2.0, np.ones(3, "f4"))

@@ -21,12 +21,13 @@ from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stages, stages_of
+from hybrid_jax import native
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.programs import kept_jit
+from hybrid_jax.programs import kept_jit, prepare
 from hybrid_jax.runtime import FAST_COMPILE, cores
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
@@ -73,9 +74,12 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
         # which must compile in the same order.
         pool = ThreadPoolExecutor(cores())
         stack.callback(pool.shutdown, cancel_futures=True)
-        for model in sources if jax.process_count() == 1 else ():
-            if not stages.knows(f"pre-training {model}"):
-                programs[model] = pool.submit(_compile, model, vehicle, config)
+        if jax.process_count() == 1:
+            for model in sources:
+                if not stages.knows(f"pre-training {model}"):
+                    programs[model] = pool.submit(_compile, model, vehicle, config)
+            for model in {*config.models} & {*SOLVED}:
+                programs[model] = pool.submit(_compile_solved, model, vehicle, config)
         source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
         target = flown(domain, target_splits(config), config, stages, config.target_flights)
         home = flown(SOURCE, {"test": SplitSpec(config.test, 100)}, config, stages)
@@ -86,6 +90,7 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
                 learned[start] = pretrained(start, vehicle, config, stages, source)
                 lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target, home))
             fields = learned[start].fields
+            wait([programs[model]] if model in programs else [])
             if model in SOLVED:
                 name = f"{FINE_TUNED} {model} {target.config['domain']}"
                 finals = {FINE_TUNED: solved(name, SOLVED[model], fields, config, stages, target)}
@@ -129,14 +134,18 @@ def solved(
     name: str, method: Method, fields: AbstractVectorField, config: Config, stages: Stages, target: Dataset
 ) -> Fit:
     """Each seed's field adapted to its target windows by a method, for each of the sizes, as the stage `name`."""
-    starts = lane(fields, np.tile(np.arange(config.seeds), config.draws))
 
     def of_size(size: int) -> Fit:
-        windows = windows_of(method, size, config)
-        return jax.device_get(_solved(method, settings(config), (starts, *windows), target.splits))
+        return jax.device_get(_solved(*solving(method, fields, size, config), target.splits))
 
     parts = stages.parts(name, [partial(of_size, size) for size in config.sizes])
     return jax.tree.map(lambda *parts: np.concatenate(parts), *parts)
+
+
+def solving(method: Method, fields: AbstractVectorField, size: int, config: Config) -> tuple[Method, Settings, Any]:
+    """The arguments of `_solved` for a size, but for the flights."""
+    starts = lane(fields, np.tile(np.arange(config.seeds), config.draws))
+    return method, settings(config), (starts, *windows_of(method, size, config))
 
 
 # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
@@ -224,6 +233,7 @@ def capacity(config: Config) -> tuple[int, int]:
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     """Compile all programs that training and testing a model will run; they depend on shapes only."""
+    native.status()  # first: training needs the kernels, and while GCC compiles them the flights' program is traced
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)
@@ -236,6 +246,14 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
         stopped = replace(states, status=np.full_like(states.status, STOPPED))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
+
+
+def _compile_solved(model: str, vehicle: Vehicle, config: Config) -> None:
+    """The same for a model that is not trained."""
+    fields = pretraining(source_of(model), fresh_fields(source_of(model), vehicle, config), config)[0].best
+    target = {name: placeholder(spec) for name, spec in target_splits(config).items()}
+    for size in config.sizes:
+        prepare(_solved, *solving(SOLVED[model], fields, size, config), target)
 
 
 def placeholder(spec: SplitSpec) -> Trajectories:

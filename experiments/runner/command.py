@@ -57,7 +57,7 @@ def run(
         gc.set_threshold(50_000, 20, 20)
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
-        # Compiles the kernels beside what comes first, if there are none yet: GCC takes some ten seconds.
+        # Compiles the kernels beside what comes first, if there are none yet: GCC takes some seconds.
         threading.Thread(target=native.status, daemon=True).start()
         signal.signal(signal.SIGTERM, _interrupt)
         main = hosts.is_main_process()  # it alone prints and writes

@@ -8,11 +8,14 @@ import equinox as eqx
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
+from experiments.paper import study
 from experiments.paper.conditions import adaptation, fresh_fields, measured, pretraining, settings, subsets
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
-from experiments.paper.study import drawn_splits, placeholder, pretrained
-from experiments.runner.stages import _identity
+from experiments.paper.lanes import fit_of
+from experiments.paper.study import SOLVED, drawn_splits, placeholder, pretrained, target_splits
+from experiments.runner.stages import _identity, stages_of
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.flight import SplitSpec
@@ -121,6 +124,29 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
     for each, factor in zip(rates, (1, 0.1, 0.01), strict=True):
         np.testing.assert_allclose(each.physics, factor * 1e-2, rtol=1e-6)
         np.testing.assert_allclose(each.residual, factor * 1e-4, rtol=1e-6)
+
+
+@pytest.mark.parametrize("model", SOLVED)
+def test_programs_compiled_ahead_are_those_that_solve(model, monkeypatch):
+    config, asked, ran = replace(SMALL, sizes=(100, 300)), [], []
+
+    def kind(*arguments):
+        leaves, structure = jax.tree.flatten(arguments)
+        return structure, [(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves]
+
+    def found(*arguments):
+        ran.append(kind(*arguments))
+        return np.zeros(config.seeds)
+
+    monkeypatch.setattr(study, "_solved", found)
+    monkeypatch.setattr(study, "prepare", lambda kept, *arguments: asked.append(kind(*arguments)))
+    study._compile_solved(model, IRIS, config)
+    start = study.source_of(model)
+    learned = fit_of(pretraining(start, fresh_fields(start, IRIS, config), config)[0])
+    target = Dataset({name: placeholder(spec) for name, spec in target_splits(config).items()}, {})
+    study.solved("", SOLVED[model], learned.fields, config, stages_of(config, Console(quiet=True)), target)
+    assert len(asked) == len(config.sizes)
+    assert asked == ran
 
 
 def test_subsets_are_nested_by_size_differ_by_seed_and_agree_between_models():
