@@ -35,7 +35,7 @@ CLOCK = 60.0  # s: flights start at a random time in [0, CLOCK), at any phase of
 
 # Bounds of a sound flight of the Iris; those of other vehicles are scaled.
 MAX_DISTANCE, MAX_ALTITUDE, MAX_SPEED = 20.0, 10.0, 15.0  # m from home in the plane, m, m/s
-RECIPE = 1  # increment when the shared configuration no longer gives the shared flights
+RECIPE = 1  # increment when the same configuration no longer gives the same flights
 SECONDS = 11.0  # length of a flight
 LOW = (0.5, 0.2)  # m, mean altitudes over a window below which ground effect adds at least 0.4 % and 2.6 % of thrust
 PERCENTILES = (1, 50, 99)
