@@ -150,7 +150,7 @@ def test_terms_and_learned_names_are_read(written):
 @pytest.mark.parametrize(
     ("above", "below", "message"),
     [
-        ('learn = ["mass"]', "", "learn must be names of"),
+        ('learn = ["weight"]', "", "learn must be names of"),
         ('learn = ["k", "k"]', "", "learn"),
         ('learn = ["k", "k_rotors"]', "", "both k and k_rotors"),
         ('learn = "k"', "", "learn must be a list"),

@@ -56,7 +56,7 @@ METHODS: Mapping[str, Method] = {
 
 # Of a rigid body's parameters, and of its disturbance; another class may have a class attribute `units` like this.
 UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
-UNITS |= {"centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
+UNITS |= {"mass": "kg", "centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
 UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s"}
 UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w{axis}]": "rad/s²" for axis in "xyz"}
 

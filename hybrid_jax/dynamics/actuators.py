@@ -24,7 +24,7 @@ from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
 NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay")  # of learnable parameters
 GIVES = ("speed", "thrust")
-EXCLUSIVE = {"curve": ("k", "k_rotors"), "time_constants": ("time_constant",)}
+EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
 SLOWEST_SHARE = 1e-3  # of the speed of hover: below, the root of a thrust has no slope
 Numbers = Array | np.ndarray
 QUICKEST = 1e-3  # s, least time constant that is learned

@@ -25,10 +25,10 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     q, v, omega = x[QUATERNION], x[VELOCITY], x[BODY_RATES]
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
-    acceleration = (thrust / vehicle.mass) * rotation.body_z(q) + gravity
+    acceleration = (thrust / constants["mass"][0]) * rotation.body_z(q) + gravity
     attitude = attitude_matrix(q)
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
-    force = _specific_force(vehicle, constants, velocity, torque)
+    force = _specific_force(constants, velocity, torque)
     faster = _velocity_error(constants, velocity, force)
     turning = rotation.derivative(q, omega)
     torque = _with_aerodynamic_moments(constants, velocity, omega, torque)
@@ -59,14 +59,14 @@ def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
     return k * total, torque
 
 
-def _specific_force(vehicle: Vehicle, constants: Constants, velocity, torque):
+def _specific_force(constants: Constants, velocity, torque):
     """Specific force without thrust in the body frame [m/s²]: drag, and a cable that the rotors' torque balances."""
-    drag, pull = constants["drag"], constants["cable_pull"]
+    drag, pull, (mass,) = constants["drag"], constants["cable_pull"], constants["mass"]
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
-        x, y, z = (-(factor / vehicle.mass) * part for factor, part in zip(drag, velocity, strict=True))
+        x, y, z = (-(factor / mass) * part for factor, part in zip(drag, velocity, strict=True))
     if is_present(pull):
-        x, y = x + pull[0] / vehicle.mass * torque[1], y - pull[1] / vehicle.mass * torque[0]
+        x, y = x + pull[0] / mass * torque[1], y - pull[1] / mass * torque[0]
     return [x, y, z]
 
 

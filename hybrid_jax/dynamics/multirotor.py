@@ -41,7 +41,7 @@ class Multirotor(AbstractRigidBody):
         terms: nominal values; those that are zero and not learned cost nothing.
 
     Raises:
-        ValueError: an unknown parameter name, both k and k_rotors, or no vehicle or terms.
+        ValueError: an unknown parameter name, two that only their ratio or product tells, or no vehicle or terms.
     """
 
     deviations: dict[str, Float[Array, "..."]]

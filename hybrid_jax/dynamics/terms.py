@@ -9,7 +9,7 @@ from hybrid_jax import checks
 from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
 SPEED, RATE = 1.0, 10.0  # m/s and rad/s at which a coefficient of 1 weighs as much as the vehicle
-POSITIVE = {"Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
+POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,), "torque_coefficient": ()}
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
@@ -51,6 +51,8 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
         raise ValueError(f"learn must not name a parameter twice, got {', '.join(learn)}")
     if {"k", "k_rotors"} <= set(learn):
         raise ValueError("learn must not name both k and k_rotors: a factor common to all rotors is in both")
+    if "mass" in learn and (other := {"k", "k_rotors"} & set(learn)):
+        raise ValueError(f"learn must not name both mass and {other.pop()}: accelerations tell their ratio")
 
 
 def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:
@@ -62,7 +64,7 @@ def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...
     """The nominal value of everything in `SHAPES`, number by number; SI units."""
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
-    own |= {"torque_coefficient": (vehicle.torque_coefficient,)}
+    own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 

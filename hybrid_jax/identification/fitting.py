@@ -36,7 +36,7 @@ from hybrid_jax.identification.prediction import Problem, all_errors, normal_equ
 ROUNDS = 3  # of weights
 CLUSTER = 2.0  # s of windows that are taken as one observation,
 FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many windows
-OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "k", "k_rotors", "drag"}
+OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
 NO_EFFECT = 1.0  # information of a parameter that is not told: its standard error is its own size, or a factor of e

@@ -11,6 +11,7 @@ from jax.flatten_util import ravel_pytree
 from matrices import newton_euler
 
 from hybrid_jax import Hybrid, load, rigid_body, rotation, save
+from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.base import Frozen, infer_batch, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import disturbed
@@ -19,11 +20,12 @@ from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
 
 pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
 
-ALL = tuple(name for name in SHAPES if name != "k")
+ALL = tuple(name for name in SHAPES if name not in ("mass", "k"))
 KNOWN = Terms(
     torque_gain=(0.9, 1.1, 0.8),
     centre_of_mass=(0.01, -0.02),
@@ -172,6 +174,24 @@ def test_what_is_learned_goes_with_the_vehicle_to_another():
     assert heavy.vehicle.mass == 2.0
 
 
+def test_a_learned_mass_is_that_of_a_heavier_vehicle():
+    heavier = replace(IRIS, mass=1.3 * IRIS.mass)
+    learned = Multirotor({"mass": jnp.log(1.3)}, IRIS, KNOWN)
+    np.testing.assert_allclose(learned.theta()["mass"], heavier.mass)
+    x, u = samples()
+    expected = one_by_one(multirotor(heavier, (), KNOWN), x, u)
+    np.testing.assert_allclose(one_by_one(learned, x, u), expected, rtol=1e-13, atol=1e-13)
+
+
+def test_the_mass_of_a_payload_is_found_where_the_thrust_is_known():
+    x0, u = samples(20)
+    u = jnp.broadcast_to(u.T[:, None], (20, 10, 4))
+    loaded = multirotor(replace(IRIS, mass=1.2 * IRIS.mass), ())
+    windows = Trajectories(x0.T, u, rollout_batch(loaded, x0.T, u, 0.01), 0.01)
+    found = fit_least_squares(multirotor(IRIS, ("mass",)), windows).field
+    np.testing.assert_allclose(found.theta()["mass"], 1.2 * IRIS.mass, rtol=1e-6)
+
+
 def test_no_torque_without_gain():
     x, u = samples()
     still = x.at[BODY_RATES].set(0.0)
@@ -180,7 +200,13 @@ def test_no_torque_without_gain():
 
 
 @pytest.mark.parametrize(
-    ("learn", "said"), [(("mass",), "'mass'"), (("k", "k_rotors"), "both k and k_rotors"), (("Ix", "Ix"), "twice")]
+    ("learn", "said"),
+    [
+        (("weight",), "'weight'"),
+        (("k", "k_rotors"), "both k and k_rotors"),
+        (("k_rotors", "mass"), "both mass and k_rotors"),
+        (("Ix", "Ix"), "twice"),
+    ],
 )
 def test_what_cannot_be_learned_is_refused(learn, said):
     with pytest.raises(ValueError, match=said):

@@ -59,7 +59,7 @@ def body():
 
 @cache
 def per_rotor():
-    return moved(multirotor(IRIS, tuple(name for name in SHAPES if name != "k"), TERMS))
+    return moved(multirotor(IRIS, tuple(name for name in SHAPES if name not in ("mass", "k")), TERMS))
 
 
 def with_norm(norm):
