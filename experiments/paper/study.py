@@ -78,8 +78,9 @@ def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: C
             for model in sources:
                 if not stages.knows(f"pre-training {model}"):
                     programs[model] = pool.submit(_compile, model, vehicle, config)
-            for model in {*config.models} & {*SOLVED}:
-                programs[model] = pool.submit(_compile_solved, model, vehicle, config)
+            for model in config.models:
+                if model in SOLVED:
+                    programs[model] = pool.submit(_compile_solved, model, vehicle, config)
         source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
         target = flown(domain, target_splits(config), config, stages, config.target_flights)
         home = flown(SOURCE, {"test": SplitSpec(config.test, 100)}, config, stages)
