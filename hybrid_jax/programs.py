@@ -89,7 +89,7 @@ class _Kept:
         return self.bound(args, kwargs)()
 
     def bound(self, args: tuple, kwargs: Mapping[str, Any]) -> Callable[[], Any]:
-        """The call with these arguments. It compiles nothing, unless the program cannot be kept."""
+        """The call with these arguments. Its program is compiled or read now; one that cannot be kept, in the call."""
         plain = functools.partial(self._jit, *args, **kwargs)
         leaves, structure = jax.tree.flatten((args, kwargs))
         if runtime.kept_programs() is None or jax.process_count() > 1 or any(map(checks.is_traced, leaves)):

@@ -82,17 +82,17 @@ void predict_block(const Field& field, float dt, const float* x0, const float* u
 enum Argument { THETA, OFFSET, FACTOR, WEIGHT_IN, BIAS_IN, WEIGHT_OUT, BIAS_OUT, X0, INPUTS };
 
 void predict_lane(const Sizes& s, const Lane& lane) {
-  const Numbers numbers = lane.call.numbers();  // dt, one that is not used, and the constants
+  const Numbers numbers = lane.call.numbers();
   const int64_t b = std::min(BLOCK, s.windows);
   const Field field{s, b, lane.argument(THETA), lane.argument(OFFSET), lane.argument(FACTOR), lane.argument(BIAS_IN),
-                    numbers.from(2)};
+                    numbers.from(CONSTANTS)};
   float* copy = scratch(W1, s.h * s.m);  // with room for a vector behind it
   std::copy_n(lane.argument(WEIGHT_IN), s.h * s.m, copy), std::copy_n(lane.argument(BIAS_OUT), s.d, field.bias);
   transpose(copy, s.m, field.w1t, s.h, s.h, s.m);
   transpose(lane.argument(WEIGHT_OUT), s.h, field.w2t, s.D(), s.d, s.h);
   for (int64_t begin = 0; begin < s.windows; begin += b) {
     const int64_t at = std::min(begin, s.windows - b);  // the last block overlaps the one before
-    predict_block(field, numbers[0], lane.argument(X0) + at * s.d, lane.argument(INPUTS) + at * s.steps * s.r,
+    predict_block(field, numbers[DT], lane.argument(X0) + at * s.d, lane.argument(INPUTS) + at * s.steps * s.r,
                   lane.result(0) + at * s.steps * s.d);
   }
 }

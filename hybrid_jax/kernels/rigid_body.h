@@ -11,6 +11,7 @@ namespace {
 
 constexpr int STATE = 13, BEFORE_ROTORS = 4, OF_ROTOR = 3;
 
+enum Number { DT, EPSILON, CONSTANTS };  // the numbers of a call begin with dt and ε
 using Constants = Numbers;  // m, g, Iz, c_m and, for each rotor, its x, y and spin; or nothing
 
 // θ_p, and b columns of x (13, b) and u (rotors, b).

@@ -98,8 +98,6 @@ void backward_lane(const Field& field, float dt, const float* u, float* all_kept
 
 // The arguments of both kernels; the results of the way back are the derivatives with respect to those up to u.
 enum Argument { THETA, WEIGHT_IN, GAIN, SHIFT, WEIGHT_OUT, BIAS_OUT, X0, U, KEPT, D_STATES };
-// Their numbers: dt, ε, and the constants.
-enum Number { DT, EPSILON, CONSTANTS };
 
 Layer layer_of(const Sizes& s, const Lane& lane) {
   return Layer(s.m, s.b, s.h, s.d, lane.call.numbers()[EPSILON], lane.argument(WEIGHT_IN), lane.argument(GAIN),
