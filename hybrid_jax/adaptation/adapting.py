@@ -182,7 +182,7 @@ def adapt(
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     check_windows(field, held_out, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
-    for data in (windows, held_out):
+    for data in (windows,) if validation is None else (windows, validation):
         checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
     exact, size = getattr(method, "has_intervals", False), _size(field)
     if exact and size > NAMED:
@@ -194,16 +194,20 @@ def adapt(
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
+    mse = partial(_mse, solver=compact(settings.solver))
+    before = mse(field, windows)  # its program is read, and SciPy's functions imported, while the device solves
+    import scipy.special  # noqa: F401
+
     adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
     choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
     exact = exact and int(solution.status) != DIVERGED and choice.get("chosen") not in NETWORKS
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
-    found, mse = disturbance_of(adapted), partial(_mse, solver=compact(settings.solver))
+    found = disturbance_of(adapted)
     return Adaptation(
         field=adapted,
         method=name,
         disturbance=None if found is None else np.asarray(found.vector(windows.x0.shape[-1])),
-        mse_before=float(mse(field, windows)),
+        mse_before=float(before),
         mse_after=float(mse(adapted, windows)),
         windows=len(windows),
         steps=int(solution.steps),
