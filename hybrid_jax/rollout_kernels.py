@@ -22,6 +22,8 @@ from hybrid_jax.networks.normalised_layer import RELU, plain_layer
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
+Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
+
 
 class Constants(NamedTuple):
     """What a kernel is compiled for besides shapes."""
@@ -52,7 +54,7 @@ class KernelField(NamedTuple):
     physics: RigidBody | None
     network: ResidualNetwork | None
 
-    def serves(self, x0: Array | np.ndarray, u: Array | np.ndarray, windows_axis: int) -> bool:
+    def serves(self, x0: Shaped, u: Shaped, windows_axis: int) -> bool:
         """Whether the kernels are for these arrays, of which they check no shapes themselves."""
         if (x0.ndim, u.ndim) != (2, 3) or x0.shape[windows_axis] != u.shape[windows_axis]:
             return False
@@ -86,11 +88,13 @@ class KernelField(NamedTuple):
 
     def predict(self, x0: Float[Array, "n d"], u: Float[Array, "n t m"], dt: float) -> Float[Array, "n t d"]:
         """In inference mode."""
-        network = self.network
-        assert network is not None
-        assert isinstance(network.norm, BatchNorm | Bias)
-        layers = *network.norm.fold(network.weight_in), *self._output_layer(network, x0.T)
-        return _predict(self._constants(dt), self._theta(), *_input_scaling(network, x0.shape[1]), *layers, x0, u)
+        d, m, network = x0.shape[1], x0.shape[1] + u.shape[2], self.network
+        layers = [jnp.zeros(shape, jnp.float32) for shape in (m, m, (0, m), 0, (d, 0), d)]
+        if network is not None:
+            assert isinstance(network.norm, BatchNorm | Bias)
+            hidden, output = network.norm.fold(network.weight_in), self._output_layer(network, x0.T)
+            layers = [*_input_scaling(network, d), *hidden, *output]
+        return _predict(self._constants(dt), self._theta(), *layers, x0, u)
 
     def _constants(self, dt: float, epsilon: float = 0.0) -> Constants:
         return Constants(float(dt), self.physics.vehicle if self.physics else None, epsilon)
@@ -120,9 +124,9 @@ def training_kernel(field: AbstractVectorField, solver: Solver, substeps: int = 
 
 
 def prediction_kernel(field: AbstractVectorField, solver: Solver) -> KernelField | None:
-    """The same for `KernelField.predict`. Physics alone is not for it: XLA makes one kernel of that."""
+    """The same for `KernelField.predict`."""
     own = _kernel_field(field, solver, 1)
-    return own if own and own.network and type(own.network.norm) in (BatchNorm, Bias) else None
+    return own if own and (own.network is None or type(own.network.norm) in (BatchNorm, Bias)) else None
 
 
 def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> KernelField | None:

@@ -24,6 +24,7 @@ from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.sim.flight import permutation
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
@@ -132,7 +133,7 @@ def subsets(config: Config) -> Int[np.ndarray, "runs pool"]:
     if config.draw == "random":
         keys = [_key(seed, SUBSET) for seed in range(config.seeds)]
         keys = [jax.random.fold_in(key, draw) if draw else key for draw in range(config.draws) for key in keys]
-        return stack([jax.random.permutation(key, config.pooled()) for key in keys])
+        return stack([permutation(key, config.pooled()) for key in keys])
     index = np.arange(config.pooled()).reshape(config.draws, config.flown_each(), config.windows_each())
     # With --flights, one of each flight in turn; else one flight after the other.
     index = index.swapaxes(1, 2) if config.flights else index
@@ -185,7 +186,7 @@ def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> Fit
     return jax.device_get(_begun(fields, seeds, purpose))
 
 
-@kept_jit
+@partial(kept_jit, compiler_options=FASTEST_COMPILE)
 def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: int) -> FitState:
     return eqx.filter_vmap(lambda field, seed: fitting.start(field, _key(seed, purpose)))(fields, seeds)
 

@@ -281,7 +281,7 @@ QUICK = replace(
     source_train=1000, validation=200, test=200, max_epochs=200,
 )  # fmt: skip
 SMOKE = replace(
-    PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=10, batch_size=20, max_epochs=3,
-    hidden=8,
+    PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=20, batch_size=20, max_epochs=3,
+    hidden=32,
 )  # fmt: skip
 PRESETS = {"paper": PAPER, "quick": QUICK, "smoke": SMOKE}

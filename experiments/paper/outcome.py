@@ -8,7 +8,6 @@ import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 
-import hybrid_jax
 from experiments.paper.claims import COMPARISON, claims
 from experiments.paper.config import AdaptationConfig, Config
 from experiments.paper.figures import scores, theta
@@ -27,7 +26,8 @@ from experiments.runner.run_record import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.integrate import compact
 from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.rollouts import predict
+from hybrid_jax.runtime import FASTEST_COMPILE
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 from hybrid_jax.sweep import hosts
@@ -166,13 +166,13 @@ def paths(title: str, found: Study) -> Figure:
     sizes = {row["n_train"] for row in tuned[0].rows}
     shown = {100, 500, 1000} & sizes or set(sorted(sizes)[:3])
     # Not `Model.predict`, which raises if a prediction diverges.
-    predict = kept_jit(hybrid_jax.rollout_batch, compiler_options=FAST_COMPILE)
+    predicting = kept_jit(predict, compiler_options=FASTEST_COMPILE)
     start = np.asarray(test.x0)[:, None]
     predicted: dict[int, dict[str, np.ndarray]] = {n: {} for n in sorted(shown)}
     for lanes in tuned:
         for i, row in enumerate(lanes.rows):
             if row["seed"] == lanes.rows[0]["seed"] and row["n_train"] in shown:
-                states = np.asarray(predict(lane(lanes.fields, i), test.x0, test.u, test.dt, compact(None)))
+                states = np.asarray(predicting(lane(lanes.fields, i), test.x0, test.u, test.dt, compact(None)))
                 predicted[row["n_train"]][lanes.model] = np.concatenate([start, states], axis=1)
     truth = np.concatenate([start, np.asarray(test.x)], axis=1)
     first = next(iter(predicted[min(shown)].values()))

@@ -1,7 +1,7 @@
-// Windows predicted by RK4 with a trained network, in one call: `_predict` of rollout_kernels.py.
+// Windows predicted by RK4 with a trained model, in one call: `_predict` of rollout_kernels.py.
 //
-//   ẋ = f_p(x, u) + W₂ max(W₁ z + c, 0) + b₂, z = ([x, u] − offset) slope: a rigid body, or nothing, plus one hidden
-//   layer with ReLU.
+//   ẋ = f_p(x, u) + W₂ max(W₁ z + c, 0) + b₂, z = ([x, u] − offset) factor: a rigid body, or nothing, plus one hidden
+//   layer with ReLU, or nothing.
 //
 // A block of windows goes through all of its intervals before the next one begins, so that it stays in the first cache.
 
@@ -16,7 +16,7 @@ struct Sizes {
   int64_t windows, steps, d, r, h, m, lanes;
   Sizes(Array w1, Array x0, Array u)
       : windows(x0.size(-2)), steps(u.size(-2)), d(x0.size(-1)), r(u.size(-1)), h(w1.size(-2)), m(w1.size(-1)),
-        lanes(w1.count() / (h * m)) {}
+        lanes(x0.count() / (windows * d)) {}
   int64_t D() const { return (d + V - 1) / V * V; }  // numbers of ẋ in whole vectors
 };
 
@@ -38,11 +38,16 @@ struct Field {
 
   // ẋ at x; that part of z which is of u is there already.
   void operator()(const float* x, const float* u, float* slope) const {
-    scale(0, s.d, x);
-    for (int64_t i = 0; i < s.h; i += W) units(i);
-    const bool alone = constants.size == 0;
-    transpose(rows, s.D(), alone ? slope : network, b, b, s.d);
-    if (!alone) forward_columns(Body(theta, constants, x, u, b), network, slope);
+    const bool has_body = constants.size > 0;
+    float* from_network = has_body ? network : slope;
+    if (s.h > 0) {
+      scale(0, s.d, x);
+      for (int64_t i = 0; i < s.h; i += W) units(i);
+      transpose(rows, s.D(), from_network, b, b, s.d);
+    } else {
+      std::fill_n(from_network, s.d * b, 0.0f);
+    }
+    if (has_body) forward_columns(Body(theta, constants, x, u, b), from_network, slope);
   }
 
   void units(int64_t i) const {

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
-from jaxtyping import Array, Float, PRNGKeyArray, UInt
+from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
@@ -181,8 +181,23 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
     if spec.flights:
         return concatenate(parts[: spec.flights]), tally
     windows = concatenate(parts)
-    order = np.asarray(jax.random.permutation(key_order, len(windows)))[: spec.windows]
-    return windows[order], tally
+    return windows[permutation(key_order, len(windows))[: spec.windows]], tally
+
+
+def permutation(key: PRNGKeyArray, n: int) -> Int[np.ndarray, " n"]:
+    """`jax.random.permutation(key, n)`, for every n of which JAX compiles two programs, in half a second."""
+    order = np.arange(n)
+    for _ in range(math.ceil(3 * math.log(max(n, 1)) / math.log(2**32 - 1))):
+        # The first numbers are the same however many are drawn (jax_threefry_partitionable).
+        key, drawn = _drawn(key, max(2 ** (n - 1).bit_length(), 1024))
+        order = order[np.argsort(np.asarray(drawn)[:n], kind="stable")]
+    return order
+
+
+@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+def _drawn(key: PRNGKeyArray, n: int) -> tuple[PRNGKeyArray, UInt[Array, " n"]]:
+    key, own = jax.random.split(key)
+    return key, jax.random.bits(own, (n,), jnp.uint32)
 
 
 def cut(flights: Flights, steps: int, tally: Counter[str], vehicle: Vehicle = IRIS) -> list[Trajectories]:

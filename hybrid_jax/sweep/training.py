@@ -21,7 +21,7 @@ from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig
-from hybrid_jax.training.objective import Settings, check_minibatch
+from hybrid_jax.training.objective import Settings, check_minibatch, compiler_options
 from hybrid_jax.trajectories import Trajectories
 
 FIRST_BLOCK = 5  # epochs; later blocks are sized by the clock
@@ -77,7 +77,8 @@ def sweep(
     _check(plans, *shared, settings)
     plans, shared = _padded(plans, shared, min_capacity[1])
     shapes = _shapes(lane((states, plans), 0), shared)
-    block = _block(settings, width, max(count(states), min_capacity[0]), shapes)
+    options = compiler_options(lane(states.field, 0), shared[0], settings)
+    block = _block(settings, tuple(options.items()), width, max(count(states), min_capacity[0]), shapes)
     costs = np.asarray(plans.n_train) + len(shared[1]) / 8  # a validation window costs an eighth of a training window
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
@@ -127,8 +128,8 @@ def _shapes(*trees: PyTree) -> tuple:
 
 # A later sweep of the same shapes compiles nothing. One map per shape, so that unused programs are freed.
 @lru_cache(PROGRAMS)
-def _block(settings: Settings, width: int | None, lanes: int, shapes: tuple) -> LaneMap:
-    return LaneMap(partial(_trained, settings), width, min_capacity=lanes)
+def _block(settings: Settings, options: tuple, width: int | None, lanes: int, shapes: tuple) -> LaneMap:
+    return LaneMap(partial(_trained, settings), width, min_capacity=lanes, compiler=dict(options))
 
 
 def _trained(settings: Settings, lane: tuple[FitState, RunConfig, Int[Array, ""]], train, validation) -> FitState:

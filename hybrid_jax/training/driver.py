@@ -21,9 +21,10 @@ from hybrid_jax.integrate import checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.programs import kept_jit
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
-from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch
+from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 WEIGHT = 1e-3  # λ, where none is given
@@ -172,12 +173,13 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
     # The default is not an argument: an optimiser holds closures, with which a program is not kept.
     chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}
+    train = _train_by_kernels if compiler_options(state.field, data, settings) else _train
     with _reporting(progress, int(plan.max_epochs)) as report:
         try:
             while int(state.status) == RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
                 until = jnp.asarray(first + most, jnp.int32)  # an array, so that one program serves all blocks
-                after, rows = _train(state, plan, data, validated_on, settings, until, losses=empty, **chosen)
+                after, rows = train(state, plan, data, validated_on, settings, until, losses=empty, **chosen)
                 state, losses = after, [*losses, np.asarray(rows)[: int(after.epoch) - first]]
                 report(int(state.epoch), state)
                 most = int(np.clip(most * BLOCK_SECONDS / (time.perf_counter() - began), 1, min(BLOCK, 4 * most)))
@@ -191,7 +193,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     return result
 
 
-_train = kept_jit(fitting.run)
+_train, _train_by_kernels = kept_jit(fitting.run), kept_jit(fitting.run, compiler_options=FAST_COMPILE)
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once

@@ -4,6 +4,7 @@ from dataclasses import dataclass, field
 from typing import Any, Protocol
 
 import diffrax
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
@@ -12,7 +13,9 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running
 from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.integrate import RK4, along
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.rollout_kernels import training_kernel
 from hybrid_jax.rollouts import rollout_minibatch
+from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import Minibatch, Regulariser
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -93,3 +96,12 @@ def check_minibatch(field: Learner, settings: Settings) -> None:
     if settings.batch_size < 2 and batch_norms(field):
         size = settings.batch_size
         raise ValueError(f"settings.batch_size must be at least 2 where the field holds a BatchNorm, got {size}")
+
+
+def compiler_options(field: Learner, data: PyTree, settings: Settings) -> dict[str, bool | int]:
+    """XLA's options for a training program: the fast ones where kernels of `hybrid_jax.native` do most of the work."""
+    own = training_kernel(field, settings.solver)
+    if own is None or not isinstance(data, Trajectories):
+        return {}
+    x0, u = (jax.ShapeDtypeStruct((settings.batch_size, *a.shape[1:]), a.dtype) for a in (data.x0, data.u))
+    return FAST_COMPILE if own.serves(x0, u, windows_axis=0) else {}

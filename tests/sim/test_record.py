@@ -10,7 +10,7 @@ from experiments import make_flights
 from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import flight as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.flight import Flights, SplitSpec, cut, fly, gone_wrong, make_dataset
+from hybrid_jax.sim.flight import Flights, SplitSpec, cut, fly, gone_wrong, make_dataset, permutation
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 
@@ -96,6 +96,12 @@ def test_the_pilot_stays_in_bounds_in_wind_it_does_not_know():
     assert flights.inputs.min() >= 0
     assert flights.inputs.max() <= IRIS.max_rotor_speed
     assert (flights.lowest_rotor < 0).mean() < 1e-3
+
+
+@pytest.mark.parametrize("n", [0, 1, 2, 1000, 1625, 1626, 7040])
+def test_an_order_is_that_of_jax(n):  # two rounds of sorting from 1626 on
+    key = jax.random.key(n)
+    np.testing.assert_array_equal(permutation(key, n), jax.random.permutation(key, n))
 
 
 def test_a_flight_does_not_depend_on_how_many_are_flown():
