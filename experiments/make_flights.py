@@ -11,6 +11,7 @@ from rich.console import Console
 from experiments.render import picture
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
+from experiments.runner.options import CountFromZero, check_numbers
 from experiments.runner.progress import Line
 from hybrid_jax.io.archive import digest
 from hybrid_jax.io.datasets import Dataset, load_dataset, save_dataset
@@ -34,18 +35,21 @@ class Options:
     with side wind."""
     out: Path
     """File to write (.npz)."""
-    seed: int = 0
+    seed: CountFromZero = 0
     """Seed of everything random."""
-    train: int = 1000
+    train: CountFromZero = 1000
     """Windows of 0.1 s (10 steps) to learn from; 0 leaves a split out."""
-    validation: int = 1000
+    validation: CountFromZero = 1000
     """Windows of 0.1 s."""
-    test: int = 0
+    test: CountFromZero = 0
     """Windows of 1 s (100 steps)."""
-    test_with_past: int = 0
+    test_with_past: CountFromZero = 0
     """Windows of 0.2 s: 10 steps of past and the 10 to predict."""
     picture: Path | None = None
     """Also render the vehicle to this PNG (needs the system package libosmesa6 or libegl1)."""
+
+    def __post_init__(self):
+        check_numbers("--", self)
 
     def splits(self) -> dict[str, SplitSpec]:
         steps = {"train": 10, "validation": 10, "test": 100, "test_with_past": 20}

@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import gc
 import io
+import re
 import signal
 import sys
 import threading
@@ -86,7 +87,7 @@ def call(
 ) -> None:
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     with _exit_codes(name, "interrupted, nothing was written"):
-        command(tyro.cli(kind, prog=f"python -m experiments.{name}", description=kind.__doc__, args=arguments))
+        command(_parsed(partial(tyro.cli, kind, description=kind.__doc__), name, arguments))
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
@@ -109,10 +110,16 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
     kind = type(presets[chosen])
     description = "\n\n".join([about, *(each.__doc__ or "" for each in kind.__mro__ if issubclass(each, Run))])
-    program, output = f"python -m experiments.{name}", io.StringIO()
+    cli = partial(tyro.cli, kind, description=description, default=presets[chosen])
+    return _parsed(cli, name, arguments)
+
+
+def _parsed(cli: Callable[..., Options], name: str, arguments: Sequence[str] | None) -> Options:
+    """The options that a command line gives; ValueError if it gives none."""
+    output = io.StringIO()
     try:
         with contextlib.redirect_stderr(output):
-            return tyro.cli(kind, prog=program, description=description, args=arguments, default=presets[chosen])
+            return cli(prog=f"python -m experiments.{name}", args=arguments)
     except SystemExit as stop:
         if not stop.code:
             raise  # --help
@@ -150,10 +157,11 @@ def _renamed(argument: str) -> str:
 
 
 def _message(box: str) -> str:
-    """The text in the first part of the box that tyro draws around an error."""
+    """The text in the first part of the box that tyro draws around an error, without the name of our class."""
     lines = [line.strip("│ ") for line in box.splitlines()]
     rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰"))]
-    return " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+    text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+    return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
 
 
 def _interrupt(number: int, frame) -> None:
