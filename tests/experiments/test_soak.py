@@ -53,6 +53,6 @@ def test_memory_is_flat_after_the_warm_up():
 def test_programs_of_old_shapes_are_freed():
     """Otherwise each shape would leave a compiled program behind."""
     settings = Settings(batch_size=7)
-    kept = [weakref.ref(_block(settings, 1, 2, (shape,))) for shape in range(PROGRAMS + 1)]
+    kept = [weakref.ref(_block(settings, (), 1, 2, (shape,))) for shape in range(PROGRAMS + 1)]
     gc.collect()  # a map and its compiled function refer to each other
     assert [map_() is None for map_ in kept] == [True] + [False] * PROGRAMS
