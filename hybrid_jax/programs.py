@@ -2,7 +2,8 @@
 
 JAX's own cache keeps what XLA compiled, but finds it by the traced program, and tracing takes most of the time. Here a
 program is found by what it is made of: the function, the structure and shapes of its arguments, the source of our
-packages, the versions of the libraries, the devices and the options.
+packages, the versions of the libraries, the devices and the options. After a change of the source it is traced again,
+and compiled again if it is another program.
 
 A program is kept only if these tell all about it. One that calls a class or function of another package is not, since
 its source may change unseen; nor is a closure. It is traced as ever, and JAX's cache still serves it.
@@ -21,7 +22,7 @@ from collections.abc import Callable, Hashable, Mapping, Sequence
 from importlib.metadata import version
 from importlib.util import find_spec
 from pathlib import Path
-from typing import Any, ParamSpec, TypeVar
+from typing import Any, NamedTuple, ParamSpec, TypeVar
 
 import equinox as eqx
 import jax
@@ -36,6 +37,7 @@ STANDARD = ("builtins", "collections", "copyreg", "functools", "ml_dtypes", "ope
 KNOWN = frozenset((*OWN, *LIBRARIES, *STANDARD))  # packages whose code the key describes
 IN_MEMORY = 64  # programs of one function
 HIT = "/jax/compilation_cache/cache_hits"
+UNDESCRIBED = pickle.PicklingError, AttributeError, TypeError, ValueError, RecursionError  # all that pickle raises
 
 
 P = ParamSpec("P")
@@ -108,9 +110,9 @@ class _Kept:
         """The program from its file, or compiled now; None if it cannot be kept."""
         try:
             path = self._path(leaves, structure)
-        except (pickle.PicklingError, AttributeError, TypeError):  # all that pickle raises
+        except UNDESCRIBED:
             return None
-        return _read(path) or self._compile(leaves, structure, path)
+        return _loaded(_read(path), path) or self._compile(leaves, structure, path)
 
     def _path(self, leaves: list, structure) -> Path:
         shapes = jax.tree.unflatten(structure, [_kind(leaf) if eqx.is_array(leaf) else leaf for leaf in leaves])
@@ -136,29 +138,52 @@ class _Kept:
 
         flat.__name__ = path.name.partition("-")[0]  # for JAX's cache, too
         lowered = jax.jit(flat, **self._options).lower(arrays)
-        _compiler.hits = 0  # not of small programs that ran while this one was traced
-        compiled = lowered.compile()
+        text = hashlib.sha256(lowered.as_text().encode()).digest()
         (found, shape), *_ = results
         rest = [None if eqx.is_array(leaf) else (leaf,) for leaf in found]
         skeleton = jax.tree.unflatten(shape, range(len(rest)))
+        for other in path.parent.glob(f"{flat.__name__}-*{runtime.EXECUTABLE}"):  # made of another source
+            same = _read(other)
+            if same is not None and same.text == text:
+                same = same._replace(skeleton=skeleton, rest=rest)
+                if program := _loaded(same, other):
+                    _write(path, same)
+                    return program
+        _compiler.hits = 0  # not of small programs that ran while this one was traced
+        compiled = lowered.compile()
         if _compiler.hits:  # jaxlib loses the kernels of a program from JAX's cache when it is serialised again
             for entry in path.parent.glob(f"jit_{flat.__name__}-*"):
                 entry.unlink(missing_ok=True)  # so that the next process compiles and keeps it
         else:
-            _keep(path, compiled, len(arrays), skeleton, rest)
+            _keep(path, compiled, text, len(arrays), skeleton, rest)
         return functools.partial(_call, compiled, skeleton, rest)
 
 
-def _keep(path: Path, compiled, inputs: int, skeleton, rest: Sequence) -> None:
+class _File(NamedTuple):
+    """What is kept of a program."""
+
+    text: bytes  # the digest of what XLA compiled
+    executable: bytes
+    devices: tuple[str, list[int]]
+    inputs: int
+    skeleton: Any
+    rest: Sequence
+
+
+def _keep(path: Path, compiled, text: bytes, inputs: int, skeleton, rest: Sequence) -> None:
     """Write the program to its file, unless JAX or pickle cannot serialise it, or the disk is full."""
     try:
         executable = serialize_executable.serialize(compiled)[0]
-        content = pickle.dumps((executable, _devices(compiled), inputs, skeleton, rest))
-        temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-        temporary.write_bytes(hashlib.sha256(content).digest() + content)
-        os.replace(temporary, path)
+        _write(path, _File(text, executable, _devices(compiled), inputs, skeleton, rest))
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, NotImplementedError, OSError):
         pass  # it serves this process
+
+
+def _write(path: Path, file: _File) -> None:
+    content = pickle.dumps(tuple(file))
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    temporary.write_bytes(hashlib.sha256(content).digest() + content)
+    os.replace(temporary, path)
 
 
 @functools.cache
@@ -172,25 +197,33 @@ def source_digest(package: str) -> str:
     return digest.hexdigest()
 
 
-def _read(path: Path) -> Callable | None:
-    """The program in a file; None if there is none, or it is damaged."""
+def _read(path: Path) -> _File | None:
+    """What is in a file; None if there is none, or it is damaged."""
     try:
         data = path.read_bytes()
         digest, content = data[:32], data[32:]
-        if hashlib.sha256(content).digest() != digest:
-            return None
-        executable, devices, inputs, skeleton, rest = pickle.loads(content)
-        runtime.load_lapack()  # JAX does that when it lowers a first call, which it may not do here
-        native.register()
-        by_id = {device.id: device for device in jax.devices(devices[0])}
-        chosen = [by_id[i] for i in devices[1]]
-        before = jax.tree.structure((([0] * inputs,), {}))
-        after = jax.tree.structure([0] * sum(leaf is None for leaf in rest))
-        compiled = serialize_executable.deserialize_and_load(executable, before, after, devices[0], chosen)
+        return _File(*pickle.loads(content)) if hashlib.sha256(content).digest() == digest else None
     except Exception:  # whatever a file of another making raises: the program is compiled anew
         return None
+
+
+def _loaded(file: _File | None, path: Path) -> Callable | None:
+    """The program in what was read from a path; None if it cannot be loaded."""
+    if file is None:
+        return None
+    try:
+        runtime.load_lapack()  # JAX does that when it lowers a first call, which it may not do here
+        native.register()
+        platform, ids = file.devices
+        by_id = {device.id: device for device in jax.devices(platform)}
+        before = jax.tree.structure((([0] * file.inputs,), {}))
+        after = jax.tree.structure([0] * sum(leaf is None for leaf in file.rest))
+        chosen = [by_id[i] for i in ids]
+        compiled = serialize_executable.deserialize_and_load(file.executable, before, after, platform, chosen)
+    except Exception:  # as in `_read`
+        return None
     path.touch()  # those that nobody uses are deleted, see runtime
-    return functools.partial(_call, compiled, skeleton, rest)
+    return functools.partial(_call, compiled, file.skeleton, file.rest)
 
 
 def _call(compiled, skeleton, rest: Sequence, arrays: list) -> Any:
@@ -241,6 +274,9 @@ class _Description(pickle.Pickler):
 
     def __init__(self, file):
         super().__init__(file, protocol=5)
+        self.fast = (
+            True  # an object met twice is described twice, as are two that are equal: the bytes must be the same
+        )
         self.packages = {"hybrid_jax"}
 
     def persistent_id(self, obj: Any):
@@ -272,7 +308,7 @@ def _described(value: Any) -> tuple[bytes, set[str]]:
     """The value as bytes that are the same in every process, and which packages of OWN it is made with.
 
     Raises:
-        PicklingError, AttributeError, TypeError: it holds what its bytes would not describe.
+        PicklingError or another of UNDESCRIBED: it holds what its bytes would not describe.
     """
     file = io.BytesIO()
     pickler = _Description(file)

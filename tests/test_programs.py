@@ -15,13 +15,13 @@ from smoke import script
 from hybrid_jax import programs, runtime
 from hybrid_jax.programs import kept_jit
 
-TRACED = []
+TRACED, NUMBERS = [], {"unit": 1.0, "of": "x"}
 
 
 def scaled(factor: float, x):
-    """What the array becomes, and a number that is not traced."""
+    """What the array becomes, and values that are not traced."""
     TRACED.append(factor)
-    return {"x": factor * x, "factor": factor}
+    return {"x": factor * NUMBERS["unit"] * x, "factor": factor, "of": NUMBERS["of"]}
 
 
 @pytest.fixture
@@ -87,12 +87,43 @@ def test_other_code_machines_and_settings_ask_for_another_program(folder, monkey
     assert called(2.0, np.ones(3))[1]
 
 
+def test_a_change_of_the_source_that_leaves_a_program_as_it_was_compiles_nothing(folder, monkeypatch):
+    x = np.arange(3.0, dtype=np.float32)
+    called(2.0, x)
+    monkeypatch.setattr(programs, "source_digest", lambda package: "another")
+    monkeypatch.setitem(NUMBERS, "of", "y")
+    with monkeypatch.context() as inner:
+        inner.setattr(jax.stages.Lowered, "compile", None)
+        found, traced = called(2.0, x)
+        assert traced
+        assert found["of"] == "y"
+        np.testing.assert_array_equal(found["x"], 2 * x)
+        assert not called(2.0, x)[1]
+    monkeypatch.setattr(programs, "source_digest", lambda package: "a third")
+    monkeypatch.setitem(NUMBERS, "unit", 3.0)
+    np.testing.assert_array_equal(called(2.0, x)[0]["x"], 6 * x)
+    assert len(kept(folder)) == 3
+
+
 def test_precision_asks_for_another_program(folder):
     called(2.0, np.ones(3))
     with jax.enable_x64(jnp.result_type(float) == jnp.float32):
         found, traced = called(2.0, np.ones(3))
         assert traced
         assert found["x"].dtype == jnp.result_type(float)
+
+
+class Named(eqx.Module):
+    x: jax.Array
+    names: tuple[str, str] = eqx.field(static=True)
+
+
+def test_equal_values_ask_for_the_same_program_whether_or_not_they_are_one_object(folder):
+    one, other = "".join(["na", "me"]), "".join(["na", "me"])
+    assert one is not other
+    for names in ((one, one), (one, other)):
+        kept_jit(identity)(Named(jnp.ones(3), names))
+    assert len(kept(folder)) == 1
 
 
 DAMAGES = {"cut": lambda data: data[:-9], "empty": lambda data: b"", "changed": lambda data: data[:-9] + bytes(9)}

@@ -228,7 +228,7 @@ def _fly(
     with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
         # Compile by flying nothing. XLA computes a single chunk nevertheless, so no program is run twice for this.
         list(pool.map(lambda run: run([]), new))
-    compiled |= runs.keys()
+    compiled.update(runs)  # not |=, which for keys of a dict makes another set
     began, worked = time.perf_counter(), time.process_time()
     found, flown = [], 0
     for run, own in zip(runs.values(), groups.values(), strict=True):
