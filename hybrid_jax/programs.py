@@ -9,6 +9,7 @@ A program is kept only if these tell all about it. One that calls a class or fun
 its source may change unseen; nor is a closure. It is traced as ever, and JAX's cache still serves it.
 """
 
+import contextlib
 import functools
 import hashlib
 import inspect
@@ -142,13 +143,8 @@ class _Kept:
         (found, shape), *_ = results
         rest = [None if eqx.is_array(leaf) else (leaf,) for leaf in found]
         skeleton = jax.tree.unflatten(shape, range(len(rest)))
-        for other in path.parent.glob(f"{flat.__name__}-*{runtime.EXECUTABLE}"):  # made of another source
-            same = _read(other)
-            if same is not None and same.text == text:
-                same = same._replace(skeleton=skeleton, rest=rest)
-                if program := _loaded(same, other):
-                    _write(path, same)
-                    return program
+        if program := _taken_over(path, text, skeleton, rest):
+            return program
         _compiler.hits = 0  # not of small programs that ran while this one was traced
         compiled = lowered.compile()
         if _compiler.hits:  # jaxlib loses the kernels of a program from JAX's cache when it is serialised again
@@ -177,6 +173,19 @@ def _keep(path: Path, compiled, text: bytes, inputs: int, skeleton, rest: Sequen
         _write(path, _File(text, executable, _devices(compiled), inputs, skeleton, rest))
     except (pickle.PicklingError, AttributeError, TypeError, ValueError, NotImplementedError, OSError):
         pass  # it serves this process
+
+
+def _taken_over(path: Path, text: bytes, skeleton, rest: Sequence) -> Callable | None:
+    """The same program from a file that another source left; it is kept for this source, too."""
+    for other in path.parent.glob(f"{path.name.partition('-')[0]}-*{runtime.EXECUTABLE}"):
+        file = _read(other)
+        if file is not None and file.text == text:
+            file = file._replace(skeleton=skeleton, rest=rest)
+            if program := _loaded(file, other):
+                with contextlib.suppress(OSError):  # the disk is full
+                    _write(path, file)
+                return program
+    return None
 
 
 def _write(path: Path, file: _File) -> None:
@@ -274,9 +283,7 @@ class _Description(pickle.Pickler):
 
     def __init__(self, file):
         super().__init__(file, protocol=5)
-        self.fast = (
-            True  # an object met twice is described twice, as are two that are equal: the bytes must be the same
-        )
+        self.fast = True  # no memo: the same bytes for an object met twice as for two that are equal
         self.packages = {"hybrid_jax"}
 
     def persistent_id(self, obj: Any):
