@@ -27,7 +27,6 @@ def site(tmp_path_factory):
         "mkdocs",
         "build",
         "--strict",
-        "-q",
         "--site-dir",
         folder,
         env=os.environ | {"PYTHONPATH": str(ROOT), "HYBRID_JAX_EXECUTE": "false"},

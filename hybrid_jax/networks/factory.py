@@ -59,7 +59,8 @@ def make_residual(
             second network (`RotorThrust`), which starts at zero; "angular_acceleration", ω̇ alone; "motion", v̇ and ω̇
             and corrections of ṗ and q̇ (`Motion`).
         hidden: units of each network.
-        norm, activation: as in `residual_network`.
+        norm: as in `residual_network`.
+        activation: as in `residual_network`.
         linear: add a linear skip connection (`LinearSkip`); the output then starts at zero.
         vehicle: gives the number of rotors, by default four; needed by "near_ground" and "rotors".
 

@@ -92,7 +92,9 @@ def grid_network(
         input_size: m, the numbers in u; every point reads all of them. With 0 the network does not depend on u.
         kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
         hidden: units at each point.
-        activation, norm, scaling: as in `residual_network`; by default a smooth network without batch normalisation.
+        activation: of the hidden units, by default smooth; as in `residual_network`, like those that follow.
+        norm: batch normalisation, by default none.
+        scaling: of what the network reads and returns.
 
     Raises:
         ValueError: a kernel that is even or wider than the grid, or what `residual_network` refuses.

@@ -77,8 +77,8 @@ class LaneMap:
         function: Callable,
         width: int | None = None,
         devices: Sequence | None = None,
-        min_capacity=0,
-        compiler=None,
+        min_capacity: int = 0,
+        compiler: dict[str, bool | int] | None = None,
     ):
         self.devices = sorted(jax.devices(), key=lambda d: d.process_index) if devices is None else list(devices)
         self.width = WIDTH.get(self.devices[0].platform, 0) if width is None else width

@@ -56,7 +56,8 @@ def sweep(
     """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
-        states, plans: stacked initial states and run configurations, one per lane (`fitting.start`, `lanes.stack`).
+        states: stacked initial states, one for each lane (`fitting.start`, `lanes.stack`).
+        plans: stacked run configurations, one for each lane.
         train: the windows that `plans` index into; shared by all lanes, as `validation` is.
         min_capacity: lanes and training windows to compile for at least. Smaller sweeps are padded and share the
             program; padding of lanes needs a fixed width (see `LaneMap`).

@@ -88,8 +88,9 @@ def fit(
             `Hybrid(1e-2, 1e-3)` for physics and residual.
         optimiser: any Optax optimiser in place of Adam, e.g. `optax.adamw(1e-3)`. `rates` then multiply its updates,
             and are 1 by default.
-        min_epochs, max_epochs: no early stop before, and no epoch after.
+        min_epochs: no early stop before.
         patience: stop after this many epochs without a better validation loss.
+        max_epochs: stop after this many epochs.
         regulariser_weight: λ, by default 1e-3.
         settings: by default minibatches of 100 windows, or of all if there are fewer, and no regulariser. The paper's
             is `Settings(regulariser=hybrid_jax.training.loss.trajectory_correlation)`.
