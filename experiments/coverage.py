@@ -121,7 +121,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:
-    """A row for each flight and parameter: whether the pooled interval, and those of single sources, hold the truth."""
+    """A row for each flight and parameter: whether the pooled interval, and those of single sources, contain the true value."""
     splits = {"train": target_splits(config)["train"]}
     flights = flown(domain, splits, config, stages)
     pool = flights.splits["train"]
@@ -195,7 +195,7 @@ def pooled_table(rows: Results) -> Table:
 
 
 def conclusion(rows: Results) -> list[str]:
-    """What share of all intervals holds the truth, where it is smallest, and what pooling is worth."""
+    """What share of all intervals contains the true value, where it is smallest, and what pooling is worth."""
     fitted = rows.where(lambda row: row["inside"] is not None)
     if not len(fitted):
         return ["No parameter was fitted, so there are no intervals."]
@@ -209,7 +209,7 @@ def conclusion(rows: Results) -> list[str]:
         else "Where it is below that, something acts that no parameter stands for, and the interval does not show it."
     )
     return [
-        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} hold the truth, of single sources "
+        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, of single sources "
         f"{np.mean(fitted['alone']):.0%}.",
         f"Fewest hold for {worst} (change, noise, parameter): {shares[worst]:.0%}; at least {ASKED:.0%} are asked for. "
         f"{trust}",

@@ -91,7 +91,7 @@ def conclusion(rows: Results) -> list[str]:
         f"After the designed flight the widest interval is ±{wide:.2g} %, {others}.",
         f"If the model were exact, it would be {times(RANDOM, 'predicted')} narrower than after random; the rest "
         "probably comes with drag and ground effect, which the model lacks.",
-        f"{np.mean(own['inside']):.0%} of the designed flight's 95 % intervals hold the truth.",
+        f"{np.mean(own['inside']):.0%} of the designed flight's 95 % intervals contain the true value.",
     ]
 
 
@@ -111,7 +111,7 @@ def tables(rows: Results) -> list[Table]:
         "predicted [%]": mean("predicted"),
         "error, RMS [%]": lambda own: f"{np.sqrt(np.mean(np.square(own.numbers('error')))):.3g}",
         "bias [%]": mean("error", "+.2f"),
-        "hold the truth [%]": lambda own: f"{100 * np.mean(own['inside']):.0f}",
+        "contain the true value [%]": lambda own: f"{100 * np.mean(own['inside']):.0f}",
     }
     head = ("flight", "parameter")
     return [
@@ -141,17 +141,18 @@ def described(design: Excitation) -> dict[str, Any]:
 
 @mpl.rc_context(STYLE)
 def interval_figure(rows: Results) -> Figure:
-    """A panel per parameter, a line per flight."""
+    """A panel per parameter, a line per flight; what is wider than `WIDEST` is a triangle there."""
     names = rows.unique("parameter")
     figure, panels = subplots((PAGE, 2.1), 1, len(names), sharex=True, sharey=True)
     for axes, name in zip(panels[0], names, strict=True):
         for y, flight in enumerate(FLIGHTS):
-            found = np.minimum(rows.where(parameter=name, flight=flight).numbers("half_width"), WIDEST)
+            found = rows.where(parameter=name, flight=flight).numbers("half_width")
+            place = y + np.linspace(-0.25, 0.25, len(found) + 2)[1:-1]
             tint = COLOURS[HYBRID] if flight == DESIGNED else "0.35"
-            axes.plot(
-                found, y + np.linspace(-0.25, 0.25, len(found) + 2)[1:-1], "o", color=tint, alpha=0.5, markersize=3
-            )
-            axes.plot([found.mean()] * 2, [y - 0.35, y + 0.35], color=tint, linewidth=2)
+            for marker, drawn in (("o", found <= WIDEST), (">", found > WIDEST)):
+                shown = np.minimum(found[drawn], WIDEST)
+                axes.plot(shown, place[drawn], marker, color=tint, alpha=0.5, markersize=3)
+            axes.plot([min(found.mean(), WIDEST)] * 2, [y - 0.35, y + 0.35], color=tint, linewidth=2)
         axes.set(title=name, xscale="log", xlabel="half-width [%], log scale")
     name_lines(panels[0][0], FLIGHTS)
     tick_errors(panels[0][0].xaxis, *panels[0][0].get_xlim())

@@ -52,7 +52,7 @@ def rms(values: Any) -> float:
 
 
 def _intervals(run: Run, i: int, change: str, rate: int) -> Row:
-    """The share of the time from LEARNED on that the interval of each parameter holds the truth; when it alarmed."""
+    """The share of the time from LEARNED on that the interval of each parameter contains the true value; when it alarmed."""
     late = slice(round(LEARNED * rate), None)
     theta, std = run.flown.theta[i][late, :PARTS], run.flown.std[i][late, :PARTS]
     inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
@@ -117,7 +117,7 @@ def _coverage(rows: Results) -> list[Table]:
         )
         for change, own in rows.where(agent="online").group("change").items()
     ]
-    title = f"Share of 95 % intervals that hold the truth [%], from {LEARNED:g} s after the change on"
+    title = f"Share of 95 % intervals that contain the true value [%], from {LEARNED:g} s after the change on"
     return [Table(title, ("change", *NAMES), lines)] if lines else []
 
 

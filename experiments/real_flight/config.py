@@ -66,7 +66,7 @@ class RealFlightConfig(Run):
     """
 
     vehicle: Path | None = None
-    """TOML file with a table [vehicle] (mass, inertia, rotor positions, …); see docs/howto/logs.md."""
+    """TOML file with a table [vehicle] (mass, inertia, rotor positions, …); see docs/howto/vehicle.md."""
     source: Path | None = None
     """Folder of the flights before the change, preferably many."""
     target: Path | None = None

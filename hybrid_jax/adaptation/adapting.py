@@ -163,7 +163,7 @@ def adapt(
     Args:
         field: a trained `Hybrid`, or any other field.
         windows: in the order of time, for least squares more than there are parameters. Where some touch, as those of
-            one flight do, intervals allow for errors that are correlated within a tenth of them.
+            one flight do, intervals allow for errors that are correlated within a fifth of them.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.

@@ -93,7 +93,7 @@ def adaptation():
 
 
 def test_intervals_hold_what_is_found_after_a_change():
-    """Of twenty runs at least 16 must hold the truth, which 95 % intervals miss once in 400 times."""
+    """Of twenty runs at least 16 must contain the true value, which 95 % intervals miss once in 400 times."""
     changed = Slide(jnp.array(1.8), jnp.array(1.0))
     runs = [run(SLIDE, 160, seed, (60, changed)) for seed in range(20)]
     states = jax.vmap(lambda s, u: watch(adaptation(), s, u))(*(jnp.stack(part) for part in zip(*runs, strict=True)))

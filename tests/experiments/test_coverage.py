@@ -31,7 +31,7 @@ def test_the_claim_fails_where_significantly_fewer_intervals_hold(inside, holds)
 @pytest.mark.parametrize(("inside", "means"), [(97, "So they can be taken"), (80, "something acts")])
 def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
     first, second = conclusion(rows(inside))
-    assert first == f"Of 100 pooled 95 % intervals {inside}% hold the truth, of single sources 50%."
+    assert first == f"Of 100 pooled 95 % intervals {inside}% contain the true value, of single sources 50%."
     assert second.startswith(f"Fewest hold for weak_rotor 1 Ix (change, noise, parameter): {inside}%")
     assert means in second
 
