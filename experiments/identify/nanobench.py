@@ -4,12 +4,16 @@ FOLDER is the data set NanoBench: flights of an airframe A, and of B, which repl
 turn; the others, or ten seconds of one of them, are learned from.
 """
 
+import itertools
 import sys
 from dataclasses import replace
 from pathlib import Path
 
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 from rich.console import Console
 
 import hybrid_jax as hj
@@ -18,8 +22,10 @@ from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.adaptation.ridge import defects
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
+from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.airborne import airborne
@@ -27,18 +33,21 @@ from hybrid_jax.flights.column_map import load_column_map
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.reading import read_recording
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.scores import flight_errors
+from hybrid_jax.flights.scores import errors_between
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.measured import Layout
+from hybrid_jax.state import VELOCITY
 
 OF_A = """B2_circle_slow_rep1 B2_circle_medium_rep1 B2_circle_fast_rep1 B3_figure8_slow_rep1 B3_figure8_fast_rep1
     B7_oval_fast_rep2 B8_star_medium_rep1 B10_lissajous_fast_rep1"""
 OF_B = "B7_oval_slow_rep3 B2_circle_fast_rep3 B5_helix_fast_rep2 B8_star_fast_rep3"
 SECONDS, DT, STEPS, STRIDE = 10.0, 0.01, 50, 10
+PAST = 200  # intervals before a window: on flights of A that were left out fewer predict worse, and 400 no better
 FIT_STEPS = 12  # of Levenberg–Marquardt, of which the first few count
 FORCE = Layout(dt=DT, steps=50, most=200, disturbance=(0.0,) * 6)
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "centre_of_mass", "torque_gain", "drag", "aerodynamic_moment", "rate_damping")
+OBSERVED = ", past 2 s"  # of a model with the mean force and torque that it lacked in the past of a window
 SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of the errors of p, q, v and ω
 
 
@@ -81,9 +90,27 @@ def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajecto
     return cut_windows([flight_of(each, field) for each in recordings], STEPS, stride).windows
 
 
-def errors(field, windows) -> list[float]:
+def tests_of(recording: Recording, field: Actuated) -> hj.Trajectories:
+    """Windows of a flight, each with the `PAST` before it."""
+    return cut_windows([flight_of(recording, field)], PAST + STEPS, STRIDE).windows
+
+
+@eqx.filter_jit
+def predicted(field, tests: hj.Trajectories, observed: bool) -> Float[Array, "n t 13"]:
+    """The states after each past; if `observed`, with the mean acceleration that the field lacked in it."""
+    x, u, dt = tests.x, tests.u, tests.dt
+    past = hj.Trajectories(tests.x0, u[:, :PAST], x[:, :PAST], dt)
+    lacked = defects(field, past).reshape(len(x), PAST, -1).mean(axis=1)[:, VELOCITY.start :]
+
+    def predict(x0, u, value):
+        return hj.rollout(disturbed(field, observed * value), x0, u, dt)
+
+    return jax.vmap(predict)(x[:, PAST - 1], u[:, PAST:], lacked)
+
+
+def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]:
     """RMS of position, velocity, rotation and rates after 0.1 and 0.5 s."""
-    found = flight_errors(field, windows)
+    found = errors_between(predicted(field, tests, observed), tests.x[:, PAST:])
     return [float(np.sqrt(np.mean(np.asarray(part)[:, at] ** 2))) for at in (9, 49) for part in found]
 
 
@@ -107,7 +134,7 @@ def main(folder: Path) -> None:
         errors_few = np.concatenate([force_errors(each, left) for each in few])
         forces.append([*(rms(force_errors(each, left)) for each in (aware, fitted)), rms(errors_few)])
         console.print(Path(left.name).name, [f"{each:.3f}" for each in forces[-1]])
-        test, plain = windows_of([left], fitted), windows_of([left], gain)
+        test, plain, short = tests_of(left, fitted), tests_of(left, gain), tests_of(left, few[0])
         simple = [fitted_to(rigid_body(VEHICLE), others, each) for each in (gain, fitted)]
         models = {
             "hold the state": (HoldState(), test),
@@ -115,11 +142,14 @@ def main(folder: Path) -> None:
             "physics, constant gain": (simple[0], plain),
             "physics, voltage": (simple[1], test),
             "adapted from A": (fitted_to(of_a, others, fitted), test),
-            "adapted from A, ten seconds": (fitted_to(of_a, tens[:1], few[0], 5), windows_of([left], few[0])),
+            "adapted from A, ten seconds": (fitted_to(of_a, tens[:1], few[0], 5), short),
         }
-        for name, (model, windows) in models.items():
-            scores.setdefault(name, []).append(errors(model, windows))
-            console.print(name, [f"{each:.3f}" for each in scores[name][-1]])
+        for (name, (model, windows)), observed in itertools.product(models.items(), (False, True)):
+            if name == "hold the state" and observed:
+                continue
+            line = scores.setdefault(name + OBSERVED * observed, [])
+            line.append(errors(model, windows, observed))
+            console.print(name + OBSERVED * observed, [f"{each:.3f}" for each in line[-1]])
 
     def pooled(part) -> tuple[str, ...]:
         return tuple(f"{each:.3f}" for each in np.sqrt(np.mean(np.square(part), axis=0)))
