@@ -110,7 +110,7 @@ def predicted(field, tests: hj.Trajectories, observed: bool) -> Float[Array, "n 
 
 def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]:
     """RMS of position, velocity, rotation and rates after 0.1 and 0.5 s."""
-    found = errors_between(predicted(field, tests, observed), tests.x[:, PAST:])
+    found = errors_between(predicted(field, tests, observed), jnp.asarray(tests.x[:, PAST:]))
     return [float(np.sqrt(np.mean(np.asarray(part)[:, at] ** 2))) for at in (9, 49) for part in found]
 
 
