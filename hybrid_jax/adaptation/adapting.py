@@ -18,7 +18,7 @@ from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.least_squares import check_windows
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
-from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain
+from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
 from hybrid_jax.adaptation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.corrected_body import simplified
@@ -40,6 +40,7 @@ NAMED = 50  # physics with more parameters is a network, and its weights are not
 STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGED: "diverged"}
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FITTED = "no parameter was fitted"
+OVERLAP = "windows overlap: what is left out of a fit is seen by its neighbours, so errors to expect are too small"
 UNDETERMINED = "the windows do not tell the parameters apart"
 
 METHODS: Mapping[str, Method] = {
@@ -132,7 +133,8 @@ class Adaptation:
             lines.append(f"Parameters ({note}):")
             lines += [f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items()]
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
-                lines.append(f"Warning: these windows do not depend on {', '.join(unseen)}; any value fits them.")
+                names = ", ".join(unseen)
+                lines.append(f"Warning: these windows do not determine {names}: other values fit them as well.")
         lines.append(f"Constant disturbance: {'none' if self.disturbance is None else 'see parameters'}.")
         if self.parameters and self.without_intervals is not None:
             lines.append(f"No intervals: {self.without_intervals}.")
@@ -162,8 +164,9 @@ def adapt(
 
     Args:
         field: a trained `Hybrid`, or any other field.
-        windows: in the order of time, for least squares more than there are parameters. Where some touch, as those of
-            one flight do, intervals allow for errors that are correlated within a fifth of them.
+        windows: in the order of time and without overlap, for least squares more than there are parameters. Where they
+            follow each other, as those of one flight do, intervals allow for errors that are correlated within a fifth
+            of them.
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
@@ -190,6 +193,8 @@ def adapt(
         raise ValueError(f"field: {physics} has {size} parameters, no named physics to fit; use method='fine_tune'")
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=2)
+    if overlap(windows):
+        warnings.warn(OVERLAP, stacklevel=2)
     load_lapack()
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):

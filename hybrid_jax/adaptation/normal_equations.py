@@ -6,7 +6,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.adaptation import least_squares
 from hybrid_jax.adaptation.least_squares import Scale, Solver, ravel_parameters
@@ -18,6 +18,7 @@ from hybrid_jax.trajectories import Trajectories
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
 
 CHUNK = 250  # windows in memory at a time
+RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of parameters of equal effect, is zero
 
 
 class NormalEquations(NamedTuple):
@@ -71,24 +72,49 @@ def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) 
     return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
 
 
-def inverse(matrix: Float[Array, "p p"]) -> Float[Array, "p p"]:
-    """The inverse of a positive definite matrix, scaled to a unit diagonal first: parameters differ in their effect."""
-    scale = jnp.sqrt(jnp.diagonal(matrix))
+class Inverse(NamedTuple):
+    """The pseudo-inverse of a Gram matrix JᵀJ: zero along what changes no prediction by more than rounding does."""
+
+    matrix: Float[Array, "*n p p"]
+    told: Bool[Array, "*n p"]  # the parameters that take no part in such a change
+    rank: Int[Array, "*n"]
+
+
+def inverse(gram: Float[Array, "p p"]) -> Inverse:
+    """The inverse, of a matrix that is scaled to a unit diagonal first: parameters differ in their effect."""
+    scale = jnp.sqrt(jnp.diagonal(gram))
     scales = scale[:, None] * scale
-    return jnp.linalg.inv(matrix / scales) / scales
+    values, vectors = jnp.linalg.eigh(gram / scales)
+    epsilon = jnp.finfo(gram.dtype).eps
+    seen = values > RANK * len(gram) * epsilon
+    matrix = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T / scales
+    unseen = jnp.sum(jnp.where(seen, 0.0, jnp.square(vectors)), axis=1)
+    return Inverse(matrix, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
 
 
-def inverses(matrices: Float[Array, "n p p"]) -> Float[Array, "n p p"]:
+def inverses(grams: Float[Array, "n p p"]) -> Inverse:
     """The inverse of each, one after the other: two batches at once can wait for each other, see `matrices.solve`."""
-    return jax.lax.map(inverse, matrices)
+    return jax.lax.map(inverse, grams)
+
+
+def steps_without(
+    gram: Float[Array, "p p"], score: Float[Array, " p"], grams: Float[Array, "b p p"], scores: Float[Array, "b p"]
+) -> Float[Array, "b p"]:
+    """The Gauss–Newton step on all windows but some, for each part that is left out, with the sums over all of them.
+
+    Not finite where a part alone tells what all windows tell; what not even these tell stays as it is.
+    """
+    found = inverses(gram - grams)
+    steps = -jnp.einsum("bpq,bq->bp", found.matrix, score - scores)
+    return jnp.where((found.rank == inverse(gram).rank)[:, None], steps, jnp.nan)
 
 
 def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
-    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they do not determine θ_p.
+    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they tell less than all do.
 
     Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
     """
     gram, score, square = equations
-    steps = -jnp.einsum("npq,nq->np", inverses(jnp.sum(gram, axis=0) - gram), jnp.sum(score, axis=0) - score)
+    steps = steps_without(jnp.sum(gram, axis=0), jnp.sum(score, axis=0), gram, score)
     bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
     return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
-from hybrid_jax.adaptation.normal_equations import equations_of, has_effect, inverses, masked
+from hybrid_jax.adaptation.normal_equations import equations_of, has_effect, masked, steps_without
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.programs import kept_jit
@@ -24,6 +24,8 @@ from hybrid_jax.trajectories import Trajectories
 BLOCKS = 10
 CLUSTERS = 5  # of windows of one flight, for intervals: in gusts, errors a second apart are still correlated
 TOLERANCE = 0.1  # relative difference of errors that does not count
+FEW = 10  # windows, of which no order is seen
+SHIFTS = 20  # other windows that each is compared with
 JOINED = 10  # windows that touch, at most so many, are predicted as one
 
 
@@ -95,7 +97,7 @@ def left_out_steps(
     weight = counted[..., None]
     gram = jnp.sum(gram[places] * weight[..., None], axis=1)
     score = jnp.sum(score[places] * weight, axis=1)
-    return -jnp.einsum("bpq,bq->bp", inverses(jnp.sum(gram, axis=0) - gram + held), jnp.sum(score, axis=0) - score)
+    return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0), gram, score)
 
 
 def predict_block(
@@ -126,9 +128,27 @@ def predict_block(
 
 
 def correlated(windows: Trajectories) -> int:
-    """How many consecutive windows to take as one cluster: a fifth where some touch, as those of one flight do."""
-    touching = (np.asarray(windows.x0)[1:] == np.asarray(windows.x)[:-1, -1]).all(axis=1)
-    return blocks_of(len(windows), CLUSTERS)[0].shape[1] if touching.any() else 1
+    """How many consecutive windows to take as one cluster: a fifth where they are of one flight, or of a few."""
+    starts, ends = np.asarray(windows.x0), np.asarray(windows.x)[:, -1]
+    touch = bool((starts[1:] == ends[:-1]).all(axis=1).any())
+    of_flights = touch or overlap(windows) or _follow(starts, ends)
+    return blocks_of(len(windows), CLUSTERS)[0].shape[1] if of_flights else 1
+
+
+def _follow(starts: Float[np.ndarray, "n d"], ends: Float[np.ndarray, "n d"]) -> bool:
+    """Whether windows begin much nearer to the end of the one before than to those of others, after a gap."""
+    n, spread = len(starts), np.std(starts, axis=0)
+    if n < FEW or not spread.any():
+        return False
+    starts, ends = (part[:, spread > 0] / spread[spread > 0] for part in (starts, ends))
+    shifts = np.linspace(1, n - 1, SHIFTS + 1, dtype=int)
+    near, *others = (np.linalg.norm(np.roll(starts, -k, axis=0) - ends, axis=1) for k in shifts)
+    return bool(np.median(near) < np.median(others) / 2)
+
+
+def overlap(windows: Trajectories) -> bool:
+    """Whether a window begins inside of the one before."""
+    return bool((np.asarray(windows.x0)[1:, None] == np.asarray(windows.x)[:-1, :-1]).all(axis=-1).any())
 
 
 def longest_chain(windows: Trajectories, blocks: int) -> int:

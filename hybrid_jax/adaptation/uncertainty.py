@@ -66,8 +66,8 @@ def covariance_of(
     """The covariance of θ_p of a field fitted to the windows, given θ_d, in the physics' own parametrisation.
 
     Rows are in the order of `ravel_parameters`; for a `RigidBody`: log Ix, log Iy, log k. Pure: it compiles and maps
-    over stacked fields. A parameter that changes nothing in the windows has an infinite variance; where they do not
-    tell two parameters apart, nothing is finite.
+    over stacked fields. A parameter has an infinite variance if it changes nothing in the windows, or if they do not
+    tell it and others apart.
 
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
@@ -110,17 +110,22 @@ def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Arr
     gram, score, square = equations
     n = len(score)
     bread = inverse(jnp.sum(gram, axis=0))
+    told = bread.told
     if kind == "homoscedastic":
-        return jnp.sum(square) / (n * entries - p) * bread
-    if cluster > 1:
+        found = jnp.sum(square) / (n * entries - p) * bread.matrix
+    elif cluster > 1:
         clusters, of = -(-n // cluster), np.arange(n) // cluster
         gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
+        without = inverses(jnp.sum(gram, axis=0) - gram)
+        told = told & without.told.all(axis=0)
         # What leaving a cluster out does to θ_p.
-        moves = jnp.einsum("gpq,gq->gp", inverses(jnp.sum(gram, axis=0) - gram), score - jnp.mean(score, axis=0))
+        moves = jnp.einsum("gpq,gq->gp", without.matrix, score - jnp.mean(score, axis=0))
         moves = moves - jnp.mean(moves, axis=0)
-        return (clusters - 1) / clusters * moves.T @ moves
-    half = score @ bread  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
-    return n / (n - p) * half.T @ half
+        found = (clusters - 1) / clusters * moves.T @ moves
+    else:
+        half = score @ bread.matrix  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
+        found = n / (n - p) * half.T @ half
+    return found + jnp.diag(jnp.where(told, 0.0, jnp.inf))
 
 
 def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.grids import Grid
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
@@ -59,9 +60,16 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     Args:
         indices: the disturbed states; by default v̇ and ω̇ of a rigid body, each component of physics on a `Grid` (one
             number for all points), and every state of another system.
+
+    Raises:
+        ValueError: the field has a disturbance of other states that is not zero.
     """
-    if disturbance_of(field) is not None:
-        return field
+    if (known := disturbance_of(field)) is not None:
+        if indices is None or indices == known.indices:
+            return field
+        if checks.is_traced(known.value) or jnp.any(known.value != 0):
+            raise ValueError("indices: the field has a disturbance already; leave them out, or `without_disturbance`")
+        field = without_disturbance(field)
     physics = physics_of(field)
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
     if indices is None and getattr(physics, "rotor_states", 0):

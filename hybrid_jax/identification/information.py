@@ -26,7 +26,7 @@ class Information(NamedTuple):
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
         """The covariance of θ_p by least squares on the free parameters, zero for the others."""
         both = free & free[:, None]
-        bread = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
+        bread = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))).matrix
         return bread @ jnp.where(both, self.noise, 0.0) @ bread
 
 

@@ -55,7 +55,12 @@ class Quadrotor(eqx.Module):
         return end.at[QUATERNION].set(normalise(end[QUATERNION]))
 
     def rollouts(
-        self, x0: Float[Array, "n 13"], u: Float[Array, "n t rotors"], t0: Float[Array, " n"], dt: float, chunk: int = CHUNK
+        self,
+        x0: Float[Array, "n 13"],
+        u: Float[Array, "n t rotors"],
+        t0: Float[Array, " n"],
+        dt: float,
+        chunk: int = CHUNK,
     ) -> Float[Array, "n t 13"]:
         """The states of n flights at the end of each interval, from x0 at t0 [s] with u[:, i] held over interval i.
 

@@ -25,8 +25,16 @@ WIDTH = {"cpu": 1}  # one lane fills the cache (benchmarks/sweep.py); on a GPU a
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
-    """One tree whose arrays have a first axis over the lanes; other leaves must agree."""
-    return jax.tree.map(lambda *leaves: np.stack(leaves) if eqx.is_array_like(leaves[0]) else leaves[0], *lanes)
+    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, such as numbers, differ."""
+
+    def stacked(*leaves):
+        if isinstance(leaves[0], jax.Array | np.ndarray | np.generic):
+            return np.stack(leaves)
+        if any(leaf != leaves[0] for leaf in leaves):
+            raise ValueError(f"lanes: {leaves[0]!r} must be an array if it differs between lanes")
+        return leaves[0]
+
+    return jax.tree.map(stacked, *lanes)
 
 
 def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:

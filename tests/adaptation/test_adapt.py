@@ -18,7 +18,7 @@ from pendulum import LENGTH, pendulum, swings
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS, Adaptation, FineTune, LeastSquares, Method, Solution, adapt
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, physics_of
+from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbance_of, disturbed, physics_of
 from hybrid_jax.metrics import rollout_mse
 
 PUSH = jnp.array([0.0, 1.5])
@@ -145,6 +145,13 @@ def test_a_disturbance_acts_on_any_states():
 class Nothing(AbstractVectorField):
     def __call__(self, x, u):
         return x
+
+
+def test_a_disturbance_that_is_not_zero_is_moved_to_no_other_states():
+    still = hj.with_disturbance(hj.with_disturbance(pendulum(), (0,)), (1,))
+    assert disturbance_of(still).indices == (1,)
+    with pytest.raises(ValueError, match="indices: the field has a disturbance already"):
+        hj.with_disturbance(disturbed(pendulum(), PUSH[1:], (1,)), (0,))
 
 
 class Shaped(AbstractVectorField):

@@ -16,10 +16,11 @@ from hybrid_jax.adaptation import Auto, FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, weights_of, with_change
 from hybrid_jax.adaptation.auto import OF_A_RIGID_BODY, extended, free_parameters
 from hybrid_jax.adaptation.least_squares import fit_free, fit_least_squares, ravel_parameters
-from hybrid_jax.adaptation.selection import blocks_of, fit_candidates, predict_block, simplest
+from hybrid_jax.adaptation.selection import blocks_of, correlated, fit_candidates, predict_block, simplest
 from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.trajectories import windows_of
 
 
 @cache
@@ -52,6 +53,47 @@ def test_a_left_out_block_is_predicted_by_a_fit_to_the_others():
         others = np.setdiff1d(np.arange(40), block)
         own = fit_least_squares(field, windows[others]).field
         np.testing.assert_allclose(error, rollout_mse(own, windows[block]), rtol=1e-3)
+
+
+class Half(hj.AbstractVectorField):
+    """A pendulum of which no window tells two parameters apart."""
+
+    first: jax.Array
+    second: jax.Array
+
+    def __call__(self, x, u):
+        return pendulum(self.first + self.second)(x, u)
+
+
+def test_a_candidate_whose_parameters_no_window_tells_apart_is_fitted_all_the_same():
+    result = adapt(Half(jnp.array(0.3), jnp.array(0.4)), flown(pendulum()))
+    assert result.chosen == "theta"
+    assert result.field.first + result.field.second == pytest.approx(LENGTH, rel=0.01)
+    assert "do not determine first, second: other values fit them as well" in result.report()
+
+
+def flight(steps, stride, seed=0):
+    """Windows of one flight of a pendulum that is pushed at random."""
+    inputs = np.random.default_rng(seed).normal(size=(400, 1)).astype(np.float32)
+    start = np.array([1.0, 0.0], np.float32)
+    states = np.concatenate([start[None], np.asarray(hj.rollout(pendulum(), start, inputs, 0.05))])
+    noise = 0.01 * np.random.default_rng(seed).normal(size=states.shape)
+    return windows_of((states + noise).astype(np.float32), inputs, 0.05, steps=steps, stride=stride)
+
+
+@pytest.mark.parametrize("stride", [1, 5, 6, 8])
+def test_windows_of_one_flight_are_correlated_whether_they_touch_overlap_or_not(stride):
+    windows = flight(5, stride)
+    assert correlated(windows) == -(-len(windows) // 5)
+
+
+def test_windows_of_many_flights_are_not():
+    assert correlated(swings(100)) == 1
+
+
+def test_windows_that_overlap_are_adapted_to_with_a_warning():
+    with pytest.warns(UserWarning, match="windows overlap: what is left out of a fit"):
+        adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
 
 
 def test_parameters_that_are_not_free_stay():

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jaxtyping import Array, Float
 from pendulum import pendulum, swings
 from rich.console import Console
 from test_least_squares import Brake, Push, log_lengths, pushes
@@ -15,7 +16,7 @@ from experiments.paper import known_body
 from experiments.paper.known_body import KnownBody, coverage, known_body_table
 from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.vehicle import IRIS
 
@@ -103,6 +104,30 @@ def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything
     assert found.converged
     assert 0 < known[0, 0] < np.inf
     np.testing.assert_allclose(covariance[0, 0], known[0, 0] * 29 / 28, rtol=1e-5)  # the factor n / (n - p)
+
+
+class Sum(AbstractVectorField):
+    """ẋ = (a + b) u₀ + c u₁: no window tells a and b apart."""
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    c: Float[Array, ""]
+
+    def __call__(self, x, u):
+        return jnp.stack([(self.a + self.b) * u[0] + self.c * u[1], 0 * x[1]])
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.3, 1.0, 7.0, 100.0])
+@pytest.mark.parametrize("cluster", [1, 6])
+def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_theirs(unit, cluster):
+    windows, _ = pushes(30, 0.1, unit)
+    found = fit_least_squares(Sum(*map(jnp.array, (1.0, 0.5, 0.0))), windows)
+    variances = np.diagonal(covariance_of(found.field, windows, cluster=cluster))
+    assert np.isinf(variances[:2]).all()
+    alone = Sum(found.field.a + found.field.b, jnp.zeros(()), found.field.c)
+    known = covariance_of(alone, windows, cluster=cluster, free=np.array([True, False, True]))
+    factor = 1.0 if cluster > 1 else 28 / 27  # n - p
+    np.testing.assert_allclose(variances[2], known[2, 2] * factor, rtol=1e-3)
 
 
 def test_what_makes_no_sense_is_refused():

@@ -15,6 +15,13 @@ def test_lanes_are_stacked_and_picked():
     assert lane(stacked, 1)["n"].shape == ()
 
 
+def test_a_number_is_a_constant_of_all_lanes():
+    fields = [{"k": np.float32(i), "mass": 2.0} for i in range(3)]
+    assert stack(fields)["mass"] == 2.0
+    with pytest.raises(ValueError, match=r"lanes: 2.0 must be an array if it differs between lanes"):
+        stack([*fields, {"k": np.float32(3), "mass": 3.0}])
+
+
 @pytest.mark.parametrize(("devices", "width"), [(1, 1), (2, 1), (3, 2), (4, 5)])
 def test_schedule_is_complete_and_balanced(devices, width):
     rng = np.random.default_rng(0)
