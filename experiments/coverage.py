@@ -121,7 +121,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
 
 
 def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig, stages: Stages) -> list[Row]:
-    """A row for each flight and parameter: whether the pooled interval, and those of single sources, contain the true value."""
+    """A row for each flight and parameter: whether the pooled interval, and single ones, contain the true value."""
     splits = {"train": target_splits(config)["train"]}
     flights = flown(domain, splits, config, stages)
     pool = flights.splits["train"]
@@ -209,8 +209,8 @@ def conclusion(rows: Results) -> list[str]:
         else "Where it is below that, something acts that no parameter stands for, and the interval does not show it."
     )
     return [
-        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, of single sources "
-        f"{np.mean(fitted['alone']):.0%}.",
+        f"Of {len(fitted)} pooled 95 % intervals {np.mean(fitted['inside']):.0%} contain the true value, "
+        f"of single sources {np.mean(fitted['alone']):.0%}.",
         f"Fewest hold for {worst} (change, noise, parameter): {shares[worst]:.0%}; at least {ASKED:.0%} are asked for. "
         f"{trust}",
     ]

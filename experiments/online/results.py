@@ -52,7 +52,7 @@ def rms(values: Any) -> float:
 
 
 def _intervals(run: Run, i: int, change: str, rate: int) -> Row:
-    """The share of the time from LEARNED on that the interval of each parameter contains the true value; when it alarmed."""
+    """The share of the time from LEARNED on that each interval contains the true value; when it alarmed."""
     late = slice(round(LEARNED * rate), None)
     theta, std = run.flown.theta[i][late, :PARTS], run.flown.std[i][late, :PARTS]
     inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
