@@ -39,6 +39,7 @@ HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
 STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGED: "diverged"}
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
+NOT_FINITE = "the fit diverged; are dt and all units right?"
 NOT_FITTED = "no parameter was fitted"
 OVERLAP = "windows overlap: what is left out of a fit is seen by its neighbours, so errors to expect are too small"
 UNDETERMINED = "the windows do not tell the parameters apart"
@@ -171,7 +172,8 @@ def adapt(
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
         learned_from: windows that the source was trained on; the report warns where these windows are unlike them.
-        settings: by default RK4, minibatches of at most 100, and `scaled_loss`, so that units do not matter.
+        settings: by default RK4, minibatches of at most 100, and `scaled_loss(field, windows)` as the objective, so that
+            units do not matter. Settings of your own have the objective that they name, by default the plain MSE.
         level: confidence level of the intervals.
 
     Raises:
@@ -205,7 +207,8 @@ def adapt(
 
     adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
     choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
-    exact = exact and int(solution.status) != DIVERGED and choice.get("chosen") not in NETWORKS
+    without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
+    without = NOT_FINITE if int(solution.status) == DIVERGED else without
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
     found = disturbance_of(adapted)
     return Adaptation(
@@ -220,7 +223,7 @@ def adapt(
         level=level,
         outside={} if learned_from is None else shares_outside(motion_of(learned_from), motion_of(windows)),
         **choice,
-        **_parameters(adapted, train, settings, level, exact, free),
+        **_parameters(adapted, train, settings, level, without, free),
     )
 
 
@@ -273,7 +276,7 @@ def _size(field: AbstractVectorField) -> int:
 
 
 def _parameters(
-    field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, exact: bool, free
+    field: AbstractVectorField, windows: Trajectories, settings: Settings, level: float, without: str | None, free
 ) -> dict[str, Any]:
     """The attributes of `Adaptation` about the parameters: why there are no intervals, if there are none."""
     if not 0 < _size(field) <= NAMED:
@@ -283,8 +286,8 @@ def _parameters(
     values = named_parameters(field)
     units = {name: known.get(name, known.get(name.split("[")[0])) for name in values}
     alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
-    if not exact:
-        return {"parameters": alone, "without_intervals": NOT_LEAST_SQUARES}
+    if without is not None:
+        return {"parameters": alone, "without_intervals": without}
     if free is not None and not free.any():
         return {"parameters": alone, "without_intervals": NOT_FITTED}
     scale, cluster = scale_of(settings.objective, windows.x0.shape[-1]), correlated(windows)
