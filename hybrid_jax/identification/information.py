@@ -12,7 +12,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.adaptation.least_squares import Solver, ravel_parameters
-from hybrid_jax.adaptation.normal_equations import inverse
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 
@@ -26,7 +25,10 @@ class Information(NamedTuple):
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
         """The covariance of θ_p by least squares on the free parameters, zero for the others."""
         both = free & free[:, None]
-        bread = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))).matrix
+        gram = jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
+        scale = jnp.sqrt(jnp.diagonal(gram))
+        # Designs differentiate this, and the derivative of eigenvectors, as of `normal_equations`, is not always finite.
+        bread = jnp.linalg.inv(gram / (scale[:, None] * scale)) / (scale[:, None] * scale)
         return bread @ jnp.where(both, self.noise, 0.0) @ bread
 
 
