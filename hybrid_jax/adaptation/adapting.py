@@ -172,7 +172,7 @@ def adapt(
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
         learned_from: windows that the source was trained on; the report warns where these windows are unlike them.
-        settings: by default RK4, minibatches of at most 100, and `scaled_loss(field, windows)` as the objective, so that
+        settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, so that
             units do not matter. Settings of your own have the objective that they name, by default the plain MSE.
         level: confidence level of the intervals.
 

@@ -27,7 +27,7 @@ class Information(NamedTuple):
         both = free & free[:, None]
         gram = jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
         scale = jnp.sqrt(jnp.diagonal(gram))
-        # Designs differentiate this, and the derivative of eigenvectors, as of `normal_equations`, is not always finite.
+        # Not as in `normal_equations`: designs differentiate this, and slopes of eigenvectors are not always finite.
         bread = jnp.linalg.inv(gram / (scale[:, None] * scale)) / (scale[:, None] * scale)
         return bread @ jnp.where(both, self.noise, 0.0) @ bread
 
