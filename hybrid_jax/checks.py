@@ -5,8 +5,9 @@ In a compiled or mapped program an array is traced: it has no numbers yet, and t
 
 import math
 import os
+from collections.abc import Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import jax
 import jax.core
@@ -16,6 +17,7 @@ import numpy as np
 from hybrid_jax.state import QUATERNION
 
 Numbers = jax.Array | np.ndarray
+T = TypeVar("T")
 
 UNIT = 1e-2  # |q| may be off 1 by this: rounding and noise are far below, and it is 2 % of the thrust
 MOST = np.iinfo(np.int32).max  # what a count may be in a compiled program
@@ -107,6 +109,20 @@ def count(name: str, value: Any, least: int = 1) -> None:
     found = value.item() if isinstance(value, Numbers) and value.ndim == 0 else value
     if not isinstance(found, int | np.integer) or isinstance(found, bool) or not least <= found <= MOST:
         raise ValueError(f"{name} must be an integer of at least {least}, got {short_repr(value)}")
+
+
+def instance(name: str, value: Any, kind: type) -> None:
+    """Require an object of a class."""
+    if not isinstance(value, kind):
+        raise ValueError(f"{name} must be a {kind.__name__}, got {short_repr(value)}")
+
+
+def list_of(name: str, values: Any, kind: type[T]) -> list[T]:
+    """The values as a list; requires that each is of a class. One of them alone is no list."""
+    found = list(values) if isinstance(values, Iterable) else [values]
+    if not isinstance(values, Iterable) or not all(isinstance(value, kind) for value in found):
+        raise ValueError(f"{name} must be a list of {kind.__name__}, got {short_repr(values)}")
+    return found
 
 
 def key(name: str, value: Any) -> None:

@@ -1,5 +1,7 @@
 """Windows of recorded trajectories: an initial state, the inputs held over each interval, and the next states."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -9,13 +11,18 @@ from hybrid_jax import checks
 from hybrid_jax.state import STATE_SIZE
 
 
+def _plain(dt):
+    """A Python number of one of NumPy, which Equinox would take for an array."""
+    return dt.item() if isinstance(dt, np.floating) else dt
+
+
 class Trajectories(eqx.Module):
     """n windows of t equal intervals."""
 
     x0: Float[Array | np.ndarray, "*n d"]  # initial state of each window
     u: Float[Array | np.ndarray, "*n t m"]  # input held over each interval
     x: Float[Array | np.ndarray, "*n t d"]  # state at the end of each interval: x[:, i] is (i + 1) dt after x0
-    dt: float = eqx.field(static=True)  # length of an interval [s]
+    dt: float = eqx.field(static=True, converter=_plain)  # length of an interval [s]
 
     def __len__(self) -> int:
         return self.x0.shape[0]
@@ -108,8 +115,9 @@ def windows_of(
     return Trajectories(x0=states[starts], u=inputs[inside], x=states[inside + 1], dt=dt)
 
 
-def concatenate(parts: list[Trajectories]) -> Trajectories:
+def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
     """All windows of the parts, in order; ValueError if they differ in dt, horizon, or size of state or input."""
+    parts = checks.list_of("parts", parts, Trajectories)
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]
         raise ValueError(f"parts must share dt and horizon, and sizes of state and input, got {sizes}")
