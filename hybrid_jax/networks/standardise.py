@@ -58,7 +58,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     every = -(-before.shape[0] * before.shape[1] // max(1, SAMPLES * SMALL // max(SMALL, before.shape[2])))
     samples = before.shape[0] * before.shape[1]
     x, u, after = (rows.reshape(samples, rows.shape[-1])[::every] for rows in (before, u, after))  # u may be empty
-    zeros = [jnp.zeros(network.weight_in.shape[1], x.dtype) for network in networks]
+    zeros = [jnp.zeros(network.weight_in.shape[1], jnp.result_type(x)) for network in networks]
     probed = unfreeze(eqx.tree_at(_scalings, field, [_Probe(RunningStats(zero, zero)) for zero in zeros]))
 
     predicted = np.asarray(rollout_batch(probed, x, u[:, None], windows.dt))[:, 0]

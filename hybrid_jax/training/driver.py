@@ -170,7 +170,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     """Take a run to its end in blocks of epochs, and report the progress between them."""
     validated_on, settings, optimiser = shared
     # Weakly typed numbers would come back typed, and the second block be compiled anew.
-    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype) if eqx.is_array(leaf) else leaf, state)
+    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.asarray(leaf).dtype) if eqx.is_array(leaf) else leaf, state)
     losses, most, empty, interrupt = [np.zeros((0, 2))], 1, jnp.zeros((BLOCK, 2)), None
     # The default is not an argument: an optimiser holds closures, with which a program is not kept.
     chosen = {} if optimiser is fitting.ADAM else {"optimiser": optimiser}

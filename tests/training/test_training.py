@@ -209,6 +209,20 @@ def test_double_precision_trains_alone_and_in_a_sweep():
     np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
 
 
+class Decay(AbstractVectorField):
+    rate: np.ndarray
+
+    def __call__(self, x, u):
+        return u - self.rate * x
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("field", [Decay(np.ones(2)), Hybrid(pendulum(0.8), NETWORK)], ids=["parameters", "network"])
+def test_arrays_of_numpy_are_taken_without_a_warning(field):
+    train, validation = (jax.tree.map(lambda leaf: np.asarray(leaf, np.float64), w) for w in (TRAIN, VALIDATION))
+    assert trained(field, train=train, validation=validation, max_epochs=1).epochs == 1
+
+
 def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
     plan = make_run_config(0.03, jnp.arange(60), 60, 10, 10, 60, 0.0)
     good, _ = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
