@@ -37,7 +37,8 @@ class AbstractBatchNorm(eqx.Module):
 
     def moved(self, batch: RunningStats) -> Self:
         """This with the running statistics moved towards the minibatch's by the momentum."""
-        running = jax.tree.map(lambda old, new: old + self.momentum * (new - old), self.running, batch)
+        move = self.momentum
+        running = jax.tree.map(lambda old, new: (old + move * (new - old)).astype(old.dtype), self.running, batch)
         return eqx.tree_at(lambda norm: norm.running, self, running)
 
 

@@ -142,7 +142,7 @@ def _columns_backward(of_rows, saved, d_derivative: Float[Array, "13 b"]):
     d_own, d_x, d_u = jax.vjp(of_rows, own, tuple(x), tuple(u))[1](d_derivative)
     leaves, structure = jax.tree.flatten(d_own)
     if leaves:
-        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], x.dtype))
+        leaves = tuple(jnp.stack(leaves) @ jnp.ones(x.shape[1:], leaves[0].dtype))
     return jax.tree.unflatten(structure, leaves), jnp.stack(d_x), jnp.stack(d_u)
 
 

@@ -22,7 +22,8 @@ def normalised_layer(
     arrays = weight_in, gain, shift, weight_out, bias_out, z
     if _has_kernel(activation, arrays) and native.prefix():
         return _kernel_layer(epsilon, *arrays)
-    return plain_layer(epsilon, activation, *arrays)
+    precision = jnp.result_type(*arrays)  # each derivative is returned in the precision of its array
+    return plain_layer(epsilon, activation, *(array.astype(precision) for array in arrays))
 
 
 def _has_kernel(activation: Activation, arrays) -> bool:

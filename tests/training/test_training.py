@@ -209,6 +209,15 @@ def test_double_precision_trains_alone_and_in_a_sweep():
     np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
 
 
+@pytest.mark.parametrize("norm", ["batch", "layer", "none"])
+def test_a_field_in_single_precision_trains_on_windows_in_double(norm):
+    field = Hybrid(pendulum(0.8), residual_network(2, 1, KEY, hidden=4, norm=norm))
+    with jax.enable_x64(True):
+        train, validation = (jax.tree.map(lambda leaf: jnp.asarray(leaf, float), w) for w in (TRAIN, VALIDATION))
+        best = trained(field, train=train, validation=validation, max_epochs=1).best
+    assert {leaf.dtype for leaf in jax.tree.leaves(eqx.filter(best, eqx.is_array))} == {np.dtype(np.float32)}
+
+
 class Decay(AbstractVectorField):
     rate: np.ndarray
 
