@@ -220,13 +220,18 @@ def checked(
     checks.positive("dt", dt, "a positive number of seconds")
     checks.count("substeps", substeps)
     solver = RK4() if solver is None else solver
+    check_solver(solver)
+    slope = check_field(field, *(jax.ShapeDtypeStruct(part.shape[-1:], part.dtype) for part in (x0, u)))
+    return x0.astype(jnp.result_type(x0.dtype, slope.dtype)), u, solver
+
+
+def check_solver(solver) -> None:
+    """Refuse what is no one-step method of diffrax for ODEs of one term."""
     if not isinstance(solver, diffrax.AbstractSolver):
         raise ValueError(f"solver must be one of diffrax or of hybrid_jax.SOLVERS, got {checks.short_repr(solver)}")
     # A step starts at time zero, of which a multistep method would remember the wrong ones.
     if solver.term_structure is not diffrax.AbstractTerm or isinstance(solver, diffrax.LeapfrogMidpoint):
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
-    slope = check_field(field, *(jax.ShapeDtypeStruct(part.shape[-1:], part.dtype) for part in (x0, u)))
-    return x0.astype(jnp.result_type(x0.dtype, slope.dtype)), u, solver
 
 
 def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:

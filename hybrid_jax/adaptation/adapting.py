@@ -187,6 +187,7 @@ def adapt(
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     check_windows(field, held_out, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
+    checks.instance("settings", settings, Settings)
     for data in (windows,) if validation is None else (windows, validation):
         checked(field, data.x0, data.u, data.dt, settings.solver, windows=True)
     exact, size = getattr(method, "has_intervals", False), _size(field)

@@ -123,11 +123,11 @@ def checked_arguments(
     """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
     if settings is None:
         settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
+    checks.instance("settings", settings, Settings)
     data = settings.objective.prepare(train, "train")
     validated_on = settings.objective.prepare(validation, "validation")
     _check_field(field, {"train": train, "validation": validation}, settings)
     checks.key("key", key)
-    checks.count("settings.batch_size", settings.batch_size)
     check_minibatch(field, settings)
     if len(data) < settings.batch_size:
         raise ValueError(f"train has {len(data)} windows, fewer than batch_size={settings.batch_size}")

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running_stats
 from hybrid_jax.dynamics.batching import batch_norms
-from hybrid_jax.integrate import RK4, along
+from hybrid_jax.integrate import RK4, along, check_solver
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.rollout_kernels import training_kernel
 from hybrid_jax.rollouts import rollout_minibatch
@@ -78,7 +78,11 @@ class TrajectoryLoss(Objective):
 
 @dataclass(frozen=True)
 class Settings:
-    """What a training program is compiled for, the same for all runs of a sweep. Refuses a regulariser by name."""
+    """What a training program is compiled for, the same for all runs of a sweep.
+
+    Raises:
+        ValueError: a batch size that is no count, or a regulariser, solver or objective that is none.
+    """
 
     batch_size: int = 100
     regulariser: Regulariser | None = None
@@ -89,6 +93,11 @@ class Settings:
         if self.regulariser is not None and not callable(self.regulariser):
             expected = "a function, such as one of hybrid_jax.training.loss.REGULARISERS"
             raise ValueError(f"regulariser must be {expected}, got {checks.short_repr(self.regulariser)}")
+        checks.count("batch_size", self.batch_size)
+        check_solver(self.solver)
+        methods = (getattr(self.objective, name, None) for name in ("prepare", "batch", "loss", "observe", "validate"))
+        if isinstance(self.objective, type) or not all(map(callable, methods)):
+            raise ValueError(f"objective must be an Objective, got {checks.short_repr(self.objective)}")
 
 
 def check_minibatch(field: Learner, settings: Settings) -> None:

@@ -183,6 +183,7 @@ class Weights(AbstractVectorField):
             "method must be one of auto, .*source, or a value, got 'magic'",
         ),
         (pendulum(), {"method": 3}, "method must have a method solve, see Method, got 3"),
+        (pendulum(), {"settings": {"batch_size": 10}}, "settings must be a Settings, got {'batch_size': 10}"),
         (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
         (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
         (pendulum(), {"method": "last_layer"}, "last_layer needs a field whose residual is a ResidualNetwork"),

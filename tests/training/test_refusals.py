@@ -13,6 +13,7 @@ from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
 from hybrid_jax.training.fitting import make_run_config, start
+from hybrid_jax.training.objective import TrajectoryLoss
 from hybrid_jax.training.stages import Stage, fit_in_stages
 
 TRAIN, VALIDATION, KEY = swings(60), swings(40, seed=1), jax.random.key(0)
@@ -50,6 +51,7 @@ REFUSED = {
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
     "frozen": (Frozen(pendulum()), {}, f"field: {NOTHING.format('Frozen')}"),
     "function": (lambda x, u: x, {}, f"field: {NOTHING.format('function')}"),
+    "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
     "number": (1.0, {}, f"field: {NOTHING.format('float')}"),
 }
 
@@ -59,6 +61,21 @@ def test_what_cannot_be_trained_is_refused_by_name(name):
     field, options, said = REFUSED[name]
     with pytest.raises(ValueError, match=f"^{said}"):
         fit(field, **{"train": TRAIN, "validation": VALIDATION, "key": KEY, "settings": Settings(20)} | options)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"batch_size": 0}, "batch_size must be an integer of at least 1, got 0"),
+        ({"batch_size": 10.0}, "batch_size must be an integer of at least 1, got 10.0"),
+        ({"solver": "rk4"}, "solver must be one of diffrax or of hybrid_jax.SOLVERS, got 'rk4'"),
+        ({"objective": "mse"}, "objective must be an Objective, got 'mse'"),
+        ({"objective": TrajectoryLoss}, "objective must be an Objective, got <class"),
+    ],
+)
+def test_settings_that_are_none_are_refused(options, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        Settings(**options)
 
 
 @pytest.mark.parametrize("alone", [True, False], ids=["fit", "sweep"])
@@ -90,7 +107,7 @@ def test_stages_that_make_no_sense_are_refused(stages, said):
     ("field", "size", "said"),
     [
         (rigid_body(IRIS), 20, "train: field: RigidBody does not take a state"),
-        (FIELD, 2.5, "settings.batch_size must be an integer of at least 1, got 2.5"),
+        (FIELD, 2.5, "batch_size must be an integer of at least 1, got 2.5"),
         (FIELD, 61, "train has 60 windows, fewer than batch_size=61"),
         (Frozen(FIELD), 20, "field: Frozen has nothing to learn"),
     ],
