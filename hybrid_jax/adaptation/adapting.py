@@ -26,6 +26,7 @@ from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
 from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
 from hybrid_jax.integrate import checked, compact
+from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.programs import kept_jit
@@ -142,13 +143,10 @@ class Adaptation:
         return "\n".join(lines)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything but the field, as JSON values."""
+        """Everything but the field, as JSON values: None for a number that is not finite."""
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
-        disturbance = None if self.disturbance is None else self.disturbance.tolist()
-        covariance = None if self.covariance is None else self.covariance.tolist()
-        found = vars(self) | {"converged": self.converged, "disturbance": disturbance, "parameters": parameters}
-        found |= {"covariance": covariance}
-        return {name: value for name, value in found.items() if name != "field"}
+        found = vars(self) | {"converged": self.converged, "parameters": parameters}
+        return json_value({name: value for name, value in found.items() if name != "field"})
 
 
 def adapt(

@@ -112,6 +112,15 @@ def test_a_method_maps_over_stacked_fields():
     np.testing.assert_allclose(jnp.exp(found.field.log_length), LENGTH, rtol=1e-4)  # float32
 
 
+def test_every_entry_of_a_result_is_json_and_none_where_it_is_not_finite():
+    result = adapt(pendulum(), swings(40), method="theta_least_squares")
+    unseen = replace(result.parameters["log_length"], high=np.inf)
+    spoiled = replace(result, parameters={"log_length": unseen}, covariance=np.full((1, 1), np.inf), mse_after=np.nan)
+    found = json.loads(json.dumps(spoiled.to_dict(), allow_nan=False))
+    assert found["parameters"]["log_length"]["high"] is found["mse_after"] is None
+    assert found["covariance"] == [[None]]
+
+
 @pytest.mark.parametrize(("frozen", "moves"), [("residual", "physics"), ("physics", "residual")])
 def test_what_is_frozen_stays(frozen, moves):
     field = hj.Hybrid(pendulum(0.55), network())
