@@ -5,7 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.state import BODY_RATES, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
 
 RANGE = 0.01, 0.99  # quantiles of the training samples
@@ -14,10 +14,10 @@ WARN = 0.1  # share of samples outside of it that is worth a warning
 Motion = Mapping[str, np.ndarray]
 
 
-def motion(x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> Motion:
+def motion(x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"], rigid: bool) -> Motion:
     """What decides whether a model has seen the like of a sample: of a rigid body speed, body rates, rotor speeds and
     tilt; of another system each state and input."""
-    if x.shape[-1] != STATE_SIZE:
+    if not rigid:
         return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
     tilt = np.arccos(np.clip(1 - 2 * np.square(x[:, QUATERNION][:, 1:3]).sum(axis=1), -1, 1))
     lengths = {"speed [m/s]": x[:, VELOCITY], "body rates [rad/s]": x[:, BODY_RATES]}
@@ -25,10 +25,11 @@ def motion(x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> Motion:
     return norms | {"rotor speed [rad/s]": u.ravel(), "tilt [rad]": tilt}
 
 
-def motion_of(windows: Trajectories) -> Motion:
+def motion_of(windows: Trajectories, rigid: bool) -> Motion:
     """`motion` of every sample of some windows."""
     x, u = np.asarray(windows.x), np.asarray(windows.u)
-    return motion(*(part.reshape(x.shape[0] * x.shape[1], part.shape[-1]) for part in (x, u)))
+    x, u = (part.reshape(x.shape[0] * x.shape[1], part.shape[-1]) for part in (x, u))
+    return motion(x, u, rigid)
 
 
 def shares_outside(known: Motion, asked: Motion) -> dict[str, float]:

@@ -1,5 +1,6 @@
 """Windows of recorded trajectories: an initial state, the inputs held over each interval, and the next states."""
 
+import math
 from collections.abc import Iterable
 
 import equinox as eqx
@@ -9,6 +10,8 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.state import STATE_SIZE
+
+SAME = 1e-3  # two dt that differ by less, relatively, are of clocks and not of windows
 
 
 def _plain(dt):
@@ -70,6 +73,20 @@ def check_attitudes(trajectories: Trajectories, name: str = "trajectories") -> N
     if trajectories.x0.shape[-1] == STATE_SIZE:
         checks.unit_quaternions(f"{name}: x0", trajectories.x0)
         checks.unit_quaternions(f"{name}: x", trajectories.x)
+
+
+def check_like(trajectories: Trajectories, windows: Trajectories, name: str) -> None:
+    """Raise ValueError unless states and inputs are of as many numbers as those of other windows."""
+    for part, axis in (("x0", "states"), ("u", "inputs")):
+        expected, found = (getattr(each, part).shape[-1] for each in (windows, trajectories))
+        if found != expected:
+            raise ValueError(f"{name}: {axis} of {expected} numbers expected, as in the other windows, got {found}")
+
+
+def check_dt(trajectories: Trajectories, windows: Trajectories, name: str) -> None:
+    """Raise ValueError for another dt than that of other windows."""
+    if not math.isclose(trajectories.dt, windows.dt, rel_tol=SAME):
+        raise ValueError(f"{name}: dt must be {windows.dt}, as of the other windows, got {trajectories.dt}")
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:

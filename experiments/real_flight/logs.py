@@ -265,4 +265,4 @@ def non_overlapping(indices: np.ndarray, sizes: Sequence[int], spacing: int) -> 
 def motion_of_logs(logs: Sequence[FlightLog]) -> Motion:
     """`motion` of every sample of some logs."""
     x, u = (np.concatenate([getattr(log, name) for log in logs]) for name in "xu")
-    return motion(x, u)
+    return motion(x, u, rigid=True)

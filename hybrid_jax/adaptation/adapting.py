@@ -34,7 +34,7 @@ from hybrid_jax.runtime import FAST_COMPILE, load_lapack
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
-from hybrid_jax.trajectories import Trajectories
+from hybrid_jax.trajectories import Trajectories, check_dt, check_like
 
 HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
@@ -181,9 +181,12 @@ def adapt(
     check_windows(field, windows)
     if learned_from is not None:
         check_windows(field, learned_from, "learned_from")
+        check_like(learned_from, windows, "learned_from")
     check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
     check_windows(field, held_out, "validation")
+    check_like(held_out, train, "validation")
+    check_dt(held_out, train, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
     checks.instance("settings", settings, Settings)
     for data in (windows,) if validation is None else (windows, validation):
@@ -205,7 +208,9 @@ def adapt(
     import scipy.special  # noqa: F401
 
     adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
-    choice = {} if solution.choice is None else _chosen(solution.choice, train, moves_a_rigid_body(field))
+    rigid = moves_a_rigid_body(field)
+    known = [] if learned_from is None else [motion_of(each, rigid) for each in (learned_from, windows)]
+    choice = {} if solution.choice is None else _chosen(solution.choice, train, rigid)
     without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
     without = NOT_FINITE if int(solution.status) == DIVERGED else without
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
@@ -220,7 +225,7 @@ def adapt(
         steps=int(solution.steps),
         status=STATUS[int(solution.status)],
         level=level,
-        outside={} if learned_from is None else shares_outside(motion_of(learned_from), motion_of(windows)),
+        outside=shares_outside(*known) if known else {},
         **choice,
         **_parameters(adapted, train, settings, level, without, free),
     )

@@ -25,7 +25,7 @@ from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes
+from hybrid_jax.trajectories import Trajectories, check, check_attitudes, check_dt
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -154,6 +154,7 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
                 raise ValueError(f"{name}: {error}") from error
             if x0.dtype != jnp.result_type(windows.x0):
                 raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
+            check_dt(windows, data["train"], name)
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
         if moves_a_rigid_body(field):
             check_attitudes(windows, name)

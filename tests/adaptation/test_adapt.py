@@ -121,6 +121,37 @@ def test_every_entry_of_a_result_is_json_and_none_where_it_is_not_finite():
     assert found["covariance"] == [[None]]
 
 
+class Leak(AbstractVectorField):
+    """Thirteen states, and no rigid body."""
+
+    rate: Array
+
+    def __call__(self, x, u):
+        return -self.rate * x
+
+
+def test_thirteen_states_are_not_taken_for_a_rigid_body():
+    x = np.random.default_rng(0).normal(size=(20, 4, 13)).astype(np.float32)
+    windows = hj.Trajectories(x[:, 0], x[:, 1:, :2], x[:, 1:], 0.1)
+    found = adapt(Leak(jnp.array(1.0)), windows, method="source", learned_from=windows)
+    assert list(found.outside) == [*(f"x[{i}]" for i in range(13)), "u[0]", "u[1]"]
+
+
+WIDE = replace(swings(40), u=np.zeros((40, 8, 2), np.float32))
+OTHERS = {
+    "another dt": ("validation", replace(swings(40), dt=0.1), "dt must be 0.05, as of the other windows, got 0.1"),
+    "validation": ("validation", WIDE, "inputs of 1 numbers expected, as in the other windows, got 2"),
+    "learned_from": ("learned_from", WIDE, "inputs of 1 numbers expected, as in the other windows, got 2"),
+}
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_windows_of_another_kind_are_refused(name):
+    option, windows, said = OTHERS[name]
+    with pytest.raises(ValueError, match=f"^{option}: {said}"):
+        adapt(pendulum(), swings(40), method="source", **{option: windows})
+
+
 @pytest.mark.parametrize(("frozen", "moves"), [("residual", "physics"), ("physics", "residual")])
 def test_what_is_frozen_stays(frozen, moves):
     field = hj.Hybrid(pendulum(0.55), network())

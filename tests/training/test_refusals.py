@@ -1,5 +1,7 @@
 """What training refuses, in one line that says what is wrong."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -51,6 +53,7 @@ REFUSED = {
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
     "frozen": (Frozen(pendulum()), {}, f"field: {NOTHING.format('Frozen')}"),
     "function": (lambda x, u: x, {}, f"field: {NOTHING.format('function')}"),
+    "another dt": (pendulum(), {"validation": replace(VALIDATION, dt=0.1)}, "validation: dt must be 0.05, .* got 0.1$"),
     "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
     "number": (1.0, {}, f"field: {NOTHING.format('float')}"),
 }
