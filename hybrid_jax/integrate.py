@@ -18,7 +18,7 @@ import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, features_first, infer_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, features_first, infer_batch
 from hybrid_jax.programs import kept_jit
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
@@ -234,13 +234,23 @@ def check_solver(solver) -> None:
         raise ValueError(f"solver must be a one-step method for ODEs of one term, got {type(solver).__name__}")
 
 
+def check_callable(field) -> None:
+    """Refuse what is no field, such as a result that holds one."""
+    if not callable(field):
+        inside = next((f"; pass its .{part}" for part in ("best", "field") if callable(getattr(field, part, None))), "")
+        raise ValueError(f"field: must be a function (x, u) → ẋ, got {type(field).__name__}{inside}")
+
+
 def check_field(field, x: jax.ShapeDtypeStruct, u: jax.ShapeDtypeStruct) -> jax.ShapeDtypeStruct:
     """Shape and type of ẋ = field(x, u); ValueError if the field does not map x and u to ẋ of the shape of x."""
+    check_callable(field)
     name = getattr(field, "__name__", type(field).__name__)
     given = f"a state {x.shape} and an input {u.shape}"
     try:
         slope = eqx.filter_eval_shape(field, x, u)
     except Exception as error:  # a user's code may raise anything
+        for part in (field.physics, field.residual) if isinstance(field, Hybrid) else ():
+            check_field(part, x, u)  # it says which part does not take them
         reason = f"{type(error).__name__}: {checks.first_line(error)}"
         raise ValueError(f"field: {name} does not take {given}: {reason}") from error
     if getattr(slope, "shape", None) != x.shape or not jnp.issubdtype(slope.dtype, jnp.floating):

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, trainable
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
-from hybrid_jax.integrate import checked
+from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.programs import kept_jit
@@ -143,6 +143,8 @@ def checked_arguments(
 
 def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settings) -> None:
     """Refuse a field that learns nothing, and windows that do not match it. Other learners check their own windows."""
+    if isinstance(settings.objective, TrajectoryLoss):
+        check_callable(field)
     if not any(jax.tree.leaves(trainable(field))):
         missing = "no array of floating-point numbers; a Python float is none, use jnp.asarray"
         raise ValueError(f"field: {type(field).__name__} has nothing to learn, {missing}")

@@ -227,6 +227,7 @@ class Weights(AbstractVectorField):
         (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
         (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
         (pendulum(), {"method": "last_layer"}, "last_layer needs a field whose residual is a ResidualNetwork"),
+        (hj.Model(pendulum()), {}, "field: must be a function .* got Model; pass its .field$"),
         (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
         (Nothing(), {"method": "fine_tune"}, "field: Nothing has nothing to train"),
         (Weights(jnp.zeros(60)), {}, "field: Weights has 60 parameters, no named physics to fit; use"),

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from pendulum import pendulum, swings
 
-from hybrid_jax import IRIS, Hybrid, Settings, fit, residual_network
+from hybrid_jax import IRIS, Hybrid, Model, Settings, fit, residual_network
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sweep.lanes import stack
@@ -55,7 +55,18 @@ REFUSED = {
     "function": (lambda x, u: x, {}, f"field: {NOTHING.format('function')}"),
     "another dt": (pendulum(), {"validation": replace(VALIDATION, dt=0.1)}, "validation: dt must be 0.05, .* got 0.1$"),
     "settings": (pendulum(), {"settings": "rk4"}, "settings must be a Settings, got 'rk4'"),
-    "number": (1.0, {}, f"field: {NOTHING.format('float')}"),
+    "number": (1.0, {}, "field: must be a function .* got float$"),
+    "model": (Model(FIELD), {}, "field: must be a function .* got Model; pass its .field$"),
+    "inputs": (
+        Hybrid(pendulum(), residual_network(2, 3, KEY)),
+        {},
+        "train: field: ResidualNetwork does not take a state .* its weights are for 5 states and inputs, got 2 and 1$",
+    ),
+    "outputs": (
+        Hybrid(pendulum(), residual_network(2, 1, KEY, outputs=3)),
+        {},
+        r"train: field: ResidualNetwork must return a derivative \(2,\) for .* returned float32\[3\]$",
+    ),
 }
 
 
