@@ -125,6 +125,16 @@ def list_of(name: str, values: Any, kind: type[T]) -> list[T]:
     return found
 
 
+def places(name: str, values: Any, size: int = MOST) -> tuple[int, ...]:
+    """The values as a tuple; requires different indices, one at least, of an axis of some size."""
+    found = tuple(values) if isinstance(values, Iterable) else ()
+    whole = all(isinstance(value, int | np.integer) for value in found)
+    if not whole or len({*found}) < max(1, len(found)) or not 0 <= min(found) <= max(found) < size:
+        limit = "" if size == MOST else f" and at most {size - 1}"
+        raise ValueError(f"{name} must be different integers of at least 0{limit}, got {short_repr(values)}")
+    return found
+
+
 def key(name: str, value: Any) -> None:
     """Require a random key of JAX, typed or raw."""
     if isinstance(value, jax.Array | np.ndarray):

@@ -26,14 +26,15 @@ from hybrid_jax.adaptation import causes_bank, change_test, kalman
 from hybrid_jax.adaptation.causes import Bank, Cause, Directions, bank_of, directions
 from hybrid_jax.adaptation.kalman import Belief, Each, Plant
 from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.online_state import DISTURBANCE, Flags, Numbers, OnlineState, named_priors
+from hybrid_jax.adaptation.online_state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, named_priors
 from hybrid_jax.adaptation.samples import HUGE, Heard, Sample, nearer, sampled
 from hybrid_jax.adaptation.tuning import Tuning
 from hybrid_jax.adaptation.uncertainty import Interval, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import physics_of, with_disturbance
+from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.integrate import check_callable
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION
 
@@ -48,7 +49,8 @@ class OnlineAdaptation(AbstractEstimator):
         state = filter.begin(x)
         state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
 
-    Pure: its methods compile and map over stacked states, and do not raise for bad samples; see `flags`.
+    Pure: its methods compile and map over stacked states, and do not raise for bad samples, but for their shape; see
+    `flags`.
 
     Attributes:
         field: its physics is adapted from the values that it has; a network beside it stays as it is.
@@ -95,8 +97,12 @@ class OnlineAdaptation(AbstractEstimator):
         for name, numbers, check in (("noise", noise, checks.positive), ("process", process, checks.not_negative)):
             for number in np.ravel(numbers):
                 check(name, number)
-        if not 0 < initial <= 1:
-            raise ValueError(f"initial must be a share above 0 and at most 1, got {initial}")
+        if not 0 < (checks.real(initial) or 0) <= 1:
+            raise ValueError(f"initial must be a share above 0 and at most 1, got {checks.short_repr(initial)}")
+        check_callable(field)
+        self.tuning = Tuning() if tuning is None else tuning
+        checks.instance("tuning", self.tuning, Tuning)
+        indices = None if indices is None else checks.places("indices", indices)
         if np.any(disturbance):
             if indices is None and not moves_a_rigid_body(physics_of(field)):
                 raise ValueError("indices must say which states are disturbed, as the system is no rigid body")
@@ -104,12 +110,14 @@ class OnlineAdaptation(AbstractEstimator):
         self.field, self.dt, self.initial = field, float(dt), float(initial)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
         self.names, self.scales = named_priors(field, prior, disturbance)
-        self.causes = tuple(directions(cause, self.names, self.scales) for cause in causes)
-        self.tuning = Tuning() if tuning is None else tuning
+        self.causes = tuple(
+            directions(cause, self.names, self.scales) for cause in checks.list_of("causes", causes, Cause)
+        )
 
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
         """Before the first sample x, at the field's own parameters."""
-        x = jnp.asarray(x, float)
+        x, indices = jnp.asarray(x, float), getattr(disturbance_of(self.field), "indices", None)
+        check_sizes(x, {"noise": self.noise, "process": self.process}, indices)
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
         zero, theta, start = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype), jnp.full(p, self.initial**2, x.dtype)
         variances, mixture = self._variances(x), None
@@ -150,7 +158,10 @@ class OnlineAdaptation(AbstractEstimator):
             each: turns a function of the filter of one cause into one of arrays of all.
         """
         tuning, d = self.tuning, len(state.x)
-        x = jnp.asarray(x, state.x.dtype)
+        checks.not_negative("elapsed", elapsed)
+        x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
+        if x.shape != state.x.shape:
+            raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
         x = nearer(x, state.x) if moves_a_rigid_body(self.field) else x
         heard = Heard(state.last, state.equal, state.silent)
         sample, heard = sampled(x, u, elapsed, heard, self.dt, tuning.gap)

@@ -60,7 +60,10 @@ def named_priors(
     own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
     if unknown := sorted(own.keys() - {*names, *groups}):
         raise ValueError(f"prior: {', '.join(unknown)}: must be among {', '.join(dict.fromkeys(groups))}")
-    disturbed = iter(np.broadcast_to(disturbance, groups.count(DISTURBANCE)).tolist())
+    size, sizes = groups.count(DISTURBANCE), np.ravel(disturbance)
+    if len(sizes) not in (1, size):
+        raise ValueError(f"disturbance must be one number, or one for each of {size} disturbed, got {len(sizes)}")
+    disturbed = iter(np.broadcast_to(sizes, size).tolist())
     found = []
     for name, group in zip(names, groups, strict=True):
         scale = next(disturbed) if group == DISTURBANCE else own.get(name, own.get(group))
@@ -71,6 +74,17 @@ def named_priors(
     return names, tuple(found)
 
 
+def check_sizes(x: Array, numbers: Mapping[str, tuple[float, ...]], indices: tuple[int, ...] | None) -> None:
+    """Refuse what is no sample x (d,), numbers that are not one for each of its states or for all, and indices."""
+    if x.ndim != 1:
+        raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
+    for name, values in numbers.items():
+        if len(values) not in (1, len(x)):
+            raise ValueError(f"{name} must be one number, or one for each of the {len(x)} of x, got {len(values)}")
+    if indices is not None:
+        checks.places("indices", indices, len(x))
+
+
 def _names(field: AbstractVectorField) -> tuple[str, ...]:
     """The name of each parameter; the field may be traced."""
 
@@ -78,7 +92,7 @@ def _names(field: AbstractVectorField) -> tuple[str, ...]:
         return jnp.stack(list(named_parameters(unravel(theta)).values()))
 
     with jax.ensure_compile_time_eval():
-        like = jax.tree.map(lambda a: jnp.zeros(a.shape, a.dtype) if eqx.is_inexact_array(a) else a, field)
+        like = jax.tree.map(lambda a: jnp.zeros(a.shape, jnp.result_type(a)) if eqx.is_inexact_array(a) else a, field)
         theta, unravel = ravel_parameters(like)
         slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
         labels = list(named_parameters(like))

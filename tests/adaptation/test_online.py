@@ -170,15 +170,58 @@ def test_a_run_beside_others_is_the_run_alone():
     np.testing.assert_allclose(together.theta[1], alone.theta, atol=1e-5)
 
 
-def test_what_cannot_be_estimated_is_refused():
-    for options, words in (
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
         ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
         ({"prior": {"friction": 0.1}}, "prior: idle must be given"),
         ({"disturbance": 1.0}, "indices must say"),
+        (
+            {"disturbance": (1.0, 1.0), "indices": (0,)},
+            "disturbance must be one number, or one for each of 1 disturbed",
+        ),
+        ({"disturbance": 1.0, "indices": (0, 0)}, "indices must be different integers of at least 0, got"),
         ({"initial": 0.0}, "initial must be"),
+        ({"initial": "a"}, "initial must be a share above 0 and at most 1, got 'a'"),
         ({"noise": 0.0}, "noise must be"),
-    ):
-        with pytest.raises(ValueError, match=words):
-            OnlineAdaptation(SLIDE, DT, **({"noise": NOISE} | options))
+        ({"tuning": "x"}, "tuning must be a Tuning, got 'x'"),
+        ({"causes": hj.Cause("a", {"friction": 0.3})}, "causes must be a list of Cause, got Cause"),
+        ({"causes": ("friction",)}, "causes must be a list of Cause, got"),
+        ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
+    ],
+)
+def test_a_filter_that_makes_no_sense_is_refused(options, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        OnlineAdaptation(**({"field": SLIDE, "dt": DT, "noise": NOISE} | options))
+
+
+@pytest.mark.parametrize(
+    ("options", "x", "said"),
+    [
+        ({"noise": (NOISE, NOISE)}, [0.0], "noise must be one number, or one for each of the 1 of x, got 2"),
+        ({"process": (0.1, 0.1)}, [0.0], "process must be one number, or one for each of the 1 of x, got 2"),
+        (
+            {"disturbance": 1.0, "indices": (3,)},
+            [0.0],
+            "indices must be different integers of at least 0 and at most 0",
+        ),
+        ({}, [[0.0]], r"x must be one sample \(d,\), got shape \(1, 1\)"),
+    ],
+)
+def test_a_first_sample_of_another_size_is_refused(options, x, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        OnlineAdaptation(SLIDE, DT, **({"noise": NOISE} | options)).begin(x)
+
+
+def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
+    state = adaptation().begin([0.0])
+    assert eqx.tree_equal(adaptation().update(state, [0.1], [1]), adaptation().update(state, np.array([0.1]), [1.0]))
+    with pytest.raises(ValueError, match=r"^x must be one sample \(1,\), as the state is, got shape \(2,\)"):
+        adaptation().update(state, [0.0, 0.0], [0.0])
+    with pytest.raises(ValueError, match=r"^elapsed must be a finite number of at least 0, got -1"):
+        adaptation().update(state, [0.0], [0.0], elapsed=-1)
+
+
+def test_a_tuning_that_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match="pause must be"):
         Tuning(pause=-1.0)
