@@ -70,8 +70,12 @@ class Bank(NamedTuple):
 
 
 def directions(cause: Cause, names: tuple[str, ...], scales: tuple[float, ...]) -> Directions:
-    """The cause among parameters of these names and prior standard deviations; ValueError for an unknown name."""
-    rows, rates = [], []
+    """The cause among parameters of these names and prior standard deviations.
+
+    Raises:
+        ValueError: a name that is unknown, or of a parameter that is held, with a prior of zero.
+    """
+    names, rows, rates = tuple(name if scale else "" for name, scale in zip(names, scales, strict=True)), [], []
     for name, size in cause.parameters.items():
         for i in _places(cause, name, names):
             rows.append(_row({i: size}, scales))
@@ -88,12 +92,12 @@ def _places(cause: Cause, name: str, names: tuple[str, ...]) -> list[int]:
     """Where a parameter, or the entries of an array, stand in θ."""
     found = [i for i, each in enumerate(names) if name in (each, each.partition("[")[0])]
     if not found:
-        raise ValueError(f"cause {cause.name}: {name} must be among {', '.join(names)}")
+        raise ValueError(f"cause {cause.name}: {name} must be among {', '.join(filter(None, names))}")
     return found
 
 
 def _row(sizes: Mapping[int, float], scales: tuple[float, ...]) -> tuple[float, ...]:
-    return tuple(sizes.get(i, 0.0) / scale for i, scale in enumerate(scales))
+    return tuple(sizes.get(i, 0.0) / (scale or 1.0) for i, scale in enumerate(scales))
 
 
 def bank_of(causes: tuple[Directions, ...], p: int, dt: float) -> Bank:

@@ -58,7 +58,7 @@ class OnlineAdaptation(AbstractEstimator):
         noise: standard deviation of what is measured of each state.
         prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
             a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
-            array, efficiency.
+            array, efficiency. Zero holds a parameter.
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
         indices: of the disturbed states; by default v̇ and ω̇ of a rigid body.
         process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].

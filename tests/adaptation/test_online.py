@@ -35,6 +35,16 @@ class Pushed(hj.AbstractVectorField):
         return u + self.push
 
 
+class Towed(hj.AbstractVectorField):
+    """ẋ = u − c x + p."""
+
+    friction: jax.Array
+    push: jax.Array | float
+
+    def __call__(self, x, u):
+        return u - self.friction * x + self.push
+
+
 SLIDE = Slide(jnp.array(1.0), jnp.array(1.0))
 
 
@@ -174,7 +184,8 @@ def test_a_run_beside_others_is_the_run_alone():
     ("options", "said"),
     [
         ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
-        ({"prior": {"friction": 0.1}}, "prior: idle must be given"),
+        ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it is to stay as it is"),
+        ({"prior": 0.0}, "prior must be positive for a parameter at least, got 0 for all"),
         ({"disturbance": 1.0}, "indices must say"),
         (
             {"disturbance": (1.0, 1.0), "indices": (0,)},
@@ -187,6 +198,10 @@ def test_a_run_beside_others_is_the_run_alone():
         ({"tuning": "x"}, "tuning must be a Tuning, got 'x'"),
         ({"causes": hj.Cause("a", {"friction": 0.3})}, "causes must be a list of Cause, got Cause"),
         ({"causes": ("friction",)}, "causes must be a list of Cause, got"),
+        (
+            {"prior": {"friction": 0.1, "idle": 0.0}, "causes": [hj.Cause("a", {"idle": 1})]},
+            "cause a: idle must be among",
+        ),
         ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
     ],
 )
@@ -220,6 +235,17 @@ def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
         adaptation().update(state, [0.0, 0.0], [0.0])
     with pytest.raises(ValueError, match=r"^elapsed must be a finite number of at least 0, got -1"):
         adaptation().update(state, [0.0], [0.0], elapsed=-1)
+
+
+@pytest.mark.parametrize("causes", [(), (hj.Cause("push", {"push": 1.0}),)], ids=["alone", "causes"])
+def test_a_parameter_with_a_prior_of_zero_is_held(causes):
+    field, prior = Towed(jnp.array(1.0), jnp.array(0.0)), {"friction": 0.0, "push": 1.0}
+    state = last(watch(OnlineAdaptation(field, DT, NOISE, prior, causes=causes), *run(Towed(field.friction, 0.7), 150)))
+    held = OnlineAdaptation(field, DT, NOISE, prior, causes=causes)
+    found, intervals = held.model(state), held.intervals(state)
+    assert found.friction == intervals["friction"].low == intervals["friction"].high == field.friction
+    assert intervals["push"].low < 0.7 < intervals["push"].high
+    assert state.restarts == 0
 
 
 def test_a_tuning_that_makes_no_sense_is_refused():
