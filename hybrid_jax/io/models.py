@@ -67,9 +67,11 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
             container or module; names its path.
         OSError: the file cannot be written.
     """
+    about = {} if about is None else about
+    checks.instance("about", about, Mapping)
     structure = Structure(field)
     arrays = named_leaves({"field": field}) | {key: to_numpy(leaf) for key, leaf in structure.static_arrays.items()}
-    save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about or {})}, arrays)
+    save_archive(path, FORMAT, {"field": structure.tree, "about": dict(about)}, arrays)
     if structure.problem is not None:
         warnings.warn(f"{path}: this model can only be loaded with like=: {structure.problem}", stacklevel=2)
 

@@ -130,3 +130,8 @@ def test_numbers_that_are_not_finite_and_steps_that_are_not_positive_are_refused
     for dt in (0.0, -0.01, bad):
         with pytest.raises(ValueError, match="dt must be a positive"):
             models.Model(PHYSICS).predict(*flight(), dt)
+
+
+def test_about_is_a_mapping(tmp_path):
+    with pytest.raises(ValueError, match=r"^about must be a Mapping, got 'hello'"):
+        save(tmp_path / "model.npz", pendulum(), about="hello")
