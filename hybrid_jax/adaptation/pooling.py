@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from jaxtyping import Float
 
+from hybrid_jax import checks
 from hybrid_jax.adaptation.adapting import Adaptation, Parameter
 from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.uncertainty import check_level, named_parameters
@@ -29,6 +30,7 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
         ValueError: fewer than three results, or one without intervals; the message says which.
     """
     check_level(level)
+    results = checks.list_of("results", results, Adaptation)
     if len(results) < SOURCES:
         raise ValueError(f"results must be of at least {SOURCES} sources, got {len(results)}")
     for i, result in enumerate(results):

@@ -100,7 +100,7 @@ def fit_in_stages(
         ValueError: as `fit`; no stages; windows shorter than a stage needs; or rates of a group that the field has not.
     """
     data, shared, weight = checked_arguments(field, train, validation, key, settings, optimiser, regulariser_weight)
-    if not stages:
+    if not (stages := checks.list_of("stages", stages, Stage)):
         raise ValueError("stages must be some Stage, got none")
     field, results = ready(field, train), []
     steps = [(rates_by_group(field, stage.rates), cut(data, stage.steps), stage) for stage in stages]

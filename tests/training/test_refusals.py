@@ -108,7 +108,13 @@ def test_one_window_is_not_normalised_by_itself(alone):
 
 
 @pytest.mark.parametrize(
-    ("stages", "said"), [([], "stages"), ([Stage({"": 0.1}, steps=9)], "steps"), ([Stage({"wing": 0.1})], "'wing'")]
+    ("stages", "said"),
+    [
+        ([], "stages"),
+        (Stage({"": 0.1}), "stages must be a list of Stage, got Stage"),
+        ([Stage({"": 0.1}, steps=9)], "steps"),
+        ([Stage({"wing": 0.1})], "'wing'"),
+    ],
 )
 def test_stages_that_make_no_sense_are_refused(stages, said):
     with pytest.raises(ValueError, match=said):
