@@ -10,6 +10,7 @@ import numpy as np
 import optax
 from jaxtyping import Array, Int, PyTree
 
+from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
 from hybrid_jax.adaptation.uncertainty import select_disturbance
@@ -68,15 +69,18 @@ class LeastSquares:
     def __post_init__(self):
         if self.disturbance not in ("auto", True, False):
             raise ValueError(f"disturbance must be 'auto', True or False, got {self.disturbance!r}")
+        if self.indices is not None:
+            checks.places("indices", self.indices)
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         n, d = train.x0.shape
         options = settings.solver, self.max_steps, scale_of(settings.objective, d)
-        larger = sized(with_disturbance(field, self.indices), d)
+        indices = None if self.indices is None else checks.places("indices", self.indices, d)
+        larger = sized(with_disturbance(field, indices), d)
         start = larger if self.disturbance is True else field
         check_determined(start, n)
         if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # else there are too few to decide
-            found = select_disturbance(field, train, *options, self.indices).fit
+            found = select_disturbance(field, train, *options, indices).fit
         else:
             found = fit_least_squares(start, train, *options)
         status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
@@ -95,6 +99,11 @@ class FineTune:
     regulariser_weight: float = 1e-3  # λ of `settings.regulariser`, if there is one
     l2_sp: float = 0.0  # weight of half the squared distance from the source's parameters, see `held_at_start`
     seed: int = 0  # of the order of minibatches
+
+    def __post_init__(self):
+        if self.frozen not in (None, "physics", "residual"):
+            raise ValueError(f"frozen must be 'physics', 'residual' or None, got {checks.short_repr(self.frozen)}")
+        checks.count("seed", self.seed, least=0)
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         if self.frozen and not isinstance(field, Hybrid):

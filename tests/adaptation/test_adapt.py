@@ -2,6 +2,7 @@
 
 import inspect
 import json
+import re
 import textwrap
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -215,6 +216,20 @@ class Weights(AbstractVectorField):
 
 
 @pytest.mark.parametrize(
+    ("method", "options", "said"),
+    [
+        (FineTune, {"frozen": "residuals"}, "frozen must be 'physics', 'residual' or None, got 'residuals'"),
+        (FineTune, {"seed": "x"}, "seed must be an integer of at least 0, got 'x'"),
+        (LeastSquares, {"indices": (1, 1)}, "indices must be different integers of at least 0, got (1, 1)"),
+        (LeastSquares, {"indices": 1}, "indices must be different integers of at least 0, got 1"),
+    ],
+)
+def test_a_method_that_makes_no_sense_is_refused(method, options, said):
+    with pytest.raises(ValueError, match=f"^{re.escape(said)}$"):
+        method(**options)
+
+
+@pytest.mark.parametrize(
     ("field", "options", "said"),
     [
         (
@@ -224,6 +239,7 @@ class Weights(AbstractVectorField):
         ),
         (pendulum(), {"method": 3}, "method must have a method solve, see Method, got 3"),
         (pendulum(), {"settings": {"batch_size": 10}}, "settings must be a Settings, got {'batch_size': 10}"),
+        (pendulum(), {"method": LeastSquares(indices=(9,))}, "indices must be different .* and at most 1, got"),
         (pendulum(), {"level": 95}, "level must be between 0 and 1, got 95"),
         (pendulum(), {"method": "theta_only"}, "field must be a Hybrid where its residual is frozen, got Pendulum"),
         (pendulum(), {"method": "last_layer"}, "last_layer needs a field whose residual is a ResidualNetwork"),
