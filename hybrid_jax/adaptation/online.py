@@ -60,7 +60,7 @@ class OnlineAdaptation(AbstractEstimator):
             a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
             array, efficiency. Zero holds a parameter.
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
-        indices: of the disturbed states; by default v̇ and ω̇ of a rigid body.
+        indices: of the disturbed states; by default those that the field has, or v̇ and ω̇ of a rigid body.
         process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
         initial: share of the prior that is uncertain at the start, before a change.
         causes: of which one may change at a time, each of a few parameters, found by how well it explains the samples.
@@ -104,7 +104,8 @@ class OnlineAdaptation(AbstractEstimator):
         checks.instance("tuning", self.tuning, Tuning)
         indices = None if indices is None else checks.places("indices", indices)
         if np.any(disturbance):
-            if indices is None and not moves_a_rigid_body(physics_of(field)):
+            known = disturbance_of(field) is not None or moves_a_rigid_body(physics_of(field))
+            if indices is None and not known:
                 raise ValueError("indices must say which states are disturbed, as the system is no rigid body")
             field = with_disturbance(field, indices)
         self.field, self.dt, self.initial = field, float(dt), float(initial)

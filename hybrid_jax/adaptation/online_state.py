@@ -69,8 +69,7 @@ def named_priors(
         scale = next(disturbed) if group == DISTURBANCE else own.get(name, own.get(group))
         if scale is None:
             raise ValueError(f"prior: {group} must be given, 0 if it is to stay as it is")
-        what, check = (group, checks.positive) if group == DISTURBANCE else (f"prior of {name}", checks.not_negative)
-        check(what, scale)
+        checks.not_negative(group if group == DISTURBANCE else f"prior of {name}", scale)
         found.append(float(scale))
     if not any(found):
         raise ValueError("prior must be positive for a parameter at least, got 0 for all")

@@ -10,6 +10,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import OnlineAdaptation, Tuning
+from hybrid_jax.dynamics.disturbance import disturbance_of, disturbed, with_disturbance
 from hybrid_jax.integrate import rk4_step
 
 DT, NOISE = 0.05, 0.01
@@ -171,6 +172,17 @@ def test_what_the_model_cannot_explain_is_not_believed():
     assert adaptation().flags(last(states)).inconsistent
     rejected = np.flatnonzero(np.asarray(states.nis) >= adaptation().tuning.reject)
     np.testing.assert_array_equal(states.trusted[-1], states.trusted[rejected[0] - 1])
+
+
+def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
+    pushed = disturbed(SLIDE, jnp.array([0.5]), (0,))
+    samples, u = run(pushed, 100)
+    held = watch(OnlineAdaptation(pushed, DT, NOISE), samples, u)
+    assert OnlineAdaptation(pushed, DT, NOISE).names[-1] == "disturbance[0]"
+    assert not held.theta[:, -1].any()
+    learning = OnlineAdaptation(with_disturbance(SLIDE, (0,)), DT, NOISE, disturbance=1.0, tuning=CALM)
+    found = learning.model(jax.tree.map(lambda leaf: leaf[-1], watch(learning, samples, u)))
+    assert disturbance_of(found).value == pytest.approx([0.5], abs=0.05)
 
 
 def test_a_run_beside_others_is_the_run_alone():
