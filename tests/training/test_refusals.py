@@ -51,6 +51,7 @@ REFUSED = {
     "optimiser": (pendulum(), {"optimiser": "adam"}, r"optimiser must be an optax\.GradientTransformation"),
     "hidden": (Stopped(jnp.ones(()), NETWORK), {}, "field: Stopped holds a BatchNorm whose minibatch statistics"),
     "float": (Stiff(1.0), {}, f"field: {NOTHING.format('Stiff')}"),
+    "integer": (Hybrid(Stiff(jnp.array(1)), NETWORK), {}, "field: physics.length is an integer, which is not learned;"),
     "frozen": (Frozen(pendulum()), {}, f"field: {NOTHING.format('Frozen')}"),
     "function": (lambda x, u: x, {}, f"field: {NOTHING.format('function')}"),
     "another dt": (pendulum(), {"validation": replace(VALIDATION, dt=0.1)}, "validation: dt must be 0.05, .* got 0.1$"),
