@@ -126,7 +126,7 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
     verdicts, out = evaluate(CLAIMS, evidence), config.out / NAME
     figures = {
         "intervals": (interval_figure(rows), "95 % intervals of each flight; a dot is a seed, a bar their mean."),
-        "flight": (flight_figure(design, own), "The designed flight: planned (broken) and flown."),
+        "flight": (flight_figure(design, own), "The designed flight: planned (dashed) and flown."),
     }
     report = Report(
         experiment=NAME,

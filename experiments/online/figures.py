@@ -38,6 +38,14 @@ SHOWN: Mapping[str, tuple[tuple[int, str], ...]] = {
     "drag": ((9, "added drag, body x [1/s]"), (10, "body y")),
     "nothing": ((5, "log efficiency of rotor 0"), (0, "log Ix / nominal")),
 }
+AXES = {
+    "inertia": "log ratio",
+    "load": "log ratio; offset / arm",
+    "wind": "disturbance [m/s²]",
+    "weak_rotor": "log efficiency",
+    "drag": "added drag [1/s]",
+    "nothing": "log ratio",
+}
 
 
 def indices(run: Run, **tags) -> list[int]:
@@ -94,11 +102,11 @@ def parameters(run: Run, setting: Setting, reference: str) -> Figure:
         truths = [_truth(change, index) for index, _ in SHOWN[change]]
         low, high = min(values[-100:].min(), *truths, 0), max(values[-100:].max(), *truths, 0)
         room = 0.8 * (high - low) + 0.05
-        panel.set(title=CHANGE_NAMES[change], ylim=(low - room, high + room))
+        panel.set(title=CHANGE_NAMES[change], ylabel=AXES[change], ylim=(low - room, high + room))
         panel.axvline(0, color="0.7", linestyle=":", linewidth=1)
     for panel in panels[-1]:
         panel.set_xlabel("time after the change [s]")
-    title = f"Seed 0, {REFERENCES[reference]}: estimates, 95 % intervals, truth (broken; of wind its mean)"
+    title = f"Seed 0, {REFERENCES[reference]}: estimates, 95 % intervals, truth (dashed; of wind its mean)"
     figure.suptitle(title, fontsize=9)
     return figure
 

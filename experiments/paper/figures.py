@@ -38,7 +38,7 @@ LOWEST_RHO = -1.0
 DECADES = 6  # of error, from the smallest mean up
 LARGEST_BIAS = 100.0  # % of a parameter
 HOME, FLOOR = "on source flights", "floor"  # errors of the source there, and of every model
-MEANING = "mean ± std over seeds; hollow: of the finite ones"
+MEANING, SOME_FAILED = "mean ± std over seeds", "hollow: of the finite ones"
 
 
 class _Curve(NamedTuple):
@@ -63,24 +63,30 @@ def scores(rows: Results, title: str, floor: float = 0.0) -> Figure:
     curves = _curves(rows, "test_mse")
     _draw_errors(upper, curves, floor)
     _draw_home(upper, rows.where(lambda row: "source_mse" in row))
-    _draw_gains(lower, _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain))
+    gains = _curves(rows.where(mode=(FINE_TUNED, TARGET_ONLY)), gain)
+    _draw_gains(lower, gains)
     sizes = adapted_sizes(rows)
     lower.set_xlabel("N, target trajectories trained on")
     lower.set_xticks(sizes, [str(n) for n in sizes])
-    return _legend(figure, title, curves)
+    return _legend(figure, title, [curves, gains])
 
 
-def _legend(figure: Figure, title: str, curves: "_Curves") -> Figure:
-    """Colours of the models, then lines of the ways to train them."""
-    models, modes = (dict.fromkeys(key[i] for key in curves) for i in (0, 1))
-    entries: dict[str, Artist] = {label(model): Line2D([], [], color=colour(model), linewidth=4) for model in models}
+def _legend(figure: Figure, title: str, drawn: Sequence[_Curves]) -> Figure:
+    """Colours of the models, then lines of the ways to train them; `drawn` has the curves of each panel."""
+    models, modes = (dict.fromkeys(key[i] for curves in drawn for key in curves) for i in (0, 1))
+    entries: dict[str, Artist] = {
+        label(model).replace("θ_p", r"$\theta_p$"): Line2D([], [], color=colour(model), linewidth=4) for model in models
+    }
     style = {"color": "0.2", "markersize": 4}
     entries |= {label(mode): Line2D([], [], ls=DASHES[mode], marker=MARKERS[mode], **style) for mode in modes}
     # Lines of no model: words beside them would lie on other lines.
     others = {str(line.get_label()): line for axes in figure.axes for line in axes.get_lines()}
     entries |= {name: others[name] for name in (HOME, FLOOR) if name in others}
+    marked = [curve for curves in drawn for (_, mode), curve in curves.items() if mode != SOURCE_ONLY]
+    hollow = any(((curve.failed > 0) & (curve.failed < curve.seeds)).any() for curve in marked)
+    meaning = f"{MEANING}; {SOME_FAILED}" if hollow else MEANING
     figure.suptitle(title)
-    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title=MEANING)
+    figure.legend(entries.values(), entries.keys(), loc="outside lower center", ncols=2, title=meaning)
     return figure
 
 
@@ -90,18 +96,19 @@ def theta(rows: Results, truth: Mapping[str, float]) -> Figure:
     known = rows.where(lambda row: row["theta"] is not None, mode=(FINE_TUNED, TARGET_ONLY))
     sizes = adapted_sizes(known)
     figure, (panels,) = subplots((PAGE, 3.2), 1, len(THETA))
+    drawn = []
     for axes, name in zip(panels, THETA, strict=True):
 
         def bias(row: Row, name: str = name) -> float:
             value = row["theta"][name]
             return math.inf if value is None else 100 * (value / truth[name] - 1)
 
-        _draw_biases(axes, _curves(known, bias))
+        drawn.append(_curves(known, bias))
+        _draw_biases(axes, drawn[-1])
         axes.set(title=f"{name}, true value {truth[name]:.4g} {UNITS[name]}", xlabel="N, target trajectories")
         axes.set_xticks(sizes, [str(n) for n in sizes])
     panels[0].set_ylabel("recovered / true − 1  [%]")
-    known_by = _curves(known, lambda row: 0.0)
-    return _legend(figure, "Physical parameters after training; grey: within 5 % of the truth", known_by)
+    return _legend(figure, "Physical parameters after training; grey: within 5 % of the truth", drawn)
 
 
 def ranking(rows: Results, title: str, floors: Mapping[str, float] = MappingProxyType({})) -> Figure:

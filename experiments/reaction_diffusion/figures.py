@@ -67,7 +67,7 @@ def spectra(shown: Shown) -> Figure:
         error = _component(_forecast(shown, name), 0)[:, -1] - truth
         if np.isfinite(error).all():
             axes.loglog(*_spectrum(error), color=f"C{i}", linestyle=("-", "--")[i > 5], linewidth=1, label=name)
-    axes.set(xlabel="wavenumber [waves per side]", ylabel="mean power of u")
+    axes.set(xlabel="wavenumber [waves per side]", ylabel="mean power of u (truth) and of the error")
     return legend_below(figure, columns=2)
 
 

@@ -110,7 +110,7 @@ def error_legend(figure: Figure, title: str, failed: bool) -> Figure:
     bar = {"color": "0.3", "marker": "|", "markersize": 12, "markeredgewidth": 2.2, "linestyle": ""}
     entries = {
         "a run": Line2D([], [], color="0.3", alpha=0.55, marker="o", markersize=4, linestyle=""),
-        "mean over runs (broken: over the finite ones)" if failed else "mean over runs": Line2D([], [], **bar),
+        "mean over runs (dashed: over the finite ones)" if failed else "mean over runs": Line2D([], [], **bar),
     }
     return legend_below(figure, title, columns=2, entries=entries)
 
