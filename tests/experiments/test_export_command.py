@@ -80,7 +80,7 @@ def test_a_model_without_parameters_has_no_filter(tmp_path, capsys):
 @pytest.mark.parametrize(
     ("about", "options", "message"),
     [
-        ({"dt": 0.02}, ["--state-size", "12"], "field: Hybrid does not take"),
+        ({"dt": 0.02}, ["--state-size", "12"], "field: RigidBody does not take"),
         *(
             ({"dt": 0.02}, ["--dt", dt], f"--dt must be a positive number of seconds, got {dt}")
             for dt in ("-0.01", "0", "nan")
