@@ -11,11 +11,18 @@ from hybrid_jax import checks
 
 T = TypeVar("T")
 FEWEST_ROTORS, MOST_ROTORS = 3, 12
+# Of vehicles that fly, the radius of gyration √(I / m) is 0.2 to 1 times the longest arm.
+LONGEST_ARM = 10.0  # m
+LEAST_GYRATION, MOST_GYRATION = 0.01, 10.0  # times the longest arm
+ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: of a flat body with two digits
 
 
 @dataclass(frozen=True)
 class Vehicle:
-    """The constants of a multirotor, body frame x forward, y left, z up; ValueError unless positive and finite."""
+    """The constants of a multirotor, body frame x forward, y left, z up.
+
+    ValueError unless positive and finite, and of a body and in units that a vehicle can have.
+    """
 
     mass: float  # kg
     inertia: tuple[float, float, float]  # principal moments (Ix, Iy, Iz), kg m²
@@ -46,6 +53,24 @@ class Vehicle:
             (checks.not_negative if name == "rotor_radius" else checks.positive)(name, value)
         if not isinstance(self.name, str):
             raise ValueError(f"name must be text, got {checks.short_repr(self.name)}")
+        self._require_possible()
+
+    def _require_possible(self) -> None:
+        """Refuse what no body has, and lengths and moments that are in another unit."""
+        arm = max(math.hypot(*place) for place in self.rotor_positions)
+        if len(set(self.rotor_positions)) < 2:
+            raise ValueError(f"rotor_positions must not all be one point, got {self.rotor_positions[0]} for each rotor")
+        if arm > LONGEST_ARM:
+            raise ValueError(f"rotor_positions must be in m: a rotor is {arm:.4g} m from the centre; 1 mm is 0.001")
+        largest = max(self.inertia)
+        if largest > (1 + ROUNDING) * (sum(self.inertia) - largest):
+            rule = "a body's largest moment is at most the sum of the other two"
+            raise ValueError(f"inertia must be (Ix, Iy, Iz) in kg m² of one body, got {self.inertia}: {rule}")
+        low, high = (self.mass * (factor * arm) ** 2 for factor in (LEAST_GYRATION, MOST_GYRATION))
+        if not low <= largest <= high:
+            units = "mass in kg, rotor_positions in m, inertia in kg m² (1 g cm² is 1e-7)"
+            fits = f"{self.mass:.4g} kg with rotors {arm:.4g} m from the centre has {low:.2g} to {high:.2g} kg m²"
+            raise ValueError(f"inertia must fit to mass and rotor_positions, got {largest:.4g}: {fits}; give {units}")
 
     @property
     def rotors(self) -> int:

@@ -85,6 +85,43 @@ def test_malformed_constants_are_named(written, key, value):
     assert key in refusal(written(**{key: value}))
 
 
+IMPOSSIBLE = {
+    "mm": ({"rotor_positions": "[[100, -200], [-100, 200], [100, 200], [-100, -200]]"}, "rotor_positions must be in m"),
+    "cm": (
+        {"rotor_positions": "[[4, -4], [-4, 4], [4, 4], [-4, -4]]", "inertia": "[2e-5, 2e-5, 3e-5]"},
+        "inertia must",
+    ),
+    "one point": ({"rotor_positions": "[[0, 0], [0, 0], [0, 0], [0, 0]]"}, "rotor_positions must not all be one point"),
+    "g cm²": ({"inertia": "[2.9e5, 3.0e5, 5.5e5]"}, "inertia in kg m² (1 g cm² is 1e-7)"),
+    "no body": ({"inertia": "[0.029, 0.03, 0.55]"}, "inertia must be (Ix, Iy, Iz) in kg m² of one body"),
+}
+
+
+@pytest.mark.parametrize(("changes", "message"), IMPOSSIBLE.values(), ids=IMPOSSIBLE)
+def test_what_no_vehicle_has_is_refused(written, changes, message):
+    """Each passed every check of a log, and was then learned away from."""
+    found = refusal(written(**changes))
+    assert found.startswith(": [vehicle]: ")
+    assert message in found
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"inertia": "[1.0e-2, 1.0e-2, 2.1e-2]"},  # a flat body, 1.04 and 2.08 to two digits
+        {"mass": "600", "inertia": "[1500, 1500, 2900]", "rotor_positions": "[[4, -4], [-4, 4], [4, 4], [-4, -4]]"},
+        {
+            "mass": "0.0001",
+            "inertia": "[1e-9, 1e-9, 2e-9]",
+            "rotor_positions": "[[9e-3, 0], [-9e-3, 0], [0, 9e-3], [0, 0]]",
+        },
+    ],
+    ids=["flat", "air taxi", "insect"],
+)
+def test_flat_large_and_small_vehicles_are_read(written, changes):
+    assert load_vehicle(written(**changes)).rotors == 4
+
+
 PAYLOAD = "[vehicle.payload]\nmass = 2.0\n"
 
 
