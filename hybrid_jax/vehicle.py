@@ -11,6 +11,7 @@ from hybrid_jax import checks
 
 T = TypeVar("T")
 FEWEST_ROTORS, MOST_ROTORS = 3, 12
+TABLES = ("vehicle", "learn", "terms", "actuator", "purpose")  # of a vehicle file: see `dynamics.vehicle_file`
 # Of vehicles that fly, the radius of gyration √(I / m) is 0.2 to 1 times the longest arm.
 LONGEST_ARM = 10.0  # m
 LEAST_GYRATION, MOST_GYRATION = 0.01, 10.0  # times the longest arm
@@ -86,6 +87,8 @@ class Vehicle:
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     """Read the table `[vehicle]` of a TOML file whose keys are the attributes of `Vehicle`.
 
+    `dynamics.vehicle_file.load_vehicle_model` reads its other tables, too, and checks what is in them.
+
     Args:
         variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
             All variants of the file are checked.
@@ -93,7 +96,10 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     Raises:
         ValueError: the file, the key and what was expected, in one line.
     """
-    return vehicle_of(read_tables(path), path, variant)
+    tables = read_tables(path)
+    vehicle = vehicle_of(tables, path, variant)
+    require_known(str(path), tables, TABLES)
+    return vehicle
 
 
 def read_tables(path: str | Path) -> dict[str, Any]:

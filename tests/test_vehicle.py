@@ -122,6 +122,10 @@ def test_flat_large_and_small_vehicles_are_read(written, changes):
     assert load_vehicle(written(**changes)).rotors == 4
 
 
+def test_unknown_tables_are_refused(written):
+    assert ": 'vehicel': must be one of vehicle, learn," in refusal(written(below="[vehicel]\nmass = 2.0"))
+
+
 PAYLOAD = "[vehicle.payload]\nmass = 2.0\n"
 
 

@@ -15,13 +15,14 @@ from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.real_flight.config import read_topics
 from experiments.runner import command
 from experiments.runner.options import Positive, check_numbers
+from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.column_map import load_column_map
 from hybrid_jax.flights.consistency import check_log
 from hybrid_jax.flights.loading import Reading, asked_interval, read_log
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.suitability import check_recording
 from hybrid_jax.io.files import json_value, write_atomic
-from hybrid_jax.vehicle import Vehicle, load_vehicle
+from hybrid_jax.vehicle import Vehicle
 
 NAME = "inspect_logs"
 LISTS = ("--polynomial", "--motor-order", "--topics")
@@ -81,7 +82,7 @@ def inspect(options: Options) -> None:
     read_topics(options.topics)
     if options.write_vehicle is not None and options.write_vehicle.exists():
         raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
-    vehicle = None if options.vehicle is None else load_vehicle(options.vehicle)
+    vehicle = None if options.vehicle is None else load_vehicle_model(options.vehicle).vehicle
     folder = options.folder
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")

@@ -16,11 +16,10 @@ from hybrid_jax.dynamics.actuators import NAMES, Actuated, Actuator, actuated, c
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import Terms, check_names
-from hybrid_jax.vehicle import Vehicle, from_table, read_tables, require_known, vehicle_of
+from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
 LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.cleaning`
 NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, they would absorb other effects
-TABLES = ("vehicle", "learn", "terms", "actuator", "purpose")
 
 
 @dataclass(frozen=True)

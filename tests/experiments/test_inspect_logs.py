@@ -111,10 +111,12 @@ def test_a_folder_is_described_whatever_is_in_it(tmp_path, capsys):
         (["--topics", "/odom"], "--topics must be words such as"),
         (["--dt", "0"], "--dt must be a positive"),
         (["--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
+        (["--vehicle", "mas.toml"], "mas.toml: learn must be names of"),  # which real_flight would refuse later
     ],
 )
 def test_bad_options_end_in_one_line(tmp_path, monkeypatch, capsys, options, words):
     write(tmp_path / "flights", LOGS[:1])
+    (tmp_path / "mas.toml").write_text('learn = ["Ix", "mas"]\n' + vehicle_toml(IRIS))
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as stop:
         main(["flights", *options])
