@@ -122,6 +122,12 @@ def test_flat_large_and_small_vehicles_are_read(written, changes):
     assert load_vehicle(written(**changes)).rotors == 4
 
 
+def test_a_byte_order_mark_is_passed_over(written):
+    path = written()
+    path.write_bytes(b"\xef\xbb\xbf" + path.read_bytes())
+    assert load_vehicle(path).mass == 1.5
+
+
 def test_unknown_tables_are_refused(written):
     assert ": 'vehicel': must be one of vehicle, learn," in refusal(written(below="[vehicel]\nmass = 2.0"))
 
