@@ -6,6 +6,7 @@ from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from jaxtyping import Float, Int
 from matplotlib.figure import Figure
 
 from experiments.reporting.plots import STYLE, save_figure
@@ -68,13 +69,26 @@ def _fitted(found: Identified):
 
 def _predicted(found: Identified, recording: Recording, layout: Layout, names) -> Table:
     errors = prediction_errors(found.field, [recording], layout, names)
-    lines = []
-    for name, part in errors.items():
-        at = [max(1, part.shape[1] // 4), part.shape[1]]
-        cells = ["  ".join(f"{e:.3g}" for e in np.sqrt(np.nanmean(part[:, k - 1] ** 2, axis=0))) for k in at]
-        lines.append((name, _unit(name), *cells))
-    ends = [f"after {layout.dt * max(1, layout.steps // 4):.3g} s", f"after {layout.dt * layout.steps:.3g} s"]
+    asked = max(1, layout.steps // 4), layout.steps
+    lines = [(name, _unit(name), *(_nearest(part, step, layout.dt) for step in asked)) for name, part in errors.items()]
+    ends = [f"after {layout.dt * step:.3g} s" for step in asked]
     return Table(f"RMS of what was predicted of {Path(recording.name).name}", ("quantity", "unit", *ends), lines)
+
+
+def _by_step(part: Float[np.ndarray, "n t k"]) -> tuple[Int[np.ndarray, " m"], Float[np.ndarray, "m k"]]:
+    """The steps, from 1, at which something was measured in any window, and the RMS of the errors there."""
+    steps = np.flatnonzero(~np.isnan(part).all(axis=(0, 2)))
+    return steps + 1, np.sqrt(np.nanmean(part[:, steps] ** 2, axis=0))
+
+
+def _nearest(part: Float[np.ndarray, "n t k"], asked: int, dt: float) -> str:
+    """The errors at the measured step that is nearest to the one asked for, with its time if it is another."""
+    steps, errors = _by_step(part)
+    if not len(steps):
+        return "not measured"
+    at = int(np.abs(steps - asked).argmin())
+    shown = "  ".join(f"{each:.3g}" for each in errors[at])
+    return shown if steps[at] == asked else f"{shown} ({dt * steps[at]:.3g} s)"
 
 
 def figure(out: Path, found: Identified, logs, left_out, layout: Layout, names) -> dict[str, str]:
@@ -83,9 +97,9 @@ def figure(out: Path, found: Identified, logs, left_out, layout: Layout, names) 
     with mpl.rc_context(STYLE):
         picture = Figure(figsize=(3.2 * len(errors), 2.8), layout="constrained")
         for panel, (name, part) in zip(np.atleast_1d(picture.subplots(1, len(errors))), errors.items(), strict=True):
-            t = layout.dt * np.arange(1, part.shape[1] + 1)
+            steps, rms = _by_step(part)
             axes = logs[0].signals[name].axes if name != "attitude" else ("x", "y", "z")
-            panel.plot(t, np.sqrt(np.nanmean(part**2, axis=0)), label=axes)
+            panel.plot(layout.dt * steps, rms, marker="." if len(steps) < part.shape[1] else None, label=axes)
             panel.set(xlabel="time from the start [s]", ylabel=f"RMS error [{_unit(name)}]", title=name)
             panel.legend()
         save_figure(picture, out / "errors")

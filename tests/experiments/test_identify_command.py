@@ -5,6 +5,7 @@ import pytest
 
 import hybrid_jax as hj
 from experiments.identify.__main__ import main
+from experiments.identify.report import _by_step, _nearest
 from hybrid_jax.vehicle import IRIS
 
 VEHICLE = f"""
@@ -64,6 +65,17 @@ def test_a_folder_of_commands_becomes_a_report_and_a_model(files):
     assert "time_constant" in page
     assert "two.csv" in page
     assert (folder / "out" / "errors.png").stat().st_size > 0
+
+
+def test_errors_are_shown_at_steps_that_were_measured():
+    """By default steps are of 5 ms, and a log at 100 Hz has samples at every second one: the tables were nan."""
+    part = np.full((3, 20, 2), np.nan)
+    part[:, 1::2] = 0.5
+    steps, errors = _by_step(part)
+    np.testing.assert_array_equal(steps, np.arange(2, 21, 2))
+    np.testing.assert_array_equal(errors, np.full((10, 2), 0.5))
+    assert _nearest(part, 5, 0.005) == "0.5  0.5 (0.02 s)"
+    assert _nearest(part, 20, 0.005) == "0.5  0.5"
 
 
 @pytest.mark.parametrize(
