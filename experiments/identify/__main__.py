@@ -1,6 +1,8 @@
 """Identify a vehicle from logs of commands: python -m experiments.identify --help"""
 
+import sys
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -9,6 +11,7 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
+from experiments.identify.checked import check_consistent, check_whole, require_distinct
 from experiments.identify.report import figure, tables
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
@@ -25,6 +28,7 @@ from hybrid_jax.identification.measured import Initial, Layout
 from hybrid_jax.io import save
 
 NAME = "identify"
+ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
 @dataclass(frozen=True)
@@ -42,6 +46,8 @@ class Config:
 
     Position, velocity, attitude, body rates and accelerometer may each be missing. Each parameter comes with a 95 %
     interval; one that the logs do not tell has an infinite one.
+
+    Logs are checked first, as far as their signals allow. A check that fails stops with exit code 3; --anyway goes on.
     """
 
     folder: Annotated[Path, tyro.conf.Positional]
@@ -71,47 +77,80 @@ class Config:
     columns: Path | None = None
     """Column map of CSV logs."""
     motor_order: tuple[int, ...] = ()
-    """Which motor of the log, from 0, each rotor of the vehicle is."""
+    """Which motor of the log, from 0, each rotor of the vehicle is, such as 2,0,3,1."""
+    anyway: bool = False
+    """Go on although checks of the logs failed: the page then says so first."""
 
     @property
     def layout(self) -> Layout:
         return Layout(self.dt, self.steps, self.windows, initial=self.initial)
 
 
-def recordings(config: Config) -> tuple[list[Recording], list[Recording]]:
-    """Logs to learn from, and those left out."""
+def recordings(config: Config) -> tuple[list[Recording], list[Recording], list[str]]:
+    """Logs to learn from, and those left out; also what their readers say, and which files were not read."""
     read = partial(read_recording, columns=config.columns, motor_order=config.motor_order)
     out = [read(path) for path in config.test]
-    files = find_logs(config.folder)[0] if config.folder.is_dir() else [config.folder]
+    files, others = find_logs(config.folder) if config.folder.is_dir() else ([config.folder], {})
     left = {path.resolve() for path in config.test}
     found = [read(path) for path in files if path.resolve() not in left]
     if not found:
         raise ValueError(f"{config.folder}: holds no log besides those of --test")
-    return found, out
+    said = [f"{path.name}: left: {why}" for path, why in others.items()]
+    return found, out, said + [f"{Path(log.name).name}: {note}" for log in (*found, *out) for note in log.notes]
 
 
-def field_of(config: Config, logs: list[Recording]):
-    """The field to start from: told commands if the logs have any and the vehicle file has a table [actuator]."""
-    model: VehicleModel = load_vehicle_model(config.vehicle)
+def model_of(config: Config) -> VehicleModel:
+    model = load_vehicle_model(config.vehicle)
     model = replace(model, learn=config.learn) if config.learn else model
-    for log in logs:
+    return model
+
+
+def field_of(config: Config, model: VehicleModel, logs: list[Recording], left_out: list[Recording]):
+    """The field to start from: told commands if the logs have any and the vehicle file has a table [actuator]."""
+    for log in (*logs, *left_out):
         if log.rotors != model.vehicle.rotors:
             raise ValueError(f"{log.name}: has {log.rotors} motors, {config.vehicle} has {model.vehicle.rotors}")
-    commanded = model.actuator is not None and all("command" in log.signals for log in logs)
-    if not commanded and not all("rotor_speed" in log.signals for log in logs):
-        raise ValueError(f"{config.vehicle}: logs of commands need a table [actuator]; see --help")
-    return model.commanded() if commanded else model.physics()
+    speeds_alone = [log.name for log in logs if "command" not in log.signals]
+    told = "command" if model.actuator is not None and not speeds_alone else "rotor_speed"
+    for log in logs if told == "rotor_speed" else ():
+        if told not in log.signals:
+            mend = f"leave out {speeds_alone[0]}" if speeds_alone else "give it a table [actuator]; see --help"
+            raise ValueError(f"{config.vehicle}: {log.name} has commands and no rotor speeds: {mend}")
+    for log in left_out:
+        if told not in log.signals:
+            raise ValueError(f"--test {log.name}: has no {told}, which the other logs have; leave it out")
+    if told == "command":
+        return model.commanded()
+    return model.physics()
+
+
+def checked(config: Config, console: Console):
+    """The logs to learn from, those left out, the field to start from, lines for the page, and failed checks.
+
+    Raises:
+        ChecksFailed: a check failed, without --anyway.
+    """
+    model, (logs, left_out, said) = model_of(config), recordings(config)
+    require_distinct(logs, left_out)
+    say = partial(console.print, highlight=False, soft_wrap=True, markup=False)
+    for line in said:
+        say(line)
+    failed = check_whole([*logs, *left_out], model.vehicle, config.anyway)
+    field = field_of(config, model, logs, left_out)
+    failed += check_consistent([*logs, *left_out], field, model.learn, config.anyway)
+    for line in failed:
+        say(line, style="yellow")
+    return logs, left_out, field, said, failed
 
 
 def run(config: Config) -> None:
-    checks.writable_folder("--out", config.out)
-    runtime.configure()
-    console, began = Console(stderr=True), time.perf_counter()
-    logs, left_out = recordings(config)
-    field = field_of(config, logs)
     for name in config.measured:
         if name not in MEASURED:
             raise ValueError(f"--measured must be of {', '.join(MEASURED)}, got {name!r}")
+    checks.writable_folder("--out", config.out)
+    runtime.configure()
+    console, began = Console(stderr=True), time.perf_counter()
+    logs, left_out, field, said, failed = checked(config, console)
     alone = config.together or config.measured or not isinstance(field, Actuated)
     console.print(f"identifying {', '.join(log.name for log in logs)}", highlight=False, soft_wrap=True)
     if alone:
@@ -129,14 +168,18 @@ def run(config: Config) -> None:
         environment({"identification": seconds}),
         Results(rows),
         figures=pictures,
-        notes=notes,
+        notes=[*notes, *said, *failed],
         tables=shown,
         head=f"# What {', '.join(Path(log.name).name for log in logs)} tell of the vehicle",
+        warnings=[ANYWAY.format(len(failed))] if failed else [],
     )
     write_report(config.out, report, console)
 
 
-main = partial(command.call, NAME, Config, run)
+def main(arguments: Sequence[str] | None = None) -> None:
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    command.call(NAME, Config, run, given)
+
 
 if __name__ == "__main__":
     main()

@@ -43,8 +43,8 @@ def files(tmp_path, monkeypatch):
         w[i] = speed
         speed += (100 + 900 * told - speed) * (1 - np.exp(-dt / 0.08))
     force = 4 * 1.1 * IRIS.thrust_coefficient * w**2 / IRIS.mass + rng.normal(0, 0.1, len(t))
-    table = np.column_stack([t, rng.normal(0, 0.1, (len(t), 2)), force, *[c] * 4])
     for name in ("one", "two"):
+        table = np.column_stack([t, rng.normal(0, 0.1, (len(t), 2)), force, *[c] * 4])
         path = tmp_path / "logs" / f"{name}.csv"
         path.parent.mkdir(exist_ok=True)
         np.savetxt(path, table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
@@ -80,7 +80,11 @@ def test_errors_are_shown_at_steps_that_were_measured():
 
 @pytest.mark.parametrize(
     ("more", "said"),
-    [(["--learn", "gain"], "'gain'"), (["--measured", "speed"], "--measured must be of"), (["--steps", "0"], "steps")],
+    [
+        (["--learn", "gain"], "'gain'"),
+        (["--measured", "speed"], "--measured must be of"),
+        (["--steps", "0"], "steps"),
+    ],
 )
 def test_bad_options_end_in_one_line(files, capsys, more, said):
     with pytest.raises(SystemExit) as stop:

@@ -1,0 +1,137 @@
+"""Checks of logs before a vehicle is identified from them, as far as their signals allow."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from experiments.runner.command import ChecksFailed
+from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.flights.airborne import airborne
+from hybrid_jax.flights.consistency import THRUST, UNUSUAL, Check, check_log
+from hybrid_jax.flights.conversion import DT, STATES, to_flight
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.flights.samples import WXYZ, XYZ
+from hybrid_jax.flights.suitability import check_recording, failures
+from hybrid_jax.identification.between import SLOW
+from hybrid_jax.io.archive import digest
+from hybrid_jax.vehicle import Vehicle
+
+MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
+NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
+RATIO, MOTORS = "specific force over thrust per mass", "rotor_speed"
+GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
+LOOSE = 0.8  # relative error of the thrust that follows from commands, whose lag and curve are guesses
+OF_THRUST = {"curve", "mass", "k", "k_rotors"}
+# Checks of a flight: what they need, and the longest interval [s] of that at which they tell something. Identification
+# leaves out gaps and the ground by itself, and learns or ignores the lag.
+COMPARED = (
+    (("position", "velocity"), 0.05, ("dp/dt against v",)),
+    (("attitude", "rates"), 0.05, ("q̇ against ω",)),
+    (("attitude", "velocity", MOTORS), 0.11, (THRUST, RATIO)),
+    (("rates", MOTORS), SLOW, ("columns", "motor order against roll and pitch", "spin against yaw")),
+    ((MOTORS,), np.inf, ("interval between samples",)),
+)
+
+
+def require_distinct(logs: Sequence[Recording], left_out: Sequence[Recording]) -> None:
+    """Refuse a flight that occurs twice, whatever its files are called: it could be fitted and predicted."""
+    first: dict[str, str] = {}
+    for option, recordings in (("", logs), ("--test ", left_out)):
+        for each in recordings:
+            arrays = {f"{name} {part}": getattr(each.signals[name], part)
+                      for name in each.signals for part in ("t", "values")}  # fmt: skip
+            key, file = digest(None, arrays), f"{option}{each.name}"
+            if key in first:
+                raise ValueError(f"{file}: the same flight as {first[key]}; leave one of the two out")
+            first[key] = file
+
+
+def check_whole(recordings: Sequence[Recording], vehicle: Vehicle, anyway: bool) -> list[str]:
+    """Check logs as they were recorded; a line for each check that failed.
+
+    Raises:
+        ChecksFailed: a check failed, and it is not to go on anyway.
+    """
+    return _require([(each, check_recording(each, vehicle)) for each in recordings], anyway)
+
+
+def check_consistent(recordings: Sequence[Recording], field: Any, learn: Sequence[str], anyway: bool) -> list[str]:
+    """Compare the signals of each log, and those with the vehicle; lines and errors as of `check_whole`."""
+    return _require([(each, compared(each, field, learn)) for each in recordings], anyway)
+
+
+def _require(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
+    needed = [(Path(log.name).name, [each for each in checks if each.name not in NOT_NEEDED]) for log, checks in found]
+    lines = [line for name, checks in needed for line in failures(checks, name)]
+    if lines and not anyway:
+        raise ChecksFailed(*lines, MEND)
+    return lines
+
+
+def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Check]:
+    """The checks of a flight that the signals of a recording allow, each at the rate of the signals that it needs."""
+    body: Any = field.body if isinstance(field, Actuated) else field
+    signals = _signals(recording, field)
+    runs: dict[float, list[Check]] = {}
+    found: list[Check] = []
+    for needs, longest, names in COMPARED:
+        dt = round(max(DT, *(signals[name].interval if name in signals else np.inf for name in needs)), 6)
+        if dt > longest or not np.isfinite(dt):
+            continue
+        if dt not in runs:
+            runs[dt] = check_log(_flight(recording, signals, dt), body.vehicle)
+        found += [check for check in runs[dt] if check.name in names]
+    excused = set()
+    if not OF_THRUST.isdisjoint(learn):
+        excused |= {each for each in found if each.name == RATIO and 1 / GUESSED < each.value < GUESSED}
+    if isinstance(field, Actuated):
+        excused |= {each for each in found if each.suggestion == UNUSUAL and each.name == THRUST and each.value < LOOSE}
+    return [each for each in found if each not in excused]
+
+
+def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> FlightLog:
+    """The flight in the air, or all of it if it is never there; what it lacks rests at the origin."""
+    filled = _filled(recording, signals, dt)
+    log, first = to_flight(filled, dt), max(signal.t[0] for signal in filled.signals.values())
+    spans = airborne(replace(recording, signals={**recording.signals, MOTORS: signals[MOTORS]}), MOTORS)
+    flying = np.any([(log.t + first >= begin) & (log.t + first <= end) for begin, end in spans] or [[False]], axis=0)
+    return log[flying] if np.count_nonzero(flying) > 1 else log
+
+
+def _signals(recording: Recording, field: Any) -> dict[str, Signal]:
+    """What a flight is made of, with rotor speeds that follow from commands at once."""
+    found = {name: signal for name, signal in recording.signals.items() if len(signal.axes) >= 3 and len(signal) > 1}
+    attitude, body = found.get("attitude"), found.pop("body_velocity", None)
+    if body and attitude and "velocity" not in found and attitude.interval < 1.5 * body.interval:
+        found["velocity"] = body  # `to_flight` turns it
+    motors = recording.signals["command" if isinstance(field, Actuated) else MOTORS]
+    speeds = _speeds(recording, field) if isinstance(field, Actuated) else motors.values
+    return found | {MOTORS: replace(motors, values=np.maximum(speeds, 0.0))}
+
+
+def _speeds(recording: Recording, field: Actuated) -> np.ndarray:
+    inputs, voltage = recording.signals["command"], recording.signals.get("voltage")
+    u = np.asarray(inputs.values)
+    if field.reads_voltage:
+        known = field.actuator.nominal_voltage
+        volts = known if voltage is None else np.interp(inputs.t, voltage.t, np.asarray(voltage.values)[:, 0])
+        u = np.column_stack([u, np.broadcast_to(volts, len(u))])
+    return np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)
+
+
+def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Recording:
+    """A recording of all that a flight needs; states that are missing or slower than dt rest at the origin."""
+    motors, kept = signals[MOTORS], {MOTORS: signals[MOTORS]}
+    for name in STATES:
+        if name in signals and signals[name].interval <= 1.5 * dt:
+            in_body = signals[name] is recording.signals.get("body_velocity")
+            kept["body_velocity" if in_body else name] = signals[name]
+        else:
+            axes, rest = (WXYZ, [1.0, 0, 0, 0]) if name == "attitude" else (XYZ, [0.0] * 3)
+            kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), axes, "nothing")
+    return replace(recording, signals=kept)

@@ -1,0 +1,114 @@
+"""Logs are checked before a vehicle is identified from them: what would teach a wrong vehicle ends in exit code 3."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from recorded import LOGS, write
+from rich.console import Console
+
+from experiments.identify.__main__ import Config, checked, main
+from experiments.identify.checked import compared
+from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.dynamics.actuators import Actuator
+from hybrid_jax.dynamics.vehicle_file import VehicleModel
+from hybrid_jax.flights.consistency import FAILS
+from hybrid_jax.flights.reading import recording_of
+from hybrid_jax.vehicle import IRIS
+
+ACTUATOR = "[actuator]\ncurve = [100.0, 900.0]\n"
+SWAPPED = replace(LOGS[0], u=LOGS[0].u[:, [1, 2, 3, 0]])
+
+
+@pytest.fixture
+def folder(tmp_path, monkeypatch):
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
+    (tmp_path / "v.toml").write_text('learn = ["Ix", "curve"]\n' + vehicle_toml(IRIS) + ACTUATOR)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def ended(capsys, *arguments):
+    """The exit code, and the lines on stderr."""
+    with pytest.raises(SystemExit) as stop:
+        main(["logs", "--vehicle", "v.toml", *arguments])
+    return stop.value.code, capsys.readouterr().err.splitlines()
+
+
+def test_a_check_that_fails_ends_in_what_to_type(folder, capsys):
+    write(folder / "logs", [SWAPPED])
+    (folder / "logs" / "notes.txt").write_text("windy")
+    code, lines = ended(capsys, "--learn", "Ix", "Iy")
+    assert code == 3
+    assert lines[0] == "notes.txt: left: no format that is read"
+    assert "motor order against roll and pitch: " in lines[1]
+    assert lines[1].endswith("--motor-order 3,0,1,2")
+    assert "nothing was identified" in lines[-1]
+    assert not [*(folder / "runs" / "identify").glob("*")]
+
+
+MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order": (3, 0, 1, 2)}, [])}
+
+
+@pytest.mark.parametrize(("more", "failed"), MENDS.values(), ids=MENDS)
+def test_it_goes_on_when_asked_or_mended(folder, more, failed):
+    write(folder / "logs", [SWAPPED])
+    config = Config(folder / "logs", folder / "v.toml", learn=("Ix",), **more)
+    *_, lines = checked(config, Console(quiet=True))
+    assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
+
+
+def test_a_flight_is_not_both_fitted_and_predicted(folder, capsys):
+    """Under another name its predictions would look like those of an unseen flight."""
+    write(folder / "logs", LOGS[:2])
+    write(folder, [LOGS[1]])
+    code, (line,) = ended(capsys, "--learn", "Ix", "--test", "chirp_run2.csv.gz")
+    assert code == 2
+    assert "--test chirp_run2.csv.gz: the same flight as logs/chirp_run2.csv.gz" in line
+
+
+def failed(recording, learn=("k", "Ix"), vehicle=IRIS):
+    """Names of the checks that fail; commands are told by the curve of `ACTUATOR`."""
+    model = VehicleModel(vehicle, actuator=Actuator((100.0, 900.0)), learn=learn)
+    field = model.commanded() if "command" in recording.signals else model.physics()
+    return [check.name for check in compared(recording, field, learn) if check.verdict == FAILS]
+
+
+def commanded(log, *left_out):
+    """A recording of commands, without some signals."""
+    recording = recording_of(log)
+    speeds = recording.signals["rotor_speed"]
+    signals = {name: signal for name, signal in recording.signals.items() if name not in ("rotor_speed", *left_out)}
+    return replace(recording, signals=signals | {"command": replace(speeds, values=(log.u - 100) / 900)})
+
+
+def test_commands_and_a_gyro_alone_tell_the_order_of_the_motors():
+    without = ("position", "velocity", "attitude")
+    assert failed(commanded(LOGS[0], *without)) == []
+    assert failed(commanded(SWAPPED, *without)) == ["motor order against roll and pitch"]
+    assert failed(commanded(SWAPPED, *without, "rates")) == []
+
+
+def test_states_are_compared_with_what_there_is_of_them():
+    x = LOGS[0].x.copy()
+    x[:, 7:10] = -x[:, 7:10]
+    backwards = replace(LOGS[0], x=x)
+    assert "dp/dt against v" in failed(commanded(backwards))
+    assert failed(commanded(backwards, "position", "attitude")) == []
+
+
+def test_a_thrust_that_is_learned_may_be_off_but_not_in_another_unit():
+    weak, ratio = replace(IRIS, thrust_coefficient=IRIS.thrust_coefficient / 2), "specific force over thrust per mass"
+    assert ratio not in failed(recording_of(LOGS[0]), vehicle=weak)
+    assert ratio in failed(recording_of(LOGS[0]), learn=("Ix",), vehicle=weak)
+    rpm = replace(LOGS[0], u=LOGS[0].u * 30 / np.pi)
+    assert ratio in failed(recording_of(rpm))
+
+
+def test_slow_signals_are_not_compared_as_if_they_were_fast():
+    """What a motor did between commands 40 ms apart is not known."""
+    recording = commanded(SWAPPED)
+    slow = dict(recording.signals)
+    for name, k in (("position", 20), ("command", 4)):
+        slow[name] = replace(slow[name], t=slow[name].t[::k], values=slow[name].values[::k])
+    assert failed(replace(recording, signals=slow)) == []
