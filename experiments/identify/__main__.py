@@ -18,9 +18,9 @@ from experiments.reporting.results import Results
 from experiments.runner import command
 from experiments.runner.run_record import environment
 from hybrid_jax import checks, runtime
-from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.measurement import MEASURED
-from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
+from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification.fitting import identify, identify_in_turn
@@ -102,6 +102,10 @@ def recordings(config: Config) -> tuple[list[Recording], list[Recording], list[s
 def model_of(config: Config) -> VehicleModel:
     model = load_vehicle_model(config.vehicle)
     model = replace(model, learn=config.learn) if config.learn else model
+    if not model.learn:
+        raise ValueError(f"{config.vehicle}: learn: names nothing; give --learn Ix Iy, or what else is not known")
+    if LAG in model.learn:
+        raise ValueError(f"{config.vehicle}: learn: {LAG} is for real_flight alone: {_learn(model.learn, (LAG,))}")
     return model
 
 
@@ -121,7 +125,15 @@ def field_of(config: Config, model: VehicleModel, logs: list[Recording], left_ou
             raise ValueError(f"--test {log.name}: has no {told}, which the other logs have; leave it out")
     if told == "command":
         return model.commanded()
+    if lost := [name for name in model.learn if name in NAMES]:
+        why = f"need commands, and {speeds_alone[0]} has rotor speeds alone"
+        raise ValueError(f"{config.vehicle}: learn: {', '.join(lost)}: {why}: {_learn(model.learn, lost)}")
     return model.physics()
+
+
+def _learn(names: Sequence[str], without: Sequence[str]) -> str:
+    """What to type to learn all but some parameters."""
+    return f"give --learn {' '.join(name for name in names if name not in without) or 'Ix Iy'}"
 
 
 def checked(config: Config, console: Console):

@@ -67,6 +67,16 @@ def test_a_flight_is_not_both_fitted_and_predicted(folder, capsys):
     assert "--test chirp_run2.csv.gz: the same flight as logs/chirp_run2.csv.gz" in line
 
 
+@pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])
+def test_what_speeds_do_not_tell_is_refused(folder, capsys, learn, rest):
+    """It vanished from the result."""
+    write(folder / "logs", LOGS[:1])
+    code, (line,) = ended(capsys, "--learn", *learn.split(","))
+    assert code == 2
+    assert line.startswith("identify: v.toml: learn: curve")
+    assert line.endswith(f"has rotor speeds alone: give --learn {rest}")
+
+
 def failed(recording, learn=("k", "Ix"), vehicle=IRIS):
     """Names of the checks that fail; commands are told by the curve of `ACTUATOR`."""
     model = VehicleModel(vehicle, actuator=Actuator((100.0, 900.0)), learn=learn)

@@ -84,6 +84,7 @@ def test_errors_are_shown_at_steps_that_were_measured():
         (["--learn", "gain"], "'gain'"),
         (["--measured", "speed"], "--measured must be of"),
         (["--steps", "0"], "steps"),
+        (["--learn", "k", "motor_time_constant"], "motor_time_constant is for real_flight alone: give --learn k"),
     ],
 )
 def test_bad_options_end_in_one_line(files, capsys, more, said):
