@@ -28,6 +28,7 @@ from hybrid_jax.identification.measured import Initial, Layout
 from hybrid_jax.io import save
 
 NAME = "identify"
+LISTS = ("--learn", "--measured", "--motor-order")
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
@@ -190,7 +191,7 @@ def run(config: Config) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
-    command.call(NAME, Config, run, given)
+    command.call(NAME, Config, run, command.split_lists(given, LISTS))
 
 
 if __name__ == "__main__":

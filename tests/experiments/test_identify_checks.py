@@ -38,7 +38,7 @@ def ended(capsys, *arguments):
 def test_a_check_that_fails_ends_in_what_to_type(folder, capsys):
     write(folder / "logs", [SWAPPED])
     (folder / "logs" / "notes.txt").write_text("windy")
-    code, lines = ended(capsys, "--learn", "Ix", "Iy")
+    code, lines = ended(capsys, "--learn", "Ix,Iy")
     assert code == 3
     assert lines[0] == "notes.txt: left: no format that is read"
     assert "motor order against roll and pitch: " in lines[1]
@@ -71,7 +71,7 @@ def test_a_flight_is_not_both_fitted_and_predicted(folder, capsys):
 def test_what_speeds_do_not_tell_is_refused(folder, capsys, learn, rest):
     """It vanished from the result."""
     write(folder / "logs", LOGS[:1])
-    code, (line,) = ended(capsys, "--learn", *learn.split(","))
+    code, (line,) = ended(capsys, "--learn", learn)
     assert code == 2
     assert line.startswith("identify: v.toml: learn: curve")
     assert line.endswith(f"has rotor speeds alone: give --learn {rest}")

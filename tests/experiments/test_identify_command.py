@@ -84,7 +84,8 @@ def test_errors_are_shown_at_steps_that_were_measured():
         (["--learn", "gain"], "'gain'"),
         (["--measured", "speed"], "--measured must be of"),
         (["--steps", "0"], "steps"),
-        (["--learn", "k", "motor_time_constant"], "motor_time_constant is for real_flight alone: give --learn k"),
+        (["--learn", "k,motor_time_constant"], "motor_time_constant is for real_flight alone: give --learn k"),
+        (["--motor-order", "0,1,2,2"], "--motor-order must be of 0, 1, 2, 3, each at most once"),
     ],
 )
 def test_bad_options_end_in_one_line(files, capsys, more, said):
