@@ -16,6 +16,7 @@ from experiments.identify.report import figure, tables
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
+from experiments.runner.options import Count, Positive, check_numbers
 from experiments.runner.run_record import environment
 from hybrid_jax import checks, runtime
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
@@ -69,11 +70,11 @@ class Config:
     """Fit all parameters at once; by default those of the thrust first, from the accelerometer, where there is one."""
     initial: Initial = "estimated"
     """The state that a window starts from: estimated from the samples before it, or the last sample as it is."""
-    dt: float = 0.005
+    dt: Positive = 0.005
     """Steps of the solver, and of the grid on which measurements are compared [s]."""
-    steps: int = 20
+    steps: Count = 20
     """Steps of a window. Short ones resist slow disturbances, long ones tell slow effects."""
-    windows: int = 300
+    windows: Count = 300
     """Windows at most, spread evenly over the logs."""
     columns: Path | None = None
     """Column map of CSV logs."""
@@ -157,6 +158,7 @@ def checked(config: Config, console: Console):
 
 
 def run(config: Config) -> None:
+    check_numbers("--", config)
     for name in config.measured:
         if name not in MEASURED:
             raise ValueError(f"--measured must be of {', '.join(MEASURED)}, got {name!r}")

@@ -83,7 +83,8 @@ def test_errors_are_shown_at_steps_that_were_measured():
     [
         (["--learn", "gain"], "'gain'"),
         (["--measured", "speed"], "--measured must be of"),
-        (["--steps", "0"], "steps"),
+        (["--steps", "0"], "--steps must be an integer of at least 1"),
+        (["--windows", "0"], "--windows must be an integer of at least 1"),  # it named a field that is no option
         (["--learn", "k,motor_time_constant"], "motor_time_constant is for real_flight alone: give --learn k"),
         (["--motor-order", "0,1,2,2"], "--motor-order must be of 0, 1, 2, 3, each at most once"),
     ],
