@@ -1,19 +1,14 @@
-"""Which rotor is damaged, and by how much: python -m experiments.identify.crazypad FOLDER
-
-FOLDER is `motor_data` of the data set CrazyPAD: a vehicle whose propeller M3 was cut in steps. The effectiveness of
-each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust and trim. In all flights
-the thrust of a command grows in the seconds after take-off. So damage is found against the same seconds of normal
-flights, and what is left of each rotor then predicts with what whole normal flights tell.
-"""
+"""Which rotor is damaged, and by how much: python -m experiments.identify.crazypad --help"""
 
 import re
-import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from jaxtyping import Float
 from rich.console import Console
 
@@ -49,6 +44,19 @@ _CURVE = np.polynomial.polynomial.polyfit((0.088 * _GRAMS - 0.0006239 * _GRAMS**
 ACTUATOR = Actuator(tuple(map(float, _CURVE)), "thrust", (0.06, 0.06), FULL, 1.0)
 LAYOUT = Layout(dt=0.01, steps=20, span=0.1, disturbance=(0.0,) * 3 + (0.5,) * 3)
 SHORT = replace(LAYOUT, steps=15)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Which rotor is damaged, and by how much, in the data set CrazyPAD: a vehicle whose propeller M3 was cut in steps.
+
+    The effectiveness of each rotor is learned from normal flights, then from three seconds of a damaged one, by thrust
+    and trim. In all flights the thrust of a command grows in the seconds after take-off. So damage is found against the
+    same seconds of normal flights, and what is left of each rotor then predicts with what whole normal flights tell.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """`motor_data` of the data set, with the folders normal_flight and cut_propeller_M3_…"""
 
 
 class Flight(NamedTuple):
@@ -136,9 +144,10 @@ def changed(field: Any, log_efficiency) -> Any:
     return replace(field, body=CorrectedBody(field.body, jnp.asarray(log_efficiency), jnp.zeros(3)))
 
 
-def main(folder: Path) -> None:
+def run(options: Options) -> None:
+    runtime.configure()
     console = Console(width=120)
-    normal, cut = flights(folder)
+    normal, cut = flights(options.folder)
     here = source(normal[:3])
     fresh = take_off(here, normal[:3])
     console.print("normal:", {name: np.asarray(value).tolist() for name, value in here.theta().items()})
@@ -166,7 +175,7 @@ def main(folder: Path) -> None:
     print_tables(console, [Table(title, (*header, "from normal", "those seconds", "interpolated"), lines)])
 
 
+main = partial(command.call, "identify.crazypad", Options, run)
+
 if __name__ == "__main__":
-    runtime.configure()
-    with command._exit_codes("identify.crazypad", "interrupted"):
-        main(Path(sys.argv[1]))
+    main()

@@ -1,18 +1,16 @@
-"""From one airframe to another: python -m experiments.identify.nanobench FOLDER
-
-FOLDER is the data set NanoBench: flights of an airframe A, and of B, which replaced it. Each flight of B is left out in
-turn; the others, or ten seconds of one of them, are learned from.
-"""
+"""From one airframe to another: python -m experiments.identify.nanobench --help"""
 
 import itertools
-import sys
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
+from typing import Annotated
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import tyro
 from jaxtyping import Array, Float
 from rich.console import Console
 
@@ -49,6 +47,17 @@ FORCE = Layout(dt=DT, steps=50, most=200, disturbance=(0.0,) * 6)
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "centre_of_mass", "torque_gain", "drag", "aerodynamic_moment", "rate_damping")
 OBSERVED = ", past 2 s"  # of a model with the mean force and torque that it lacked in the past of a window
 SCALE = np.repeat([0.1, 0.05, 0.2, 0.2], [3, 4, 3, 3]).astype(np.float32)  # of the errors of p, q, v and ω
+
+
+@dataclass(frozen=True)
+class Options:
+    """From one airframe to another, in the data set NanoBench: flights of an airframe A, and of B, which replaced it.
+
+    Each flight of B is left out in turn. The others, or ten seconds of one of them, are learned from.
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """The flights of the data set, such as B2_circle_slow_rep1.csv.gz."""
 
 
 def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated | None = None, free=None) -> Actuated:
@@ -119,9 +128,11 @@ def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int =
     return fit_least_squares(start, windows_of(recordings, field, stride), None, FIT_STEPS, jnp.asarray(SCALE)).field
 
 
-def main(folder: Path) -> None:
+def run(options: Options) -> None:
+    runtime.configure()
     console, columns = Console(width=150), load_column_map(Path(__file__).with_suffix(".toml"))
-    a, b = ([read_recording(folder / f"{name}.csv.gz", columns) for name in part.split()] for part in (OF_A, OF_B))
+    flown = OF_A.split(), OF_B.split()
+    a, b = ([read_recording(options.folder / f"{name}.csv.gz", columns) for name in part] for part in flown)
     aware, constant = thrust_of(a), thrust_of(a, voltage=False)
     console.print("A:", {name: np.asarray(value).round(4).tolist() for name, value in aware.theta().items()})
     of_a = fitted_to(multirotor(VEHICLE, LEARN, Terms()), a, aware, 100)
@@ -161,7 +172,7 @@ def main(folder: Path) -> None:
     print_tables(console, [*shown, Table("Flights of B left out, RMSE", ("model", *names), lines)])
 
 
+main = partial(command.call, "identify.nanobench", Options, run)
+
 if __name__ == "__main__":
-    runtime.configure()
-    with command._exit_codes("identify.nanobench", "interrupted"):
-        main(Path(sys.argv[1]))
+    main()

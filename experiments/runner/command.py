@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import gc
+import inspect
 import io
 import re
 import signal
@@ -87,7 +88,7 @@ def call(
 ) -> None:
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     with _exit_codes(name, "interrupted, nothing was written"):
-        command(_parsed(partial(tyro.cli, kind, description=kind.__doc__), name, arguments))
+        command(_parsed(partial(tyro.cli, kind, description=inspect.cleandoc(kind.__doc__ or "")), name, arguments))
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:

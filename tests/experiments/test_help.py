@@ -1,0 +1,20 @@
+"""Commands that reproduce one result have a command line like all others."""
+
+from importlib import import_module
+
+import pytest
+
+
+@pytest.mark.parametrize("name", ["identify.crazypad", "identify.nanobench", "render"])
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["--help"], 0), ([], 2), (["none", "more"], 2), (["none"], 2)], ids=str
+)
+def test_the_command_line_is_explained_or_refused_in_one_line(name, arguments, code, monkeypatch, capsys):
+    """--help was taken for a folder, and without an argument there was a traceback."""
+    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
+    with pytest.raises(SystemExit) as stop:
+        import_module(f"experiments.{name}").main(arguments)
+    assert stop.value.code == code
+    said = capsys.readouterr()
+    assert f"usage: python -m experiments.{name}" in said.out if code == 0 else said.err.startswith(f"{name}: ")
+    assert len(said.err.splitlines()) == (code != 0)
