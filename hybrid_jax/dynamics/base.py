@@ -125,7 +125,10 @@ class Hybrid(AbstractVectorField):
     residual: AbstractVectorField
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.physics(x, u) + apply_residual(self.physics, x, self.residual(x, u))
+        slope, added = self.physics(x, u), apply_residual(self.physics, x, self.residual(x, u))
+        if jnp.shape(added) != jnp.shape(slope):
+            raise ValueError(f"the residual must return {jnp.shape(slope)}, as physics does, got {jnp.shape(added)}")
+        return slope + added
 
     def train_batch(self, x, u):
         return train_batch(self.physics, x, u) + apply_residual(self.physics, x, train_batch(self.residual, x, u))

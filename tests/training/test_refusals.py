@@ -63,6 +63,11 @@ REFUSED = {
         {},
         "train: field: ResidualNetwork does not take a state .* its weights are for 5 states and inputs, got 2 and 1$",
     ),
+    "one output": (
+        Hybrid(pendulum(), residual_network(2, 1, KEY, outputs=1)),
+        {},
+        r"train: field: ResidualNetwork must return a derivative \(2,\) for .* returned float32\[1\]$",
+    ),
     "outputs": (
         Hybrid(pendulum(), residual_network(2, 1, KEY, outputs=3)),
         {},
