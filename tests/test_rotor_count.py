@@ -11,7 +11,7 @@ from surface import refusal
 import hybrid_jax as hj
 from hybrid_jax.control import Controller
 from hybrid_jax.export.program import sizes_of
-from hybrid_jax.flights.consistency import check_log
+from hybrid_jax.flights.consistency import OK, check_log
 from hybrid_jax.flights.flight_csv import read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.readings import respond
@@ -75,6 +75,8 @@ def test_logs_of_six_rotors_are_read_and_motors_in_another_order_found(flown, tm
         found = respond(each, HEXA)
         assert found is not None
         assert (found.order == tuple(range(6))) == right
+        checks = {check.name: check for check in check_log(each, HEXA)}
+        assert (checks["motor order against roll and pitch"].verdict == OK) == right
     assert "6 motors" in refusal(lambda: check_log(read, IRIS))
 
 

@@ -138,6 +138,7 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (gyro, math.nan, "ms", limit))]
     columns = " ".join(f"u{motor}" for motor in found.order)
     rotors, numbers = " ".join(map(str, range(vehicle.rotors))), ",".join(map(str, found.order))
+    ordered = found.order == tuple(range(vehicle.rotors))
     advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}: --motor-order {numbers}"
     yaw = found.yaw_sign * found.correlations[2]
     if abs(sum(vehicle.spin)) > 1:
@@ -153,7 +154,7 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     return [
-        _check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if found.order == (0, 1, 2, 3) else advice),
+        _check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
         Check(spin, yaw, "correlation", YAW_LIMIT, *turning),
         replace(lagging, value=lag),
     ]
