@@ -18,7 +18,7 @@ from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.runner.options import Run
-from experiments.runner.run_record import OtherRun, recorded
+from experiments.runner.run_record import ChecksFailed, OtherRun, recorded
 from hybrid_jax import checks, native
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
@@ -27,10 +27,6 @@ Options = TypeVar("Options")
 BAD_INPUT, FAILED_CHECKS = 2, 3  # exit codes; that of a signal is 128 + its number
 # How options begin, old → new. Old names are accepted for one version; --help does not list them.
 RENAMED = {"--guess-off": "--perturbed-by", "--safe-": "--invariant-", "--no-safe-": "--no-invariant-"}
-
-
-class ChecksFailed(Exception):
-    """Checks of the input failed; its arguments are lines that say which, and what to type."""
 
 
 def run(

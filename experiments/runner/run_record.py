@@ -33,9 +33,15 @@ class OtherRun(ValueError):
     """The unfinished run differs from the requested one; the message has one line per difference."""
 
 
+class ChecksFailed(Exception):
+    """Checks of the input failed; its arguments are lines that say which, and what to type."""
+
+
 @contextmanager
 def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[None]:
-    """Record that a run began in a folder, and at the end that it finished; bad input restores the previous record.
+    """Record that a run began in a folder, and at the end that it finished.
+
+    Bad input and failed checks begin nothing: they restore the previous record, so that a mended run may follow.
 
     Raises:
         OtherRun: an unfinished run there has another configuration, other flights or other versions.
@@ -52,7 +58,7 @@ def recorded(folder: Path, config: Run, say: Callable[[str], None]) -> Iterator[
     write_atomic(path, json_text(record | {"state": "unfinished"}))
     try:
         yield
-    except ValueError:
+    except (ValueError, ChecksFailed):
         if found:
             write_atomic(path, json_text(found))
         else:

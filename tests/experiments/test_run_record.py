@@ -10,7 +10,7 @@ from experiments.closed_loop.config import PRESETS as CLOSED_LOOP
 from experiments.comparison import PRESETS as COMPARISON
 from experiments.paper.config import PRESETS, SMOKE
 from experiments.runner.command import read
-from experiments.runner.run_record import FILE, OtherRun, recorded
+from experiments.runner.run_record import FILE, ChecksFailed, OtherRun, recorded
 
 
 def record(folder):
@@ -109,9 +109,10 @@ def test_old_option_names_of_the_closed_loop_are_accepted():
     assert (found.invariant_hidden, found.invariant_linear) == (9, False)
 
 
-def test_bad_input_begins_no_run_and_ends_none(tmp_path):
-    interrupt(tmp_path, SMOKE, ValueError)
+@pytest.mark.parametrize("error", [ValueError, ChecksFailed])
+def test_bad_input_begins_no_run_and_ends_none(tmp_path, error):
+    interrupt(tmp_path, SMOKE, error)
     assert not (tmp_path / FILE).exists()
     interrupt(tmp_path, SMOKE, OSError)
-    interrupt(tmp_path, SMOKE, ValueError)
+    interrupt(tmp_path, SMOKE, error)
     assert record(tmp_path)["state"] == "unfinished"
