@@ -110,7 +110,7 @@ def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
         flight = reading.flight(options.dt, options.polynomial)
     except ValueError as error:
         return Inspected(path, reading, checks, str(error))
-    return Inspected(path, reading, [*checks, *(check_log(flight, vehicle) if vehicle is not None else [])], "")
+    return Inspected(path, reading, [*checks, *check_log(flight, vehicle)], "")
 
 
 def _read(path: Path, columns, options: Options) -> Reading:

@@ -16,12 +16,13 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import EMPTY, Table
 from experiments.runner.run_record import environment
-from hybrid_jax.flights.consistency import FAILS, UNKNOWN, WARNS, Check
+from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
 from hybrid_jax.flights.loading import Reading
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Signal
 
 PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
 SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
+NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
 LEGEND = {
     "whole file": "the log ends where its program ended it, and no bit was changed",
     "airframe": "a multirotor flew; a model of one stands for nothing else",
@@ -64,6 +65,7 @@ def write_page(
     tables += [todo(logs)] if any(not log.result.startswith("ready") for log in logs) else []
     notes = [f"{log.path.name}: {note}" for log in read if log.reading for note in log.reading.recording.notes]
     notes += [f"{path.name}: left: {why}" for path, why in left.items()]
+    notes += [NOT_RUN] if config["vehicle"] is None and read else []
     pictures = {
         f"signals_{index}": (draw(log), f"{log.path.name}: its signals; grey: gaps")
         for index, log in enumerate(read[:PICTURED])

@@ -23,6 +23,9 @@ GROUND = "cut it out: --cleaning.in-flight, cut_ground=True"
 MORE_FLIGHT = "check on a flight with more motion"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
 THRUST = "v̇ against thrust along body z"
+RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
+SPIN, GYRO = "spin against yaw", "lag of the gyro behind the motors"
+NEED_VEHICLE = (RATIO, ORDER, SPIN, GYRO)  # checks that are not run without one
 MAX_SAMPLES = 100_000  # the middle of longer logs is checked
 
 LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
@@ -55,13 +58,13 @@ class Check:
     suggestion: str  # what to correct, if anything
 
 
-def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
-    """Run all checks of a log against itself and its vehicle.
+def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
+    """Run all checks of a log against itself and its vehicle; without a vehicle, those that need none.
 
     Raises:
         ValueError: fewer than two samples, or another number of motors than the vehicle has.
     """
-    if log.u.shape[1] != vehicle.rotors:
+    if vehicle is not None and log.u.shape[1] != vehicle.rotors:
         raise ValueError(f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}")
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
@@ -76,9 +79,8 @@ def check_log(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
         _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
         _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
-        _thrust(log, vehicle),
         _columns(log),
-        *_motors(log, vehicle),
+        *([_thrust(log, vehicle), *_motors(log, vehicle)] if vehicle is not None else []),
     ]
 
 
@@ -92,16 +94,16 @@ def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Che
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
     """Check the mean specific force along body z in flight, over k Σu² / m."""
-    flying, name = sound_intervals(log) & ~on_ground(log)[:-1], "specific force over thrust per mass"
+    flying = sound_intervals(log) & ~on_ground(log)[:-1]
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
     if not len(thrust) or thrust.mean() <= 0:
         still = "the vehicle stays on the ground: check a log in flight"
-        return Check(name, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
+        return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
-    return _check(name, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
+    return _check(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
 
 
 def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
@@ -131,11 +133,10 @@ def _columns(log: FlightLog) -> Check:
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     found, limit = respond(log, vehicle), 1000 * log.dt
-    order, spin, gyro = "motor order against roll and pitch", "spin against yaw", "lag of the gyro behind the motors"
     if found is None or sum(found.correlations[:2]) < 2 * ORDER_LIMIT:
         value = math.nan if found is None else min(found.correlations[:2])
-        correlated = (order, value, "correlation", ORDER_LIMIT), (spin, math.nan, "correlation", 0.0)
-        return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (gyro, math.nan, "ms", limit))]
+        correlated = (ORDER, value, "correlation", ORDER_LIMIT), (SPIN, math.nan, "correlation", 0.0)
+        return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (GYRO, math.nan, "ms", limit))]
     columns = " ".join(f"u{motor}" for motor in found.order)
     rotors, numbers = " ".join(map(str, range(vehicle.rotors))), ",".join(map(str, found.order))
     ordered = found.order == tuple(range(vehicle.rotors))
@@ -150,12 +151,12 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     lag, late = 1000 * found.lag, found.lag > 0
     shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: --cleaning.delay {found.lag:.4f}"
     shift += f', or learn "{LAG}" if they are commands' if late else ""
-    lagging = _at_most(gyro, abs(lag), "ms", limit, shift)
+    lagging = _at_most(GYRO, abs(lag), "ms", limit, shift)
     # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     return [
-        _check(order, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
-        Check(spin, yaw, "correlation", YAW_LIMIT, *turning),
+        _check(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
+        Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning),
         replace(lagging, value=lag),
     ]
 

@@ -64,6 +64,7 @@ def rates(log: FlightLog) -> Readings:
     found = {
         NOTHING: (turned, omega),
         "body rates are in degrees per second: declare deg/s": (turned, omega * np.pi / 180),
+        "body rates are in rad/s, declared deg/s: declare rad/s": (turned, omega * 180 / np.pi),
         "body rates are in the world frame: rotate them into the body": (turned, back.apply(omega)),
         "body rates and attitude differ in body frame: convert the one that is FRD": (turned, omega @ BODIES["FRD"]),
         "body rates have the opposite sign": (turned, -omega),

@@ -1,6 +1,7 @@
 """A folder of logs is described, checked and drawn, and becomes a vehicle file with the numbers that the logs tell."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -102,6 +103,16 @@ def test_a_folder_is_described_whatever_is_in_it(tmp_path, capsys):
         assert words in page
     results = json.loads((tmp_path / "inspect_logs" / "report.json").read_text())["rows"]
     assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
+
+
+def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, capsys):
+    in_mm = [replace(log, x=log.x * np.repeat([1000.0, 1.0], [3, 10])) for log in LOGS[1:2]]
+    main([str(write(tmp_path / "flights", [LOGS[0], *in_mm])), "--out", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
+    assert "FAILS dp/dt against v: position is in mm" in said
+    unchecked = "not checked for want of --vehicle: number of motors, largest speed; specific force"
+    assert all(unchecked in text for text in (said, (tmp_path / "inspect_logs" / "report.md").read_text()))
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ import pytest
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.cleaning import delay_motors
-from hybrid_jax.flights.consistency import FAILS, NOTHING, OK, UNKNOWN, check_log
+from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, check_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.readings import orders
 from hybrid_jax.vehicle import IRIS
@@ -79,6 +79,7 @@ MISTAKES = {
     "xyzw": (lambda log: with_parts(log, q=np.roll(log.x[:, 3:7], -1, axis=1)), RATES, "(x, y, z, w), read as"),
     "inverse": (lambda log: with_parts(log, q=log.x[:, 3:7] * [1, -1, -1, -1]), RATES, "world → body"),
     "degrees": (lambda log: with_parts(log, omega=np.rad2deg(log.x[:, 10:])), RATES, "degrees"),
+    "radians": (lambda log: with_parts(log, omega=np.deg2rad(log.x[:, 10:])), RATES, "declared deg/s"),
     "FRD rates": (lambda log: with_parts(log, omega=log.x[:, 10:] @ BODIES["FRD"]), RATES, "FRD"),
     "world rates": (gyro_in_world, RATES, "world frame"),
     "NED and FRD": (as_ned, THRUST, 'world = "NED" and body = "FRD"'),
@@ -96,6 +97,14 @@ def test_mistakes_are_found_and_corrections_suggested(flight, mistake):
     check = table(make(noisy(flight, np.random.default_rng(1))))[name]
     assert check.verdict == FAILS, check
     assert words in check.suggestion, check
+
+
+@pytest.mark.parametrize("mistake", ["mm", "inverse", "degrees", "NED and FRD"])
+def test_mistakes_that_no_vehicle_shows_are_found_without_one(flight, mistake):
+    make, name, words = MISTAKES[mistake]
+    found = {check.name: check for check in check_log(make(flight))}
+    assert (found[name].verdict, words in found[name].suggestion) == (FAILS, True)
+    assert [*found, *NEED_VEHICLE] == [check.name for check in check_log(flight, IRIS)]
 
 
 @pytest.mark.parametrize("order", orders(4).tolist(), ids=str)
