@@ -105,12 +105,14 @@ def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
         reading = _read(path, columns, options)
     except ValueError as error:
         return Inspected(path, None, [], str(error))
-    checks = check_recording(reading.recording, vehicle, asked_interval(reading, options.dt))
+    checks, refusal = check_recording(reading.recording, vehicle, asked_interval(reading, options.dt)), ""
     try:
         flight = reading.flight(options.dt, options.polynomial)
+        other = vehicle is not None and flight.u.shape[1] != vehicle.rotors  # a check that failed says so
+        checks += check_log(flight, None if other else vehicle)
     except ValueError as error:
-        return Inspected(path, reading, checks, str(error))
-    return Inspected(path, reading, [*checks, *check_log(flight, vehicle)], "")
+        refusal = str(error)
+    return Inspected(path, reading, checks, refusal)
 
 
 def _read(path: Path, columns, options: Options) -> Reading:

@@ -13,6 +13,7 @@ from experiments.inspect_logs.estimates import estimate
 from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.flights.recording import Recording, Signal
+from hybrid_jax.state import STATE_NAMES, input_names
 from hybrid_jax.vehicle import IRIS, load_vehicle
 
 MASS, ARM, LAG, INERTIA = 0.5, 0.12, 0.06, (2e-3, 2.4e-3)
@@ -113,6 +114,18 @@ def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, capsys):
     assert "FAILS dp/dt against v: position is in mm" in said
     unchecked = "not checked for want of --vehicle: number of motors, largest speed; specific force"
     assert all(unchecked in text for text in (said, (tmp_path / "inspect_logs" / "report.md").read_text()))
+
+
+def test_a_log_of_other_motors_hides_no_other(tmp_path, capsys):
+    six = replace(LOGS[1], u=np.concatenate([LOGS[1].u, LOGS[1].u[:, :2] + 1], axis=1))
+    (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
+    folder = write(tmp_path / "flights", LOGS[:1])
+    header = ",".join(["t", *STATE_NAMES, *input_names(6)])
+    np.savetxt(folder / "six.csv", np.column_stack([six.t, six.x, six.u]), "%.9g", ",", header=header, comments="")
+    main([str(folder), "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path)])
+    said = capsys.readouterr().out
+    assert "six.csv: CSV, unknown vehicle, 0.9 s, 6 motors: FAILS number of motors: 6 motors are logged" in said
+    assert "1 of 2 logs are ready" in said
 
 
 @pytest.mark.parametrize(
