@@ -19,6 +19,7 @@ from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.column_map import load_column_map
 from hybrid_jax.flights.consistency import check_log
 from hybrid_jax.flights.loading import Reading, asked_interval, read_log
+from hybrid_jax.flights.log import even_segments
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.suitability import check_recording
 from hybrid_jax.io.files import json_value, write_atomic
@@ -110,6 +111,7 @@ def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
         flight = reading.flight(options.dt, options.polynomial)
         other = vehicle is not None and flight.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(flight, None if other else vehicle)
+        even_segments(flight)
     except ValueError as error:
         refusal = str(error)
     return Inspected(path, reading, checks, refusal)

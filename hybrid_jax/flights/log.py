@@ -139,8 +139,12 @@ def even_segments(log: FlightLog) -> list[slice]:
     """Return the segments; refuse a log whose samples are not evenly spaced within each."""
     uneven = unevenness(log)
     if uneven.any():
-        at = log.t[int(uneven.argmax())]
-        raise ValueError(f"{log.name}: samples at {at:.6g} s are not {log.dt:.6g} s apart; resample the log first")
+        row = int(uneven.argmax())
+        found = (
+            f"the interval at {log.t[row]:.6g} s is {log.t[row + 1] - log.t[row]:.6g} s, the median is {log.dt:.6g} s"
+        )
+        even = f"--cleaning.resample {log.dt:.6g}, dt={log.dt:.6g}"
+        raise ValueError(f"{log.name}: {found}; put the samples on even times first: {even}")
     return segments(log)
 
 
