@@ -6,7 +6,7 @@ On the ground an accelerometer measures gravity whatever the thrust is. Near it 
 import numpy as np
 from jaxtyping import Bool, Float
 
-from hybrid_jax.flights.log import FlightLog, runs_of
+from hybrid_jax.flights.log import FlightLog, runs_of, sound_intervals
 from hybrid_jax.flights.recording import Recording
 
 IDLE = 0.3  # share of the power in flight below which motors idle
@@ -37,6 +37,11 @@ def on_ground(log: FlightLog) -> Bool[np.ndarray, " n"]:
     """Which samples are not `airborne`."""
     flights = _flights(log.t, (log.u**2).sum(axis=1), log.x[:, 2])
     return ~np.any([(log.t >= first) & (log.t <= last) for first, last in flights] or [np.zeros(len(log))], axis=0)
+
+
+def flying_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:
+    """Whether an interval is sound and begins in the air."""
+    return sound_intervals(log) & ~on_ground(log)[:-1]
 
 
 def _flights(t, power: Float[np.ndarray, " n"], z=None) -> list[tuple[float, float]]:

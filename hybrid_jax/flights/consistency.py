@@ -11,9 +11,9 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights import readings
-from hybrid_jax.flights.airborne import on_ground
+from hybrid_jax.flights.airborne import flying_intervals, on_ground
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.log import FlightLog, gaps, repeats, sound_intervals
+from hybrid_jax.flights.log import FlightLog, gaps, repeats
 from hybrid_jax.flights.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
 from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import Vehicle
@@ -95,7 +95,7 @@ def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Che
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
     """Check the mean specific force along body z in flight, over k Σu² / m."""
-    flying = sound_intervals(log) & ~on_ground(log)[:-1]
+    flying = flying_intervals(log)
     thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
     specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
     along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
@@ -163,10 +163,10 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
 
 
 def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
-    """Compare two records under every reading; kinematics hold for each axis, v̇ is moved by wind and drag as well."""
-    sound, limit = sound_intervals(log)[:, None].astype(float), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
+    """Compare two records in flight under every reading; kinematics hold for each axis, wind and drag move v̇, too."""
+    sound, limit = flying_intervals(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
     width = min(max(1, round(SPAN / log.dt)), len(sound))
-    whole = moving_mean(sound, width)[:, 0] > 1 - 1e-9
+    whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
     pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
     if not len(a) or max(_size(a), _size(b)) < least:

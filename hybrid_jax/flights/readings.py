@@ -10,6 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from hybrid_jax.flights.airborne import flying_intervals
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rates_between, rotation_of
 from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -108,7 +109,7 @@ def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"
 
 
 def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
-    slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], sound_intervals(log)[:, None]
+    slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], flying_intervals(log)[:, None]
     predicted = middle(rotation_of(q).apply(UP)) * thrust
     power = (predicted**2 * sound).sum()
     scale = max(0.0, (predicted * (slope + GRAVITY) * sound).sum() / power) if power > 0 else 0.0
