@@ -17,17 +17,20 @@ from experiments.runner import command
 from experiments.runner.options import Positive, check_numbers
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.column_map import load_column_map
-from hybrid_jax.flights.consistency import check_log
+from hybrid_jax.flights.consistency import FAILS, check_log
 from hybrid_jax.flights.loading import Reading, asked_interval, read_log
 from hybrid_jax.flights.log import even_segments
 from hybrid_jax.flights.reading import find_logs, read_recording
+from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.suitability import check_recording
 from hybrid_jax.io.files import json_value, write_atomic
 from hybrid_jax.vehicle import Vehicle
 
 NAME = "inspect_logs"
 LISTS = ("--polynomial", "--motor-order", "--topics")
-DT = 0.01  # s
+DT, ONE_TO_ONE = 0.01, (0.0, 1.0)  # s; rotor speed = command
+# Checks that a log may fail and still tell of its vehicle: it needs no position, and is cut at gaps and on the ground.
+BORNE = ("quantities", "gaps", "repeated samples", "time on the ground")
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,7 @@ class Options:
     """Vehicle file that the logs are compared with: number and order of motors, spin, thrust, largest speed."""
     write_vehicle: Path | None = None
     """Write a vehicle file to start from: hover and thrust, where the rotors are, spin, lag and centre of thrust as the
-    logs tell, with a comment on each number that they do not. An existing file is not overwritten."""
+    logs tell that fail no check, with a comment on each number that they do not. No file is overwritten."""
     mass: Positive | None = None
     """With --write-vehicle: what the vehicle weighs [kg]. No log tells it; thrust and inertia grow with it."""
     arm: Positive | None = None
@@ -94,7 +97,7 @@ def inspect(options: Options) -> None:
     console = Console()
     write_page(options.out / NAME, logs, left, json_value(_described(options)), console)
     if options.write_vehicle is not None:
-        found = estimate([log.reading.recording for log in logs if log.reading is not None])
+        found = estimate(trusted(logs, console))
         write_atomic(options.write_vehicle, vehicle_text(found, folder.resolve().stem, options.mass, options.arm))
         console.print(f"{options.write_vehicle}: written; read its comments before it is used", highlight=False)
 
@@ -107,14 +110,31 @@ def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
     except ValueError as error:
         return Inspected(path, None, [], str(error))
     checks, refusal = check_recording(reading.recording, vehicle, asked_interval(reading, options.dt)), ""
+    # The checks that need no vehicle bear motors in any unit, so commands are compared whatever speed they stand for.
+    unscaled = "rotor_speed" not in reading.recording.signals and not options.polynomial
     try:
-        flight = reading.flight(options.dt, options.polynomial)
+        flight = reading.flight(options.dt, ONE_TO_ONE if unscaled else options.polynomial)
         other = vehicle is not None and flight.u.shape[1] != vehicle.rotors  # a check that failed says so
-        checks += check_log(flight, None if other else vehicle)
+        checks += check_log(flight, None if other or unscaled else vehicle)
         even_segments(flight)
+        if unscaled:
+            reading.flight(options.dt)  # says what is missing
     except ValueError as error:
         refusal = str(error)
     return Inspected(path, reading, checks, refusal)
+
+
+def trusted(logs: Sequence[Inspected], console: Console) -> list[Recording]:
+    """The recordings that a vehicle file may rest on; which are not is printed."""
+    failed = {
+        log.path.name: any(check.verdict == FAILS and check.name not in BORNE for check in log.checks) for log in logs
+    }
+    kept = [log.reading.recording for log in logs if log.reading is not None and not failed[log.path.name]]
+    if not kept:
+        raise ValueError("--write-vehicle: no log flew and passed its checks; mend the logs as the page says")
+    if left := [name for name, fails in failed.items() if fails]:
+        console.print(f"left out of the vehicle file, as checks failed: {', '.join(left)}", highlight=False)
+    return kept
 
 
 def _read(path: Path, columns, options: Options) -> Reading:

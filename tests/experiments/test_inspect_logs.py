@@ -6,9 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import LOGS, write
+from rich.console import Console
 from scipy.signal import lfilter
 
-from experiments.inspect_logs.__main__ import main
+from experiments.inspect_logs.__main__ import Options, look, main, trusted
 from experiments.inspect_logs.estimates import estimate
 from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.real_flight.simulated import vehicle_toml
@@ -21,6 +22,15 @@ CURVE = np.array([0.02, 0.4, 1.9])  # N
 # An order that no autopilot has: rear left, front left, front right, rear right.
 PLACES = ARM / np.sqrt(2) * np.array([[-1, 1], [1, 1], [1, -1], [-1, -1]])
 SPIN = [1, -1, 1, -1]
+COLUMN_MAP = """
+frames = {world = "ENU", body = "FLU", velocity = "world"}
+time = {columns = ["t"], unit = "s"}
+position = {columns = ["px", "py", "pz"], unit = "m"}
+attitude = {columns = ["qw", "qx", "qy", "qz"], unit = "wxyz"}
+velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}
+body_rates = {columns = ["wx", "wy", "wz"], unit = "rad/s"}
+motors = {columns = ["u0", "u1", "u2", "u3"], unit = "dshot"}
+"""
 
 
 @pytest.fixture(scope="module")
@@ -134,6 +144,22 @@ def test_a_log_that_training_refuses_is_not_ready(tmp_path, capsys):
     said = capsys.readouterr().out
     assert "no flight: the interval at 0.012 s is 0.008 s, the median is 0.012 s; put the samples on even times" in said
     assert "1 of 2 logs are ready" in said
+
+
+def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
+    """Of body rates in degrees inertia comes out 57 times too small; commands are checked without their scale, too."""
+    (tmp_path / "map.toml").write_text(COLUMN_MAP)
+    wrong = replace(LOGS[1], x=LOGS[1].x * np.repeat([1.0, 180 / np.pi], [10, 3]))
+    folder = write(tmp_path / "flights", [LOGS[0], wrong])
+    paths = [folder / "chirp_run1.csv.gz", folder / "chirp_run2.csv.gz"]
+    options = Options(folder, columns=tmp_path / "map.toml")
+    logs = [look(path, None, options) for path in paths]
+    assert ["has only motor commands" in log.refusal for log in logs] == [True, True]
+    assert "FAILS q̇ against ω: body rates are in degrees per second" in logs[1].result
+    assert [kept.name for kept in trusted(logs, Console())] == [str(paths[0])]
+    assert "left out of the vehicle file, as checks failed: chirp_run2.csv.gz" in capsys.readouterr().out
+    with pytest.raises(ValueError, match=r"^--write-vehicle: no log flew and passed its checks"):
+        trusted(logs[1:], Console())
 
 
 @pytest.mark.parametrize(
