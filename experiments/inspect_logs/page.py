@@ -62,7 +62,7 @@ def write_page(
     rows = Results([{"log": log.path.name, "result": log.result} for log in logs], ("log",))
     read = [log for log in logs if log.reading is not None]
     tables = [overview(logs), *([signal_table(read), check_table(read), legend(read)] if read else [])]
-    tables += [todo(logs)] if any(not log.result.startswith("ready") for log in logs) else []
+    tables += [todo(logs)] if todo(logs).lines else []
     notes = [f"{log.path.name}: {note}" for log in read if log.reading for note in log.reading.recording.notes]
     notes += [f"{path.name}: left: {why}" for path, why in left.items()]
     notes += [NOT_RUN] if config["vehicle"] is None and read else []

@@ -142,13 +142,6 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     rotors, numbers = " ".join(map(str, range(vehicle.rotors))), ",".join(map(str, found.order))
     ordered = found.order == tuple(range(vehicle.rotors))
     advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}: --motor-order {numbers}"
-    yaw = found.yaw_sign * found.correlations[2]
-    if abs(sum(vehicle.spin)) > 1:
-        turning = FAILS, "the vehicle would turn in hover: half of its rotors must spin each way"
-    elif yaw < OPPOSED:
-        turning = FAILS, "flip the sign of every spin of the vehicle"
-    else:
-        turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
     lag, late = 1000 * found.lag, found.lag > 0
     shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: --cleaning.delay {found.lag:.4f}"
     shift += f', or learn "{LAG}" if they are commands' if late else ""
@@ -157,9 +150,26 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     return [
         _check(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
-        Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning),
+        _spin(log, vehicle, found.yaw_sign * found.correlations[2]),
         replace(lagging, value=lag),
     ]
+
+
+def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
+    if abs(sum(vehicle.spin)) > 1:
+        turning = FAILS, "the vehicle would turn in hover: half of its rotors must spin each way"
+    elif yaw >= OPPOSED:
+        turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
+    else:
+        # Of equal Ix and Iy, roll and pitch leave yaw alone. The difference of two estimates may be all there is.
+        ix, _, iz = vehicle.inertia
+        even = respond(log, replace(vehicle, inertia=(ix, ix, iz)))
+        sure = even is not None and even.yaw_sign * even.correlations[2] < OPPOSED
+        hangs = (
+            "opposed only with the vehicle's Iy − Ix: correct its inertia, which may be an estimate, or else its spins"
+        )
+        turning = (FAILS, "flip the sign of every spin of the vehicle") if sure else (WARNS, hangs)
+    return Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning)
 
 
 def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:

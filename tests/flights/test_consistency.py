@@ -7,7 +7,7 @@ import pytest
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.cleaning import delay_motors
-from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, check_log
+from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.readings import orders
 from hybrid_jax.vehicle import IRIS
@@ -121,6 +121,26 @@ def test_reversed_spin_is_found(flight):
     check = table(with_parts(flight, u=np.sqrt(squares)))
     assert check[ORDER].verdict == OK
     assert (check[YAW].verdict, "flip" in check[YAW].suggestion) == (FAILS, True)
+
+
+def test_a_spin_is_not_refused_for_an_inertia_that_may_be_an_estimate(flight):
+    """While it rolls steadily, an Iy twice too large makes of pitch a torque about yaw that is against the motors."""
+    (ix, _, iz), t = IRIS.inertia, flight.t
+    roll, yaw = 2 + 0.3 * np.sin(20 * t), 0.1 * np.sin(12 * t)
+    omega = np.stack([roll, -1.5 * iz / ix * np.gradient(yaw, t) / roll, yaw], axis=1)
+    torque = IRIS.inertia * np.gradient(omega, t, axis=0) + np.cross(omega, IRIS.inertia * omega)
+    arms, k = np.array(IRIS.rotor_positions), IRIS.thrust_coefficient
+    mix = np.stack([k + 0 * arms[:, 0], k * arms[:, 1], -k * arms[:, 0], IRIS.torque_coefficient * np.array(IRIS.spin)])
+    u = np.sqrt(np.linalg.solve(mix, np.column_stack([15 + 0 * t, torque]).T).T)
+    log = with_parts(flight, omega=omega, u=u)
+    for wrong, spin, verdict, words in (
+        (1.0, IRIS.spin, OK, NOTHING),
+        (2.0, IRIS.spin, WARNS, "Iy − Ix: correct its inertia"),
+        (1.0, tuple(-sign for sign in IRIS.spin), FAILS, "flip"),
+    ):
+        vehicle = replace(IRIS, inertia=(ix, wrong * ix, iz), spin=spin)
+        found = {check.name: check for check in check_log(log, vehicle)}[YAW]
+        assert (found.verdict, words in found.suggestion) == (verdict, True), found
 
 
 @pytest.mark.parametrize("spin", [(1, 1, -1, 1), (1, 1, 1, 1)], ids=str)
