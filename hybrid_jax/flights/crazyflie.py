@@ -7,7 +7,6 @@ The format: byte 0xBC, u16 version, u16 number of event types; of each, u16 id, 
 The Crazyflie's pitch, and its rate in `controller`, are counted nose up; the library's nose down.
 """
 
-import gzip
 import re
 import struct
 import zlib
@@ -69,7 +68,7 @@ def read_crazyflie(path: str | Path) -> Recording:
     Raises:
         ValueError: file, variable, time and what to do, in one line.
     """
-    content = _content(path)
+    content = samples.unpacked(path)
     try:
         events, at = _header(path, content)
     except (struct.error, IndexError, UnicodeDecodeError) as error:
@@ -96,16 +95,6 @@ def read_crazyflie(path: str | Path) -> Recording:
 def is_crazyflie(head: bytes) -> bool:
     """Whether a file, by its first bytes, unpacked, is such a log."""
     return len(head) >= 3 and head[0] == MAGIC and head[1:3] == VERSION.to_bytes(2, "little")
-
-
-def _content(path: str | Path) -> bytes:
-    try:
-        content = Path(path).read_bytes()
-        return gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
-    except (EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def _header(path, content: bytes) -> tuple[dict[int, Event], int]:

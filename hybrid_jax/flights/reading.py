@@ -47,6 +47,11 @@ def format_of(path: str | Path) -> str:
     return (found or named or [""])[0]
 
 
+def _is_packed(path: str | Path) -> bool:
+    with Path(path).open("rb") as file:
+        return file.read(2) == b"\x1f\x8b"
+
+
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
     """The logs of a folder in the order of their names, and its other files, each with why it is left.
 
@@ -94,6 +99,8 @@ def read_recording(
     if kind == CSV:
         columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
         found = recording_of(read_csv(path)) if columns is None else record_mapped(path, columns)
+    elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and _is_packed(path):
+        raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
         found = read_rosbag(path, topics or {})
     elif kind:

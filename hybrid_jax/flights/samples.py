@@ -1,5 +1,7 @@
 """Samples as they stand in a log, in ticks of its clock, and how they become the signals of a `Recording`."""
 
+import gzip
+import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -27,6 +29,17 @@ class Samples(NamedTuple):
     values: Float[np.ndarray, "n k"]
     axes: tuple[str, ...]
     source: str
+
+
+def unpacked(path: str | Path) -> bytes:
+    """The bytes of a file, plain or gzip; ValueError, with the file and what to do, if they cannot be read."""
+    try:
+        content = Path(path).read_bytes()
+        return gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+    except (EOFError, zlib.error) as error:
+        raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
 
 
 def record(

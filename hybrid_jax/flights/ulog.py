@@ -1,4 +1,4 @@
-"""Read PX4 ULog files, of PX4 1.5 to 1.16, with pyulog (extra `logs`).
+"""Read PX4 ULog files, plain or gzip, of PX4 1.5 to 1.16, with pyulog (extra `logs`).
 
 PX4 states attitude as body FRD → world NED and vectors in these frames (msg/versioned/VehicleAttitude.msg,
 msg/versioned/VehicleLocalPosition.msg); the format is that of docs.px4.io, "ULog File Format".
@@ -7,6 +7,7 @@ msg/versioned/VehicleLocalPosition.msg); the format is that of docs.px4.io, "ULo
 import contextlib
 import io
 import struct
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -74,12 +75,14 @@ def _load(path: str | Path) -> tuple[Any, str]:
         import pyulog
     except ImportError as error:
         raise ValueError(f"{path}: reading ULog needs pyulog: pip install 'hybrid_jax[logs]'") from error
+    content = samples.unpacked(path)
     try:
-        with contextlib.redirect_stdout(io.StringIO()):  # pyulog reports damage on standard output only
-            log = pyulog.ULog(str(path), TOPICS)
-        cut = _cut(Path(path).read_bytes())
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror}") from error
+        # pyulog reports damage on standard output only. In memory, where a seek stops at 0, it may go round for ever.
+        with contextlib.redirect_stdout(io.StringIO()), tempfile.TemporaryFile() as file:
+            file.write(content)
+            file.seek(0)
+            log = pyulog.ULog(file, TOPICS)
+        cut = _cut(content)
     except Exception as error:  # pyulog raises any exception for a damaged file
         raise ValueError(f"{path}: is not a ULog or is damaged; download it again ({type(error).__name__})") from error
     seconds = (log.last_timestamp - log.start_timestamp) * 1e-6

@@ -215,6 +215,8 @@ def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
     assert "damage" not in recording.facts
     assert "damage" in read_recording(written(blackbox(flight[:200], ended=False), "cut.bbl")).facts
     refusal(lambda: to_flight(recording), "no position", "identify")
+    packed = written(gzip.compress(blackbox(flight[:9])), "flight.bbl.gz")
+    refusal(lambda: read_recording(packed), packed, "gunzip flight.bbl.gz")
 
 
 def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):

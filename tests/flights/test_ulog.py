@@ -3,6 +3,7 @@
 The format: docs.px4.io, "ULog File Format", version 1.
 """
 
+import gzip
 import struct
 
 import numpy as np
@@ -105,9 +106,11 @@ def written(tmp_path):
     return write
 
 
-def test_a_flight_with_esc_rpm_is_read(flight, topics, written):
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_flight_with_esc_rpm_is_read(flight, topics, written, packed):
     t = flight.t - flight.t[0]
-    log = to_flight(read_ulog(written(topics | {"esc_status": escs(t, flight.u)})))
+    content = ulog(topics | {"esc_status": escs(t, flight.u)})
+    log = to_flight(read_ulog(written(gzip.compress(content) if packed else content)))
     np.testing.assert_allclose(np.diff(log.t), 0.01, atol=1e-9)
     truth = CubicSpline(t, flight.x)(log.t + 0.003)
     # Linear between samples: ẍ / (8 · 50²) of position and velocity, ω̈ / (8 · 200²) of rates; slerp of attitude.
