@@ -82,7 +82,7 @@ def read_table(
 def _parts(
     path, text: IO[str], asked, delimiter: str, decimal: str, max_rows: int
 ) -> Iterator[Float[np.ndarray, "n c"]]:
-    header = text.readline(MAX_ROW_LENGTH)
+    header = text.readline(MAX_ROW_LENGTH).replace('"', "")  # R and others put names in quotes, or all cells
     names = [name.strip() for name in header.split(delimiter)]
     columns, further = asked
     columns = [*columns, *further[: max((i + 1 for i, name in enumerate(further) if name in names), default=0)]]
@@ -92,6 +92,7 @@ def _parts(
     picked, row = [names.index(name) for name in columns], 2
     while block := text.read(BLOCK):
         block += text.readline(MAX_ROW_LENGTH)
+        block = block.replace('"', "")
         lines = (block.replace(decimal, ".") if decimal != "." else block).split("\n")
         if not lines[-1]:
             lines.pop()

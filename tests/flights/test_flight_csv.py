@@ -39,6 +39,14 @@ def test_a_log_is_read_to_the_last_digit(flight, written, packed, end):
         np.testing.assert_allclose(getattr(log, name), getattr(flight, name), rtol=0, atol=1e-15)
 
 
+def test_quotes_around_names_and_cells_are_passed_over(flight, written):
+    """As R's write.csv and pandas' QUOTE_ALL write them."""
+    header = ",".join(f'"{name}"' for name in COLUMNS)
+    quoted = [",".join(f'"{cell}"' for cell in row.split(",")) for row in rows_of(flight)]
+    for rows in (rows_of(flight), quoted):
+        np.testing.assert_allclose(read_csv(written("\n".join([header, *rows]) + "\n")).x, flight.x, rtol=0, atol=1e-15)
+
+
 def test_columns_may_have_any_order(flight, written):
     rows = [",".join([*reversed(row.split(",")), "armed"]) for row in rows_of(flight)]
     header = ",".join([*reversed(COLUMNS), "mode"])
