@@ -79,6 +79,17 @@ def read_table(
     return np.concatenate(parts)
 
 
+def notes_on_end(path: str | Path) -> tuple[str, ...]:
+    """A note if no line break ends the last row of a file that was read: a program that writes rows ends each."""
+    with Path(path).open("rb") as file:
+        packed = file.read(2) == b"\x1f\x8b"
+    with gzip.open(path) if packed else Path(path).open("rb") as file:
+        file.seek(-1, io.SEEK_END)
+        ended = file.read(1) in b"\r\n"
+    note = "no line break ends the last row, so its last number may be cut off: cut the row out, or end it with one"
+    return () if ended else (note,)
+
+
 def _parts(
     path, text: IO[str], asked, delimiter: str, decimal: str, max_rows: int
 ) -> Iterator[Float[np.ndarray, "n c"]]:

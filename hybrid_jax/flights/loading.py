@@ -2,13 +2,14 @@
 
 import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.conversion import DT, to_flight
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.flight_csv import notes_on_end, read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.reading import CSV, SUFFIXES, find_logs, format_of, read_recording, recording_of, reordered
 from hybrid_jax.flights.recording import Recording
@@ -109,7 +110,7 @@ def read_log(
     log = read_csv(path) if columns is None else read_mapped(path, columns)
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
-    recording = recording_of(log)
+    recording = replace(recording_of(log), notes=notes_on_end(path))
     if len(motor_order):
         recording = reordered(recording, motor_order)
         log = FlightLog(log.t, log.x, recording.signals["rotor_speed"].values, log.name)

@@ -11,7 +11,7 @@ import numpy as np
 from hybrid_jax.flights.blackbox import read_blackbox
 from hybrid_jax.flights.column_map import ColumnMap, load_column_map, record_mapped
 from hybrid_jax.flights.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.flight_csv import notes_on_end, read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.flights.rosbag import read_rosbag
@@ -99,6 +99,7 @@ def read_recording(
     if kind == CSV:
         columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
         found = recording_of(read_csv(path)) if columns is None else record_mapped(path, columns)
+        found = replace(found, notes=(*found.notes, *notes_on_end(path)))
     elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and _is_packed(path):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:

@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 from surface import outcome, refusal
 
 from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.loading import read_log
 from hybrid_jax.flights.log import COLUMNS, FlightLog
+from hybrid_jax.flights.reading import read_recording
 
 HEADER = ",".join(COLUMNS)
 FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -45,6 +47,15 @@ def test_quotes_around_names_and_cells_are_passed_over(flight, written):
     quoted = [",".join(f'"{cell}"' for cell in row.split(",")) for row in rows_of(flight)]
     for rows in (rows_of(flight), quoted):
         np.testing.assert_allclose(read_csv(written("\n".join([header, *rows]) + "\n")).x, flight.x, rtol=0, atol=1e-15)
+
+
+@pytest.mark.parametrize("packed", [False, True])
+def test_a_file_that_ends_within_a_row_has_a_note(flight, written, packed):
+    whole = "\r\n".join([HEADER, *rows_of(flight[:20])]) + "\r\n"
+    for cut, notes in ((0, 0), (4, 1)):
+        path = written(whole[: len(whole) - cut], packed=packed)
+        for recording in (read_log(path).recording, read_recording(path)):
+            assert sum("its last number may be cut off" in note for note in recording.notes) == notes
 
 
 def test_columns_may_have_any_order(flight, written):
