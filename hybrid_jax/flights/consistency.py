@@ -33,6 +33,7 @@ LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
 KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
+FEWEST = 20  # intervals to compare
 SPAN = 0.05  # s of moving average on both sides of an equation
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
@@ -179,7 +180,7 @@ def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
     whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
     pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
-    if not len(a) or max(_size(a), _size(b)) < least:
+    if len(a) < FEWEST or max(_size(a), _size(b)) < least:
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value = _relative_error(a, b)
     advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")

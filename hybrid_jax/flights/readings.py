@@ -44,6 +44,7 @@ def velocities(log: FlightLog) -> Readings:
         NOTHING: v,
         'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
         'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(v @ frd),
+        "x and y of velocity or position are exchanged: name their columns the other way round": v[:, [1, 0, 2]],
         'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
         "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
         "velocity is in mm/s or position in km: set the units": v * 1e-3,
