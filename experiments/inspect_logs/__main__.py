@@ -23,11 +23,13 @@ from hybrid_jax.flights.log import even_segments
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.suitability import check_recording
+from hybrid_jax.flights.windows import require_length
 from hybrid_jax.io.files import json_value, write_atomic
 from hybrid_jax.vehicle import Vehicle
 
 NAME = "inspect_logs"
 LISTS = ("--polynomial", "--motor-order", "--topics")
+WINDOW = 10  # intervals, as of load_windows
 DT, ONE_TO_ONE = 0.01, (0.0, 1.0)  # s; rotor speed = command
 # Checks that a log may fail and still tell of its vehicle: it needs no position, and is cut at gaps and on the ground.
 BORNE = ("quantities", "gaps", "repeated samples", "time on the ground")
@@ -117,6 +119,7 @@ def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
         other = vehicle is not None and flight.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(flight, None if other or unscaled else vehicle)
         even_segments(flight)
+        require_length([flight], WINDOW)
         if unscaled:
             reading.flight(options.dt)  # says what is missing
     except ValueError as error:

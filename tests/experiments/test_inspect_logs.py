@@ -140,10 +140,11 @@ def test_a_log_of_other_motors_hides_no_other(tmp_path, capsys):
 
 def test_a_log_that_training_refuses_is_not_ready(tmp_path, capsys):
     uneven = replace(LOGS[1], t=LOGS[1].t + 0.002 * (np.arange(len(LOGS[1])) % 2))
-    main([str(write(tmp_path / "flights", [LOGS[0], uneven])), "--out", str(tmp_path)])
+    main([str(write(tmp_path / "flights", [LOGS[0], uneven, LOGS[2][:2]])), "--out", str(tmp_path)])
     said = capsys.readouterr().out
     assert "no flight: the interval at 0.012 s is 0.008 s, the median is 0.012 s; put the samples on even times" in said
-    assert "1 of 2 logs are ready" in said
+    assert "no flight: no window of 10 intervals without gaps" in said
+    assert "1 of 3 logs are ready" in said
 
 
 def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
