@@ -11,7 +11,7 @@ import numpy as np
 from experiments.runner.command import ChecksFailed
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.airborne import airborne
-from hybrid_jax.flights.consistency import THRUST, UNUSUAL, Check, check_log
+from hybrid_jax.flights.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
@@ -23,7 +23,7 @@ from hybrid_jax.vehicle import Vehicle
 
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
-RATIO, MOTORS = "specific force over thrust per mass", "rotor_speed"
+MOTORS = "rotor_speed"
 GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
 LOOSE = 0.8  # relative error of the thrust that follows from commands, whose lag and curve are guesses
 OF_THRUST = {"curve", "mass", "k", "k_rotors"}
@@ -33,7 +33,7 @@ COMPARED = (
     (("position", "velocity"), 0.05, ("dp/dt against v",)),
     (("attitude", "rates"), 0.05, ("q̇ against ω",)),
     (("attitude", "velocity", MOTORS), 0.11, (THRUST, RATIO)),
-    (("rates", MOTORS), SLOW, ("columns", "motor order against roll and pitch", "spin against yaw")),
+    (("rates", MOTORS), SLOW, ("columns", ORDER, SPIN)),
     ((MOTORS,), np.inf, ("interval between samples",)),
 )
 

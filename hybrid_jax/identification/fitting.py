@@ -83,8 +83,11 @@ def identify(
         ValueError: of a recording that lacks something, or too few windows: name and what was expected.
     """
     layout = Layout() if layout is None else layout
-    told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
+    physics = physics_of(field)
+    told = "command" if isinstance(physics, Actuated) else "rotor_speed"
     checks.count("rounds", rounds)
+    if isinstance(physics, Actuated) and physics.reads_voltage:
+        _require_voltage(recordings)
     windows, inputs, columns = cut(recordings, layout, told, measured)
     moves = _free(field, free)
     if len(windows.start) <= moves.sum():
@@ -235,6 +238,13 @@ def _names(field) -> list[str]:
     physics = physics_of(field)
     leaves = jax.tree_util.tree_flatten_with_path(eqx.filter(physics, trainable(physics)))[0]
     return [jax.tree_util.keystr(path[-1:], simple=True) for path, _ in leaves]
+
+
+def _require_voltage(recordings: Sequence[Recording]) -> None:
+    for recording in recordings:
+        if "voltage" not in recording.signals:
+            mend = "leave nominal_voltage and voltage_exponent out of [actuator], or leave this log out"
+            raise ValueError(f"{recording.name}: has no battery voltage, which the actuator depends on; {mend}")
 
 
 def _free(field, names: Sequence[str] | None) -> np.ndarray:

@@ -162,4 +162,6 @@ def test_what_is_missing_or_too_short_is_named(twin):
     assert "has no velocity" in refusal(lambda: identify(start(), [only(twin, "rates")], LAYOUT, ("velocity",)))
     short = replace(LAYOUT, steps=10_000)
     assert "in flight without a gap" in refusal(lambda: identify(start(), [only(twin, "rates")], short))
+    charged = actuated(hj.multirotor(IRIS, ("Ix",)), replace(ACTUATOR, nominal_voltage=15.0, voltage_exponent=1.0))
+    assert "has no battery voltage" in refusal(lambda: identify(charged, [only(twin, "rates")], LAYOUT))
     assert "windows for" in refusal(lambda: identify(start(), [only(twin, "rates")], replace(LAYOUT, most=3)))
