@@ -84,12 +84,14 @@ def inverse(gram: Float[Array, "p p"]) -> Inverse:
     """The inverse, of a matrix that is scaled to a unit diagonal first: parameters differ in their effect."""
     scale = jnp.sqrt(jnp.diagonal(gram))
     scales = scale[:, None] * scale
-    values, vectors = jnp.linalg.eigh(gram / scales)
-    epsilon = jnp.finfo(gram.dtype).eps
+    scaled, epsilon = gram / scales, jnp.finfo(gram.dtype).eps
+    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))
     seen = values > RANK * len(gram) * epsilon
-    matrix = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T / scales
+    found = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T
+    # A step of Newton's method has the derivative of the inverse; that of eigenvectors is not always finite.
+    found = found @ (2 * jnp.eye(len(gram)) - scaled @ found)
     unseen = jnp.sum(jnp.where(seen, 0.0, jnp.square(vectors)), axis=1)
-    return Inverse(matrix, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
+    return Inverse(found / scales, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
 
 
 def inverses(grams: Float[Array, "n p p"]) -> Inverse:

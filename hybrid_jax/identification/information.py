@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax.adaptation.least_squares import Solver, ravel_parameters
+from hybrid_jax.adaptation.normal_equations import inverse
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import compact, rollout
 
@@ -23,13 +24,13 @@ class Information(NamedTuple):
     noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples
 
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
-        """The covariance of θ_p by least squares on the free parameters, zero for the others."""
+        """The covariance of θ_p by least squares on the free parameters, zero for the others.
+
+        The variance is infinite of parameters that the trajectory does not tell apart.
+        """
         both = free & free[:, None]
-        gram = jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
-        scale = jnp.sqrt(jnp.diagonal(gram))
-        # Not as in `normal_equations`: designs differentiate this, and slopes of eigenvectors are not always finite.
-        bread = jnp.linalg.inv(gram / (scale[:, None] * scale)) / (scale[:, None] * scale)
-        return bread @ jnp.where(both, self.noise, 0.0) @ bread
+        bread, told, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
+        return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(told, 0.0, jnp.inf))
 
 
 def information_of(
