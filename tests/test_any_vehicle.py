@@ -8,5 +8,5 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", params=["car", "iris", "multirotor"])
-def adapted(request):
+def adapted(request, kept_programs):
     return adapted_by_all(request.param)
