@@ -3,15 +3,17 @@
 from collections.abc import Mapping
 from pathlib import Path
 
+import matplotlib as mpl
 import numpy as np
 from jaxtyping import Float
 from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from experiments.closed_loop.results import REFERENCES
 from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, PARTS, true_theta
 from experiments.online.flights import CHANGE, SHARED, SHOWN_EVERY, Run, Setting
-from experiments.reporting.plots import PAGE, legend_below, subplots, tick_errors
+from experiments.reporting.plots import PAGE, STYLE, legend_below, subplots, tick_errors
 from hybrid_jax.sim.forces import WIND_MEAN
 from hybrid_jax.state import POSITION
 from hybrid_jax.sweep.lanes import lane
@@ -59,6 +61,7 @@ def whole(run: Run, i: int, name: str) -> np.ndarray:
     return np.concatenate([getattr(early, name), getattr(lane(run.flown, i), name)])
 
 
+@mpl.rc_context(STYLE)
 def errors(run: Run, setting: Setting, reference: str) -> Figure:
     """Distance from the reference over time, the root mean square over seeds, a panel for each change."""
     changes = list(dict.fromkeys(tags["change"] for tags in run.tags))
@@ -81,6 +84,7 @@ def errors(run: Run, setting: Setting, reference: str) -> Figure:
     return legend_below(figure, f"Distance from the reference, {REFERENCES[reference]}: RMS over seeds", columns=2)
 
 
+@mpl.rc_context(STYLE)
 def parameters(run: Run, setting: Setting, reference: str) -> Figure:
     """Estimates of one flight with their 95 % intervals, and the truth."""
     changes = list(dict.fromkeys(tags["change"] for tags in run.tags))
@@ -106,6 +110,7 @@ def parameters(run: Run, setting: Setting, reference: str) -> Figure:
         panel.axvline(0, color="0.7", linestyle=":", linewidth=1)
     for panel in panels[-1]:
         panel.set_xlabel("time after the change [s]")
+        panel.xaxis.set_major_locator(MaxNLocator(5))
     title = f"Seed 0, {REFERENCES[reference]}: estimates, 95 % intervals, truth (dashed; of wind its mean)"
     figure.suptitle(title, fontsize=9)
     return figure
