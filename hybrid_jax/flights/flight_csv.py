@@ -4,7 +4,6 @@ The header names the columns. Their order is free, and other columns are ignored
 """
 
 import contextlib
-import gzip
 import io
 import json
 import re
@@ -18,6 +17,7 @@ from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import rates_between
 from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
+from hybrid_jax.flights.samples import opened
 from hybrid_jax.state import BODY_RATES, QUATERNION, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
@@ -63,10 +63,8 @@ def read_table(
         ValueError: file, row, field and what to do, in one line.
     """
     try:
-        with Path(path).open("rb") as file:
-            packed = file.read(2) == b"\x1f\x8b"
-            file.seek(0)
-            text = io.TextIOWrapper(gzip.GzipFile(fileobj=file) if packed else file, encoding="utf-8-sig")
+        with opened(path) as file:
+            text = io.TextIOWrapper(file, encoding="utf-8-sig")
             parts = list(_parts(path, text, [columns, further], delimiter, decimal, max_rows))
     except FileNotFoundError as error:
         raise ValueError(f"{path}: no such file") from error
@@ -81,9 +79,7 @@ def read_table(
 
 def notes_on_end(path: str | Path) -> tuple[str, ...]:
     """A note if no line break ends the last row of a file that was read: a program that writes rows ends each."""
-    with Path(path).open("rb") as file:
-        packed = file.read(2) == b"\x1f\x8b"
-    with gzip.open(path) if packed else Path(path).open("rb") as file:
+    with opened(path) as file:
         file.seek(-1, io.SEEK_END)
         ended = file.read(1) in b"\r\n"
     note = "no line break ends the last row, so its last number may be cut off: cut the row out, or end it with one"

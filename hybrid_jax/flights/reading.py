@@ -1,6 +1,5 @@
 """Read any log into a `Recording`: the format is told by the file's first bytes, and by its suffix."""
 
-import gzip
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
@@ -15,7 +14,7 @@ from hybrid_jax.flights.flight_csv import notes_on_end, read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.flights.rosbag import read_rosbag
-from hybrid_jax.flights.samples import WXYZ, XYZ
+from hybrid_jax.flights.samples import WXYZ, XYZ, is_packed, opened
 from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
@@ -33,11 +32,8 @@ def format_of(path: str | Path) -> str:
     if path.is_dir():
         return ROSBAG if (path / BAG).is_file() else ""
     try:
-        with path.open("rb") as file:
+        with opened(path) as file:
             head = file.read(32)
-            if head[:2] == b"\x1f\x8b":
-                file.seek(0)
-                head = gzip.GzipFile(fileobj=file).read(32)
     except (OSError, EOFError, zlib.error):
         head = b""  # the reader that the suffix asks for says what is wrong
     if is_crazyflie(head):
@@ -45,11 +41,6 @@ def format_of(path: str | Path) -> str:
     found = [kind for magic, kind in MAGICS.items() if head.startswith(magic)]
     named = [kind for suffix, kind in SUFFIXES.items() if path.name.lower().endswith(suffix)]
     return (found or named or [""])[0]
-
-
-def _is_packed(path: str | Path) -> bool:
-    with Path(path).open("rb") as file:
-        return file.read(2) == b"\x1f\x8b"
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
@@ -100,7 +91,7 @@ def read_recording(
         columns = load_column_map(columns) if isinstance(columns, str | Path) else columns
         found = recording_of(read_csv(path)) if columns is None else record_mapped(path, columns)
         found = replace(found, notes=(*found.notes, *notes_on_end(path)))
-    elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and _is_packed(path):
+    elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and is_packed(path):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
         found = read_rosbag(path, topics or {})

@@ -4,7 +4,7 @@ import gzip
 import zlib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -13,6 +13,7 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, 
 from hybrid_jax.flights.log import wrong_norms
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
+GZIP = b"\x1f\x8b"
 XYZ, WXYZ, BATTERY = ("x", "y", "z"), ("w", "x", "y", "z"), ("battery",)
 LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
 WRAPS = (16, 32)  # bits of counters that may begin anew
@@ -31,11 +32,22 @@ class Samples(NamedTuple):
     source: str
 
 
+def is_packed(path: str | Path) -> bool:
+    """Whether a file is gzip, by its first bytes."""
+    with Path(path).open("rb") as file:
+        return file.read(2) == GZIP
+
+
+def opened(path: str | Path) -> IO[bytes]:
+    """A file, plain or gzip, to read its bytes."""
+    return gzip.open(path) if is_packed(path) else Path(path).open("rb")  # pyright: ignore[reportReturnType]
+
+
 def unpacked(path: str | Path) -> bytes:
     """The bytes of a file, plain or gzip; ValueError, with the file and what to do, if they cannot be read."""
     try:
-        content = Path(path).read_bytes()
-        return gzip.decompress(content) if content[:2] == b"\x1f\x8b" else content
+        with opened(path) as file:
+            return file.read()
     except (EOFError, zlib.error) as error:
         raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
     except OSError as error:
