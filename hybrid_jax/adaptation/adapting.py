@@ -42,8 +42,7 @@ STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGE
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; are dt and all units right?"
 NOT_FITTED = "no parameter was fitted"
-OVERLAP = "windows overlap: what is left out of a fit is seen by its neighbours, so errors to expect are too small"
-UNDETERMINED = "the windows do not tell the parameters apart"
+OVERLAP = "windows overlap: blocks left out share samples with the others, so the errors to expect are too small"
 
 METHODS: Mapping[str, Method] = {
     "auto": Auto(),
@@ -209,7 +208,6 @@ def adapt(
 
     adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
     rigid = moves_a_rigid_body(field)
-    known = [] if learned_from is None else [motion_of(each, rigid) for each in (learned_from, windows)]
     choice = {} if solution.choice is None else _chosen(solution.choice, train, rigid)
     without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
     without = NOT_FINITE if int(solution.status) == DIVERGED else without
@@ -225,7 +223,7 @@ def adapt(
         steps=int(solution.steps),
         status=STATUS[int(solution.status)],
         level=level,
-        outside=shares_outside(*known) if known else {},
+        outside={} if learned_from is None else shares_outside(*(motion_of(w, rigid) for w in (learned_from, windows))),
         **choice,
         **_parameters(adapted, train, settings, level, without, free),
     )
@@ -298,7 +296,7 @@ def _parameters(
     degrees = None if cluster == 1 else -(-len(windows) // cluster) - 1
     covariance = covariance_of(field, windows, solver=settings.solver, scale=scale, free=free, cluster=cluster)
     if np.isnan(covariance).any():
-        return {"parameters": alone, "without_intervals": UNDETERMINED}
+        return {"parameters": alone, "without_intervals": NOT_FINITE}
     found = intervals(field, covariance, level, degrees)
     fitted = [*values] if free is None else [name for name, one in zip(values, free, strict=True) if one]
     bounded = {name: Parameter(*map(float, found[name]), unit=units[name]) for name in fitted}

@@ -49,8 +49,8 @@ class OnlineAdaptation(AbstractEstimator):
         state = filter.begin(x)
         state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
 
-    Pure: its methods compile and map over stacked states, and do not raise for bad samples, but for their shape; see
-    `flags`.
+    Pure: its methods compile and map over stacked states. They refuse samples of another shape; numbers that are bad
+    raise nothing, see `flags`.
 
     Attributes:
         field: its physics is adapted from the values that it has; a network beside it stays as it is.

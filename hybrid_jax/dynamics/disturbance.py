@@ -68,7 +68,7 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
         if indices is None or indices == known.indices:
             return field
         if checks.is_traced(known.value) or jnp.any(known.value != 0):
-            raise ValueError("indices: the field has a disturbance already; leave them out, or `without_disturbance`")
+            raise ValueError("indices: the field already has a disturbance of other states; see without_disturbance")
         field = without_disturbance(field)
     physics = physics_of(field)
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))

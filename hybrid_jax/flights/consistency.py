@@ -166,9 +166,7 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
         ix, _, iz = vehicle.inertia
         even = respond(log, replace(vehicle, inertia=(ix, ix, iz)))
         sure = even is not None and even.yaw_sign * even.correlations[2] < OPPOSED
-        hangs = (
-            "opposed only with the vehicle's Iy − Ix: correct its inertia, which may be an estimate, or else its spins"
-        )
+        hangs = "opposed only with the vehicle's Iy − Ix: check its inertia, which may be estimated, then its spins"
         turning = (FAILS, "flip the sign of every spin of the vehicle") if sure else (WARNS, hangs)
     return Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning)
 

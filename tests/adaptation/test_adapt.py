@@ -191,7 +191,7 @@ class Nothing(AbstractVectorField):
 def test_a_disturbance_that_is_not_zero_is_moved_to_no_other_states():
     still = hj.with_disturbance(hj.with_disturbance(pendulum(), (0,)), (1,))
     assert disturbance_of(still).indices == (1,)
-    with pytest.raises(ValueError, match="indices: the field has a disturbance already"):
+    with pytest.raises(ValueError, match="indices: the field already has a disturbance of other states"):
         hj.with_disturbance(disturbed(pendulum(), PUSH[1:], (1,)), (0,))
 
 

@@ -92,7 +92,7 @@ def test_windows_of_many_flights_are_not():
 
 
 def test_windows_that_overlap_are_adapted_to_with_a_warning():
-    with pytest.warns(UserWarning, match="windows overlap: what is left out of a fit"):
+    with pytest.warns(UserWarning, match="windows overlap: blocks left out share samples"):
         adapt(pendulum(0.7), flight(5, 2)[:40], method="source")
 
 

@@ -136,7 +136,7 @@ def test_a_spin_is_not_refused_for_an_inertia_that_may_be_an_estimate(flight):
     log = with_parts(flight, omega=omega, u=u)
     for wrong, spin, verdict, words in (
         (1.0, IRIS.spin, OK, NOTHING),
-        (2.0, IRIS.spin, WARNS, "Iy − Ix: correct its inertia"),
+        (2.0, IRIS.spin, WARNS, "Iy − Ix: check its inertia"),
         (1.0, tuple(-sign for sign in IRIS.spin), FAILS, "flip"),
     ):
         vehicle = replace(IRIS, inertia=(ix, wrong * ix, iz), spin=spin)
