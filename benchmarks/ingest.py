@@ -17,7 +17,7 @@ from rich.table import Table
 
 from benchmarks.subjects import DT
 from benchmarks.timing import Findings, Ratio, agree, in_turns, run, stopwatch
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.vehicle import IRIS
 

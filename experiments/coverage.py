@@ -26,9 +26,9 @@ from experiments.runner.stages import Found, Stages, identity_of, rows_of, stage
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
 from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
-from hybrid_jax.adaptation.uncertainty import covariance_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
+from hybrid_jax.estimation.uncertainty import covariance_of
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sim.changes import CHANGES

@@ -15,10 +15,10 @@ from experiments.online.config import NOISE
 from experiments.runner import command
 from experiments.runner.options import NotNegative, Positive, check_numbers
 from hybrid_jax import AbstractVectorField, Model, OnlineAdaptation, checks, load, rotation
-from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.base import infer_batch
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export import (
     casadi_function,
     casadi_step,

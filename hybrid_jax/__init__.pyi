@@ -4,18 +4,13 @@ from . import runtime
 from .adaptation import (
     METHODS,
     Adaptation,
-    Cause,
     FineTune,
     LeastSquares,
     Method,
-    OnlineAdaptation,
     Ridge,
     Solution,
     Source,
     adapt,
-    covariance_of,
-    fit_least_squares,
-    intervals,
     pool,
 )
 from .dynamics import (
@@ -34,12 +29,14 @@ from .dynamics import (
     rigid_body,
     with_disturbance,
 )
+from .estimation import covariance_of, fit_least_squares, intervals
 from .flights import load_log, load_windows
-from .identification import Excitation, FlightBounds, InputBounds, excitation
 from .integrate import RK4, SOLVERS, rollout, rollout_batch
 from .io import Model, check_savable, load, portable, save
 from .networks import grid_network, residual_network
 from .networks.standardise import with_scaling
+from .online import Cause, OnlineAdaptation
+from .planning import Excitation, FlightBounds, InputBounds, excitation
 from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
 from .trajectories import Trajectories
 from .vehicle import IRIS, Vehicle, load_vehicle

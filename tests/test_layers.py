@@ -15,11 +15,12 @@ ROOT = Path(__file__).parents[1]
 ORDER = (
     *("state", "rotation", "matrices", "chunks", "runtime", "native", "checks", "programs", "vehicle", "trajectories"),
     *("extrapolation", "dynamics", "integrate", "networks", "rollout_kernels", "rollouts", "metrics", "io"),
-    *("training", "adaptation", "sweep", "sim", "flights", "control", "export", "identification"),
+    *("estimation", "training", "adaptation", "online", "sweep", "sim", "flights", "control", "export"),
+    *("planning", "identification"),
 )
 # These serve any field, whatever trained it: no learning, no reporting, and none of them knows another.
 SERVICES = {"sim", "flights", "control", "export"}
-LEARNING = {"networks", "training", "adaptation", "sweep"}
+LEARNING = {"networks", "estimation", "training", "adaptation", "online", "sweep"}
 
 
 def imported(path):

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from hybrid_jax.adaptation.normal_equations import inverses
+from hybrid_jax.estimation.normal_equations import inverses
 from hybrid_jax.matrices import solve
 
 ROOTS = np.random.default_rng(0).normal(size=(4, 3, 3)).astype(np.float32)

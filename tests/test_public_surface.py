@@ -17,9 +17,10 @@ from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
 
 import hybrid_jax as hj
 from hybrid_jax import metrics
-from hybrid_jax.adaptation import ridge, uncertainty
-from hybrid_jax.adaptation.least_squares import fit_least_squares
+from hybrid_jax.adaptation import ridge
 from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.estimation import uncertainty
+from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain

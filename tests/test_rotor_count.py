@@ -11,10 +11,10 @@ from surface import refusal
 import hybrid_jax as hj
 from hybrid_jax.control import Controller
 from hybrid_jax.export.program import sizes_of
-from hybrid_jax.flights.consistency import OK, check_log
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.checks.consistency import OK, check_log
+from hybrid_jax.flights.checks.readings import respond
+from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.readings import respond
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import fly
 from hybrid_jax.state import STATE_NAMES, input_names

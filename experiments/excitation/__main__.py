@@ -38,14 +38,14 @@ from experiments.runner.options import Count, NotNegative, Positive, Run, distin
 from experiments.runner.run_record import environment
 from experiments.runner.stages import stages_of
 from hybrid_jax import control
-from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import nominal, rigid_body
-from hybrid_jax.identification import Excitation, FlightBounds, excitation
-from hybrid_jax.identification.information import information_of
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.estimation.uncertainty import covariance_of, intervals
+from hybrid_jax.planning import Excitation, FlightBounds, excitation
+from hybrid_jax.planning.fisher_information import information_of
 from hybrid_jax.sim import flight as random_flight
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain

@@ -16,7 +16,7 @@ from experiments.reporting.plots import COLOURS, PAGE, STYLE, name_lines, subplo
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Interval, mean_interval
 from experiments.reporting.tables import Table, cross_table, over_seeds, tabulate
-from hybrid_jax.identification import Excitation, FlightBounds
+from hybrid_jax.planning import Excitation, FlightBounds
 from hybrid_jax.rotation import heading
 from hybrid_jax.sim.flight import DT
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY

@@ -25,7 +25,7 @@ from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_mod
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification.fitting import identify, identify_in_turn
-from hybrid_jax.identification.measured import Initial, Layout
+from hybrid_jax.identification.recordings import Initial, Layout
 from hybrid_jax.io import save
 
 NAME = "identify"

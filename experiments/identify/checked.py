@@ -10,14 +10,14 @@ import numpy as np
 
 from experiments.runner.command import ChecksFailed
 from hybrid_jax.dynamics.actuators import Actuated
-from hybrid_jax.flights.airborne import airborne
-from hybrid_jax.flights.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
+from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
+from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
+from hybrid_jax.flights.formats.raw import WXYZ, XYZ
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
-from hybrid_jax.flights.samples import WXYZ, XYZ
-from hybrid_jax.flights.suitability import check_recording, failures
-from hybrid_jax.identification.between import SLOW
+from hybrid_jax.identification.slow_commands import SLOW
 from hybrid_jax.io.archive import digest
 from hybrid_jax.vehicle import Vehicle
 

@@ -19,22 +19,22 @@ from experiments.identify.crazypad import ACTUATOR, VEHICLE, cut_out, force_erro
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
-from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.adaptation.ridge import defects
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.flights.airborne import airborne
-from hybrid_jax.flights.column_map import load_column_map
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.reading import read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.scores import errors_between
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.identification.fitting import identify
-from hybrid_jax.identification.measured import Layout
+from hybrid_jax.identification.recordings import Layout
 from hybrid_jax.state import VELOCITY
 
 OF_A = """B2_circle_slow_rep1 B2_circle_medium_rep1 B2_circle_fast_rep1 B3_figure8_slow_rep1 B3_figure8_fast_rep1

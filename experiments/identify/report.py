@@ -13,9 +13,9 @@ from experiments.reporting.plots import STYLE, save_figure
 from experiments.reporting.tables import Table
 from hybrid_jax.adaptation.adapting import UNITS
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
-from hybrid_jax.identification import between
+from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, prediction_errors
-from hybrid_jax.identification.measured import Layout
+from hybrid_jax.identification.recordings import Layout
 
 ACTUATOR_UNITS = {"curve": "N or rad/s", "time_constant": "s", "time_constants": "s", "delay": "s"}
 
@@ -37,7 +37,7 @@ def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Reco
     unseen = [row["parameter"] for row in rows if not np.isfinite(row["high"])]
     notes = [f"{found.windows} windows, {found.seconds:.4g} s of flight, of {len(logs)} logs"]
     with_commands = [log for log in logs if "command" in log.signals]
-    slow = [log.signals["command"].interval for log in with_commands if between.is_slow(log.signals["command"])]
+    slow = [log.signals["command"].interval for log in with_commands if slow_commands.is_slow(log.signals["command"])]
     if slow:
         notes.append(
             f"commands {max(slow):.3g} s apart: they changed in between, which the intervals count; a delay and a lag "

@@ -16,13 +16,13 @@ from experiments.real_flight.config import read_topics
 from experiments.runner import command
 from experiments.runner.options import Positive, check_numbers
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
-from hybrid_jax.flights.column_map import load_column_map
-from hybrid_jax.flights.consistency import FAILS, check_log
-from hybrid_jax.flights.loading import Reading, asked_interval, read_log
+from hybrid_jax.flights.checks.consistency import FAILS, check_log
+from hybrid_jax.flights.checks.suitability import check_recording
+from hybrid_jax.flights.formats.column_map import load_column_map
+from hybrid_jax.flights.load import Reading, asked_interval, read_log
 from hybrid_jax.flights.log import even_segments
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.suitability import check_recording
 from hybrid_jax.flights.windows import require_length
 from hybrid_jax.io.files import json_value, write_atomic
 from hybrid_jax.vehicle import Vehicle

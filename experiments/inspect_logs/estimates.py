@@ -12,9 +12,9 @@ from jaxtyping import Float
 from scipy.signal import lfilter
 
 from hybrid_jax.flights.attitude import interpolate, mean_of_held
-from hybrid_jax.flights.cleaning import TIME_CONSTANTS
+from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
+from hybrid_jax.flights.checks.readings import FAST, moving_mean
 from hybrid_jax.flights.conversion import motors_of
-from hybrid_jax.flights.readings import FAST, moving_mean
 from hybrid_jax.flights.recording import Recording, Signal
 
 FASTEST, LONGEST = 0.002, 60.0  # s: least interval, and how much of each log is used

@@ -16,8 +16,8 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.reporting.tables import EMPTY, Table
 from experiments.runner.run_record import environment
-from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
-from hybrid_jax.flights.loading import Reading
+from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
+from hybrid_jax.flights.load import Reading
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Signal
 
 PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most

@@ -10,8 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.adaptation.causes import Cause
-from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -20,6 +18,8 @@ from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.terms import Terms, units_of
+from hybrid_jax.online.estimator import OnlineAdaptation
+from hybrid_jax.online.hypotheses import Cause
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.changes import DOUBLED_DRAG, OFF_CENTRE_LOAD, WEAK_ROTOR
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain

@@ -19,11 +19,11 @@ from experiments.closed_loop.flights import PATHS, WIDTH
 from experiments.online import agents
 from experiments.online.agents import CHANGES, PARTS
 from experiments.runner.progress import Line
-from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import Controller, Hardware, Loop, sample
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.sim.domain import Quadrotor
 from hybrid_jax.sim.flight import CLOCK, fly
 from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, weak_rotor, wind

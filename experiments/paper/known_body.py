@@ -17,10 +17,10 @@ from experiments.reporting.tables import Table, tabulate
 from experiments.runner.options import Count, CountFromZero, NotNegative, check_numbers
 from experiments.runner.progress import Line
 from hybrid_jax import rotation
-from hybrid_jax.adaptation.least_squares import fit_least_squares
-from hybrid_jax.adaptation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_body
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.estimation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FASTEST_COMPILE

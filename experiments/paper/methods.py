@@ -17,11 +17,11 @@ from experiments.paper.study import SOLVED, solved
 from experiments.paper.study import adapted as trained
 from experiments.reporting import names
 from experiments.runner.stages import Stages
-from hybrid_jax.adaptation import covariance_of, intervals
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
 from hybrid_jax.dynamics.base import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.rigid_body import RigidBody
+from hybrid_jax.estimation import covariance_of, intervals
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.sweep.lanes import lane

@@ -20,10 +20,10 @@ from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment
 from experiments.runner import command
 from experiments.runner.stages import stages_of
-from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.vehicle_file import LAG, NEED_PURPOSE, VehicleModel, learned_by_field, vehicle_model_of
-from hybrid_jax.flights.cleaning import choose_time_constant
-from hybrid_jax.flights.consistency import FAILS
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.flights.checks.cleaning import choose_time_constant
+from hybrid_jax.flights.checks.consistency import FAILS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows, require_common_interval

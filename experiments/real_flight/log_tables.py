@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.reporting.tables import Table
-from hybrid_jax.flights.consistency import FAILS, WARNS
+from hybrid_jax.flights.checks.consistency import FAILS, WARNS
 
 VERDICTS = {"ok": "ok", "warns": "warns", "fails": "FAILS", "cannot tell": "?"}
 CHECKED = "Checks: of each log as recorded, then of the cleaned flight (? cannot tell; the value is beside the verdict)"

@@ -12,11 +12,11 @@ from experiments.real_flight.config import Cleaning, RealFlightConfig, read_topi
 from experiments.real_flight.models import RECIPES
 from experiments.runner.command import ChecksFailed
 from hybrid_jax.extrapolation import Motion, motion
-from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
-from hybrid_jax.flights.consistency import FAILS, Check, check_log
-from hybrid_jax.flights.loading import asked_interval, read_folder
+from hybrid_jax.flights.checks.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
+from hybrid_jax.flights.checks.consistency import FAILS, Check, check_log
+from hybrid_jax.flights.checks.suitability import check_recording, failures
+from hybrid_jax.flights.load import asked_interval, read_folder
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
-from hybrid_jax.flights.suitability import check_recording, failures
 from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.io.archive import digest
 from hybrid_jax.trajectories import Trajectories

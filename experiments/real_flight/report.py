@@ -27,7 +27,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
 from experiments.runner.run_record import environment
-from hybrid_jax.adaptation.uncertainty import named_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.windows import flight_of
 

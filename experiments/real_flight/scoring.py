@@ -22,10 +22,10 @@ from experiments.reporting import names
 from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evaluate, every
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Interval, mean_interval
-from hybrid_jax.adaptation.least_squares import ravel_parameters
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
-from hybrid_jax.adaptation.uncertainty import covariance_of, intervals
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.sweep.lanes import lane, stack

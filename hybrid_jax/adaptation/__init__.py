@@ -7,30 +7,14 @@
 
 By default the windows choose: the source as it is, its physical parameters θ_p by least squares, with these a constant
 disturbance and, of a rigid body, drag and the rotors' efficiencies, and last the network, held at the source's weights
-(`Auto`). `METHODS` lists the other methods by name; `Method` says how to write one. `OnlineAdaptation` adapts while
-the system runs, one sample at a time.
+(`Auto`). `METHODS` lists the other methods by name; `Method` says how to write one.
 """
 
 from hybrid_jax.adaptation.adapting import METHODS, Adaptation, Parameter, adapt
 from hybrid_jax.adaptation.auto import Auto
-from hybrid_jax.adaptation.causes import Cause
 from hybrid_jax.adaptation.expert_augmentation import Augmentation, ExpertAugmented, expert_augmented
-from hybrid_jax.adaptation.least_squares import LeastSquaresFit, fit_least_squares
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source
-from hybrid_jax.adaptation.online import OnlineAdaptation
-from hybrid_jax.adaptation.online_state import Flags, OnlineState
 from hybrid_jax.adaptation.pooling import pool
-from hybrid_jax.adaptation.tuning import Tuning
-from hybrid_jax.adaptation.uncertainty import (
-    DisturbanceSelection,
-    Interval,
-    covariance_of,
-    intervals,
-    select_disturbance,
-)
 
-__all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "DisturbanceSelection", "ExpertAugmented", "FineTune"]
-__all__ += ["Interval", "LeastSquares", "LeastSquaresFit", "Method", "Parameter", "Ridge", "Solution", "Source"]
-__all__ += ["Cause", "Flags", "OnlineAdaptation", "OnlineState", "Tuning"]
-__all__ += ["adapt", "covariance_of", "expert_augmented", "fit_least_squares", "intervals", "pool"]
-__all__ += ["select_disturbance"]
+__all__ = ["METHODS", "Adaptation", "Augmentation", "Auto", "ExpertAugmented", "FineTune", "LeastSquares", "Method"]
+__all__ += ["Parameter", "Ridge", "Solution", "Source", "adapt", "expert_augmented", "pool"]

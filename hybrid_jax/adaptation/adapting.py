@@ -16,14 +16,14 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
 from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
-from hybrid_jax.adaptation.least_squares import check_windows
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
-from hybrid_jax.adaptation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.corrected_body import simplified
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
 from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
+from hybrid_jax.estimation.least_squares import check_windows
+from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value

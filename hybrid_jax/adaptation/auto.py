@@ -11,14 +11,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
-from hybrid_jax.adaptation.least_squares import Scale, Solver, check_determined, ravel_parameters
 from hybrid_jax.adaptation.methods import Solution, scale_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
-from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.corrected_body import corrected
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED

@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation.least_squares import Theta, ravel_parameters
 from hybrid_jax.adaptation.methods import Solution
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
+from hybrid_jax.estimation.least_squares import Theta, ravel_parameters
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse

@@ -13,8 +13,8 @@ from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.adapting import Adaptation, Parameter
-from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.uncertainty import check_level, named_parameters
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import check_level, named_parameters
 
 SOURCES = 3  # at least so many: the variance between two says nothing
 

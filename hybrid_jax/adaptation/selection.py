@@ -14,9 +14,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from hybrid_jax.adaptation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
-from hybrid_jax.adaptation.normal_equations import equations_of, has_effect, masked, steps_without
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
+from hybrid_jax.estimation.normal_equations import equations_of, has_effect, masked, steps_without
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories

@@ -33,8 +33,8 @@ class Multirotor(AbstractRigidBody):
 
     Parameters are deviations from nominal, so that all start at zero and one learning rate fits them all: positive ones
     as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the
-    rotors is applied to the log (`hybrid_jax.flights.cleaning`): as four more states it would be unknown at the start
-    of each window.
+    rotors is applied to the log (`hybrid_jax.flights.checks.cleaning`): as four more states it would be unknown at the
+    start of each window.
 
     Attributes:
         deviations: of each learned parameter, by name; shapes as of `shape_of`.

@@ -18,7 +18,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
-LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.cleaning`
+LAG = "motor_time_constant"  # learned from the logs and not by a field: see `hybrid_jax.flights.checks.cleaning`
 NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, they would absorb other effects
 
 

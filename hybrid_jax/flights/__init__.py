@@ -8,7 +8,7 @@ Its steps can be taken one by one. Split by flight before cutting, since windows
     windows = cut_windows(train, steps=10).windows
 """
 
-from hybrid_jax.flights.cleaning import (
+from hybrid_jax.flights.checks.cleaning import (
     align_motors,
     choose_time_constant,
     delay_motors,
@@ -17,15 +17,15 @@ from hybrid_jax.flights.cleaning import (
     low_pass,
     resample,
 )
-from hybrid_jax.flights.column_map import ColumnMap, load_column_map
-from hybrid_jax.flights.consistency import Check, check_log
+from hybrid_jax.flights.checks.consistency import Check, check_log
+from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
-from hybrid_jax.flights.loading import load_log, load_logs
+from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map
+from hybrid_jax.flights.load import load_log, load_logs
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.flights.suitability import check_recording
 from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_windows
 
 __all__ = [

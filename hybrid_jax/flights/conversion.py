@@ -7,7 +7,7 @@ from jaxtyping import Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held, rotation_of
-from hybrid_jax.flights.flight_csv import MAX_ROWS
+from hybrid_jax.flights.formats.csv import MAX_ROWS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import GAP, ROTOR_UNITS, Recording, Signal
 

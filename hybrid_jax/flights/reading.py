@@ -7,15 +7,15 @@ from pathlib import Path
 
 import numpy as np
 
-from hybrid_jax.flights.blackbox import read_blackbox
-from hybrid_jax.flights.column_map import ColumnMap, load_column_map, record_mapped
-from hybrid_jax.flights.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.flight_csv import notes_on_end, read_csv
+from hybrid_jax.flights.formats.blackbox import read_blackbox
+from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, record_mapped
+from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
+from hybrid_jax.flights.formats.csv import notes_on_end, read_csv
+from hybrid_jax.flights.formats.raw import WXYZ, XYZ, is_packed, opened
+from hybrid_jax.flights.formats.rosbag import read_rosbag
+from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
-from hybrid_jax.flights.rosbag import read_rosbag
-from hybrid_jax.flights.samples import WXYZ, XYZ, is_packed, opened
-from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 CSV, ULOG, CRAZYFLIE, ROSBAG, BLACKBOX = "CSV", "PX4 ULog", "Crazyflie µSD", "rosbag", "Betaflight blackbox"
@@ -78,7 +78,7 @@ def read_recording(
 
     Args:
         columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
-        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.rosbag`.
+        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: which motor of the log, from 0, each rotor of the vehicle is; by default they are in one order.
 
     Raises:

@@ -12,10 +12,10 @@ import jax
 import numpy as np
 
 from hybrid_jax import checks
-from hybrid_jax.flights.cleaning import in_flight, lag_motors, resample
-from hybrid_jax.flights.column_map import ColumnMap
-from hybrid_jax.flights.consistency import check_log
-from hybrid_jax.flights.loading import Failed, load_logs, report
+from hybrid_jax.flights.checks.cleaning import in_flight, lag_motors, resample
+from hybrid_jax.flights.checks.consistency import check_log
+from hybrid_jax.flights.formats.column_map import ColumnMap
+from hybrid_jax.flights.load import Failed, load_logs, report
 from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
@@ -65,7 +65,7 @@ def load_windows(
         stride: samples between the starts of two windows.
         columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, for logs of commands from 0 to 1 alone.
-        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.rosbag`.
+        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: which motor of the log, from 0, each rotor of the vehicle is.
         motor_time_constant: first-order lag [s] of the rotors, for logs that record commands and not rotor speeds.
         cut_ground: cut out periods with hardly any thrust, on the ground.

@@ -20,18 +20,18 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.adaptation import uncertainty
-from hybrid_jax.adaptation.least_squares import ravel_parameters
-from hybrid_jax.adaptation.normal_equations import NormalEquations, masked
-from hybrid_jax.adaptation.uncertainty import Interval
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT
+from hybrid_jax.estimation import uncertainty
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.normal_equations import NormalEquations, masked
+from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.identification import between
-from hybrid_jax.identification.measured import Layout, Windows, cut
-from hybrid_jax.identification.prediction import Problem, all_errors, normal_equations, rms, slopes_between
+from hybrid_jax.identification import slow_commands
+from hybrid_jax.identification.prediction_error import Problem, all_errors, normal_equations, rms, slopes_between
+from hybrid_jax.identification.recordings import Layout, Windows, cut
 
 ROUNDS = 3  # of weights
 CLUSTER = 2.0  # s of windows that are taken as one observation,
@@ -166,7 +166,9 @@ def prediction_errors(
 def _weighted(field, theta, changes, problem: Problem, layout: Layout) -> Problem:
     """The problem with errors weighted by what commands may have done between their samples."""
     at = field, theta, changes, problem, layout
-    scale, whitening = between.whitened(all_errors(*at), slopes_between(*at), problem.windows.there, problem.scale)
+    scale, whitening = slow_commands.whitened(
+        all_errors(*at), slopes_between(*at), problem.windows.there, problem.scale
+    )
     return problem._replace(scale={name: jnp.asarray(each) for name, each in scale.items()}, whitening=whitening)
 
 

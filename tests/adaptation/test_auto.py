@@ -15,10 +15,10 @@ import hybrid_jax as hj
 from hybrid_jax.adaptation import Auto, FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, weights_of, with_change
 from hybrid_jax.adaptation.auto import OF_A_RIGID_BODY, extended, free_parameters
-from hybrid_jax.adaptation.least_squares import fit_free, fit_least_squares, ravel_parameters
 from hybrid_jax.adaptation.selection import blocks_of, correlated, fit_candidates, predict_block, simplest
-from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.disturbance import disturbed
+from hybrid_jax.estimation.least_squares import fit_free, fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import windows_of
 

@@ -9,9 +9,9 @@ import pytest
 from surface import refusal
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.uncertainty import named_parameters
 from hybrid_jax.dynamics.actuators import Actuator, actuated, held_means, rotor_speeds
 from hybrid_jax.dynamics.disturbance import disturbance_of
+from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export.program import sizes_of
 from hybrid_jax.vehicle import IRIS
 

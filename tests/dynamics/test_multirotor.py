@@ -11,13 +11,13 @@ from jax.flatten_util import ravel_pytree
 from matrices import newton_euler
 
 from hybrid_jax import Hybrid, load, rigid_body, rotation, save
-from hybrid_jax.adaptation.least_squares import fit_least_squares
 from hybrid_jax.dynamics.base import Frozen, infer_batch, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
 from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
+from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories

@@ -20,7 +20,7 @@ from experiments.excitation.results import (
 )
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
-from hybrid_jax.identification import FlightBounds
+from hybrid_jax.planning import FlightBounds
 
 INSIDE = {"tilt [rad]": (0.5, 0.6)}
 

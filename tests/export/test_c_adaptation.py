@@ -13,9 +13,9 @@ from fields import double
 from jax.flatten_util import ravel_pytree
 
 import hybrid_jax as hj
-from hybrid_jax.adaptation.online import OnlineAdaptation
 from hybrid_jax.control import advance
 from hybrid_jax.export import export_adaptation_c
+from hybrid_jax.online.estimator import OnlineAdaptation
 
 pytestmark = needs_compiler
 DT = 0.01

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.airborne import CLEAR, MARGIN, airborne
+from hybrid_jax.flights.checks.airborne import CLEAR, MARGIN, airborne
 from hybrid_jax.flights.recording import Recording, Signal
 
 T = np.arange(0, 12, 0.01)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from surface import refusal
 
-from hybrid_jax.flights.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
+from hybrid_jax.flights.checks.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check

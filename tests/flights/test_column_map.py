@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
-from hybrid_jax.flights.column_map import load_column_map, read_mapped
+from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
 
 GOOD = """
 frames = {world = "NED", body = "FRD", velocity = "body"}

@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
-from hybrid_jax.flights.cleaning import delay_motors
-from hybrid_jax.flights.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
+from hybrid_jax.flights.checks.cleaning import delay_motors
+from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
+from hybrid_jax.flights.checks.readings import orders
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.readings import orders
 from hybrid_jax.vehicle import IRIS
 
 VELOCITY, RATES, THRUST = "dp/dt against v", "q̇ against ω", "v̇ against thrust along body z"

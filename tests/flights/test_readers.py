@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights import load_logs
+from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.flights.reading import find_logs, read_recording
-from hybrid_jax.flights.suitability import check_recording, failures
 from hybrid_jax.vehicle import IRIS
 
 STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]

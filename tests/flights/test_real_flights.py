@@ -8,8 +8,8 @@ import pytest
 
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.flights.consistency import OK, check_log
-from hybrid_jax.flights.flight_csv import read_csv
+from hybrid_jax.flights.checks.consistency import OK, check_log
+from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.vehicle import load_vehicle

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from surface import refusal
 
-from hybrid_jax.flights.cleaning import choose_time_constant, lag_motors
+from hybrid_jax.flights.checks.cleaning import choose_time_constant, lag_motors
 from hybrid_jax.flights.windows import flight_of, folds, hold_out, manoeuvre_of
 
 NAMES = [f"/logs/{kind}_run{i}.csv.gz" for kind in ("chirp", "square", "random") for i in (1, 2, 3)]

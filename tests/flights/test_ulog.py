@@ -15,10 +15,10 @@ from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.reading import reordered
-from hybrid_jax.flights.suitability import check_recording, failures
-from hybrid_jax.flights.ulog import read_ulog
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 

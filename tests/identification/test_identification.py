@@ -15,7 +15,7 @@ from hybrid_jax.dynamics.actuators import Actuator, actuated
 from hybrid_jax.dynamics.measurement import difference, measure, moved
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify, identify_in_turn, prediction_errors
-from hybrid_jax.identification.measured import Layout, initial_states, on_grid
+from hybrid_jax.identification.recordings import Layout, initial_states, on_grid
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import IRIS
 

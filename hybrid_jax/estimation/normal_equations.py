@@ -1,0 +1,122 @@
+"""The normal equations of θ_p, window by window: what windows tell of it, and what leaving one out changes."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hybrid_jax.chunks import in_chunks
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation import least_squares
+from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
+from hybrid_jax.programs import kept_jit
+from hybrid_jax.trajectories import Trajectories
+
+ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
+
+CHUNK = 250  # windows in memory at a time
+RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of parameters of equal effect, is zero
+
+
+class NormalEquations(NamedTuple):
+    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
+
+    gram: Float[Array, "n p p"]  # JᵀJ
+    score: Float[Array, "n p"]  # Jᵀr
+    square: Float[Array, " n"]  # rᵀr
+
+
+# A program of its own: selecting a disturbance and the covariance share it.
+@kept_jit
+def normal_equations(
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
+) -> NormalEquations:
+    """The normal equations of each window at a field's θ_p; for arguments see `uncertainty.covariance_of`."""
+    theta, unravel = ravel_parameters(field)
+
+    def one(window: Trajectories) -> NormalEquations:
+        def errors(theta):
+            r = least_squares.prediction_errors(unravel(theta), window, solver, scale)
+            return r, r
+
+        jacobian, r = jax.jacfwd(errors, has_aux=True)(theta)
+        return equations_of(jacobian, r, error)
+
+    return in_chunks(jax.vmap(one), windows, chunk)
+
+
+def equations_of(
+    jacobian: Float[Array, "t d p"], r: Float[Array, "t d"], error: ErrorLoss | None = None
+) -> NormalEquations:
+    """The normal equations of one window, from its errors and their Jacobian."""
+    bent, slope = jacobian, r  # half the curvature of the square times J, half its slope
+    if error is not None:
+        bent = jnp.einsum("tde,tep->tdp", jax.vmap(jax.hessian(error))(r), jacobian)
+        slope = jax.vmap(jax.grad(error))(r)
+    p = jacobian.shape[-1]
+    effect, r = jacobian.reshape(-1, p), r.ravel()
+    return NormalEquations(effect.T @ bent.reshape(-1, p), effect.T @ slope.ravel(), r @ r)
+
+
+def masked(equations: NormalEquations, free: Bool[Array | np.ndarray, " p"]) -> NormalEquations:
+    """The normal equations of the free parameters; of the others, such that they stay as they are."""
+    gram = jnp.where(free & free[:, None], equations.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
+    return NormalEquations(gram, jnp.where(free, equations.score, 0.0), equations.square)
+
+
+def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) -> Bool[Array, " p"]:
+    """Which parameters change the predictions by more than rounding does."""
+    return jnp.diagonal(jnp.sum(equations.gram, axis=0)) > jnp.square(least_squares.rounding(windows, scale))
+
+
+class Inverse(NamedTuple):
+    """The pseudo-inverse of a Gram matrix JᵀJ: zero along what changes no prediction by more than rounding does."""
+
+    matrix: Float[Array, "*n p p"]
+    told: Bool[Array, "*n p"]  # the parameters that take no part in such a change
+    rank: Int[Array, "*n"]
+
+
+def inverse(gram: Float[Array, "p p"]) -> Inverse:
+    """The inverse, of a matrix that is scaled to a unit diagonal first: parameters differ in their effect."""
+    scale = jnp.sqrt(jnp.diagonal(gram))
+    scales = scale[:, None] * scale
+    scaled, epsilon = gram / scales, jnp.finfo(gram.dtype).eps
+    values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))
+    seen = values > RANK * len(gram) * epsilon
+    found = (vectors * jnp.where(seen, 1 / values, 0.0)) @ vectors.T
+    # A step of Newton's method has the derivative of the inverse; that of eigenvectors is not always finite.
+    found = found @ (2 * jnp.eye(len(gram)) - scaled @ found)
+    unseen = jnp.sum(jnp.where(seen, 0.0, jnp.square(vectors)), axis=1)
+    return Inverse(found / scales, unseen < jnp.sqrt(epsilon), jnp.sum(seen))
+
+
+def inverses(grams: Float[Array, "n p p"]) -> Inverse:
+    """The inverse of each, one after the other: two batches at once can wait for each other, see `matrices.solve`."""
+    return jax.lax.map(inverse, grams)
+
+
+def steps_without(
+    gram: Float[Array, "p p"], score: Float[Array, " p"], grams: Float[Array, "b p p"], scores: Float[Array, "b p"]
+) -> Float[Array, "b p"]:
+    """The Gauss–Newton step on all windows but some, for each part that is left out, with the sums over all of them.
+
+    Not finite where a part alone tells what all windows tell; what not even these tell stays as it is.
+    """
+    found = inverses(gram - grams)
+    steps = -jnp.einsum("bpq,bq->bp", found.matrix, score - scores)
+    return jnp.where((found.rank == inverse(gram).rank)[:, None], steps, jnp.nan)
+
+
+def left_out(equations: NormalEquations, horizon: int) -> Float[Array, " n"]:
+    """L_MSE of each window as predicted by a fit of θ_p to all others; not finite where they tell less than all do.
+
+    Solved from the normal equations at the minimum, which is exact for linear residuals (PRESS; Allen 1974).
+    """
+    gram, score, square = equations
+    steps = steps_without(jnp.sum(gram, axis=0), jnp.sum(score, axis=0), gram, score)
+    bent = jnp.einsum("np,npq,nq->n", steps, gram, steps)
+    return (square + 2 * jnp.einsum("np,np->n", steps, score) + bent) / horizon

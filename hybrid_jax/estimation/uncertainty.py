@@ -1,0 +1,242 @@
+"""How well windows determine θ_p, from its normal equations: covariance, intervals, a disturbance or none.
+
+The covariance is **conditional on θ_d**: if the network of a hybrid was trained on the same windows, the intervals are
+too narrow. It contains no bias: effects that the model cannot express, such as an unmodelled drag, move θ̂_p by an
+amount that no interval shows; `experiments/coverage.py` measures both.
+"""
+
+from typing import Literal, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import scipy
+from jaxtyping import Array, Bool, Float, Int
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.disturbance import (
+    disturbance_of,
+    physics_of,
+    with_disturbance,
+    with_physics,
+    without_disturbance,
+)
+from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.estimation import least_squares
+from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.normal_equations import (
+    CHUNK,
+    ErrorLoss,
+    NormalEquations,
+    has_effect,
+    inverse,
+    inverses,
+    left_out,
+    masked,
+    normal_equations,
+)
+from hybrid_jax.programs import kept_jit
+from hybrid_jax.state import STATE_NAMES
+from hybrid_jax.trajectories import Trajectories
+
+Kind = Literal["sandwich", "homoscedastic"]
+
+
+class Interval(NamedTuple):
+    """An estimate and its confidence interval, in one unit."""
+
+    value: Float[Array, "*runs"]
+    low: Float[Array, "*runs"]
+    high: Float[Array, "*runs"]
+
+
+def covariance_of(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    kind: Kind = "sandwich",
+    solver: Solver = None,
+    chunk: int = CHUNK,
+    error: ErrorLoss | None = None,
+    scale: Scale = None,
+    free: Bool[Array | np.ndarray, " p"] | None = None,
+    cluster: int = 1,
+) -> Float[Array, "p p"]:
+    """The covariance of θ_p of a field fitted to the windows, given θ_d, in the physics' own parametrisation.
+
+    Rows are in the order of `ravel_parameters`; for a `RigidBody`: log Ix, log Iy, log k. Pure: it compiles and maps
+    over stacked fields. A parameter has an infinite variance if it changes nothing in the windows, or if they do not
+    tell it and others apart.
+
+    Args:
+        field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
+        kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
+            sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
+            within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
+            MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
+        chunk: windows that are held in memory at a time.
+        error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
+            The slope and curvature of another loss enter M and H (Huber 1967).
+        scale: divides the error of each state, as in `fit_least_squares`.
+        free: which parameters were fitted, all by default; the others are known and have no variance.
+        cluster: so many consecutive windows may be correlated, as those of one flight are. The sandwich is then the
+            jackknife that leaves one cluster out at a time, as the sandwich of summed J_iᵀr_i is too narrow for few
+            clusters (CV3 of MacKinnon, Nielsen and Webb, J. Applied Econometrics 2023), and intervals need Student's t.
+
+    Raises:
+        ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
+    """
+    least_squares.check_windows(field, windows)
+    fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
+    if not checks.is_traced(fitted):
+        least_squares.check_determined(field, len(windows), int(fitted))
+    checks.count("chunk", chunk)
+    checks.count("cluster", cluster)
+    if kind not in Kind.__args__:
+        raise ValueError(f"kind must be one of {', '.join(Kind.__args__)}, got {kind!r}")
+    if error is not None and kind == "homoscedastic":
+        raise ValueError("kind must be sandwich where an error is given: homoscedastic is that of squared errors")
+    equations = normal_equations(field, windows, solver, chunk, error, scale)
+    seen = has_effect(equations, windows, scale)
+    equations = masked(equations, seen if free is None else free & seen)
+    unknown = ~seen if free is None else free & ~seen
+    found = _covariance(equations, kind, windows.x[0].size, fitted, cluster)
+    return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
+
+
+@kept_jit
+def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
+    gram, score, square = equations
+    n = len(score)
+    bread = inverse(jnp.sum(gram, axis=0))
+    told = bread.told
+    if kind == "homoscedastic":
+        found = jnp.sum(square) / (n * entries - p) * bread.matrix
+    elif cluster > 1:
+        clusters, of = -(-n // cluster), np.arange(n) // cluster
+        gram, score = (jax.ops.segment_sum(part, of, clusters) for part in (gram, score))
+        without = inverses(jnp.sum(gram, axis=0) - gram)
+        told = told & without.told.all(axis=0)
+        # What leaving a cluster out does to θ_p.
+        moves = jnp.einsum("gpq,gq->gp", without.matrix, score - jnp.mean(score, axis=0))
+        moves = moves - jnp.mean(moves, axis=0)
+        found = (clusters - 1) / clusters * moves.T @ moves
+    else:
+        half = score @ bread.matrix  # H⁻¹ M H⁻¹ as a product of itself: symmetric and never negative
+        found = n / (n - p) * half.T @ half
+    return found + jnp.diag(jnp.where(told, 0.0, jnp.inf))
+
+
+def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Array, "p p"]:
+    """H⁻¹ M H⁻¹ of `covariance_of`, of normal equations in which all but `fitted` parameters are `masked`."""
+    return _covariance(equations, "sandwich", 1, fitted, cluster)
+
+
+def intervals(
+    field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95, degrees: int | None = None
+) -> dict[str, Interval]:
+    """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
+
+    The error is taken as normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter
+    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is. With `degrees`
+    of freedom, one less than the clusters of the covariance, z is Student's quantile.
+
+    Raises:
+        ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
+    """
+    check_level(level)
+    theta, unravel = ravel_parameters(physics := physics_of(field))
+    array, p = jnp.asarray(checks.real_array("covariance", covariance), float), theta.size
+    if array.shape != (p, p):
+        raise ValueError(f"covariance must be ({p}, {p}), as the field has {p} parameters, got shape {array.shape}")
+    variances = jnp.diagonal(array)
+    if not checks.is_traced(variances) and not (variances >= 0).all():
+        raise ValueError(f"covariance must have variances of at least 0, got {variances}")
+    quantile = jax.jit(jax.scipy.special.ndtri)((1 + level) / 2)
+    if degrees is not None:
+        quantile = float(scipy.special.stdtrit(degrees, (1 + level) / 2))
+    away = quantile * jnp.sqrt(variances)
+    left, right = (named_parameters(unravel(end)) for end in (theta - away, theta + away))
+    return {
+        name: Interval(value, jnp.minimum(left[name], right[name]), jnp.maximum(left[name], right[name]))
+        for name, value in named_parameters(physics).items()
+    }
+
+
+def check_level(level: float) -> None:
+    """Refuse a confidence level that is not between 0 and 1."""
+    if not 0 < (checks.real(level) or 0) < 1:
+        raise ValueError(f"level must be between 0 and 1, got {checks.short_repr(level)}")
+
+
+def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
+    """The parameters of a field's physics, number by number.
+
+    Where the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, that gives names and values in
+    physical units; each entry must be a monotonic function of one parameter. Otherwise names are those of the fields of
+    the class. Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance have the
+    names of a rigid body's states, or indices: disturbance[vx], disturbance[0].
+    """
+    physics, disturbance = physics_of(field), disturbance_of(field)
+    if isinstance(physics, Hybrid) and disturbance is not None:
+        found, values = named_parameters(physics.physics), jnp.atleast_1d(disturbance.value)
+        labels = disturbance.indices or range(len(values))
+        if isinstance(physics.physics, AbstractRigidBody):
+            labels = [STATE_NAMES[i] for i in disturbance.indices or range(-len(values), 0)]
+        return found | {f"disturbance[{label}]": value for label, value in zip(labels, values, strict=True)}
+    leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(physics, trainable(physics)))
+    values = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
+    if (theta := getattr(type(physics), "theta", None)) is not None:
+        values = theta(physics)
+    return {
+        f"{name}[{','.join(map(str, at))}]" if at else name: value[at]
+        for name, value in values.items()
+        for at in np.ndindex(value.shape)
+    }
+
+
+class DisturbanceSelection(eqx.Module):
+    """The fit that was kept, with a disturbance of zero if none is needed, and why."""
+
+    fit: LeastSquaresFit
+    needed: Bool[Array, ""]
+    gain: Float[Array, ""]  # by how much a disturbance lowers L_MSE of left-out windows, mean over windows
+    standard_error: Float[Array, ""]  # of the gain
+
+
+def select_disturbance(
+    field: AbstractVectorField,
+    windows: Trajectories,
+    solver: Solver = None,
+    max_steps: int = 100,
+    scale: Scale = None,
+    indices: tuple[int, ...] | None = None,
+) -> DisturbanceSelection:
+    """Fit θ_p with and without a constant disturbance and keep the fit that predicts left-out windows better.
+
+    More parameters always fit the same windows better, if only the errors of a network. So each window is predicted by
+    a fit to all others (leave-one-out cross-validation; Stone 1974), and the simpler model is kept unless it is worse
+    by more than one standard error of the difference (Breiman, Friedman, Olshen and Stone, Classification and
+    Regression Trees, 1984, Sec. 3.4.3). A single window, or windows that do not determine θ_p, need no disturbance.
+
+    Pure; raises and arguments as of `fit_least_squares`, but `windows` must be independent. `indices` are the disturbed
+    states, see `with_disturbance`.
+    """
+    starts = with_disturbance(field, indices), without_disturbance(field)
+    fits = [fit_least_squares(start, windows, solver, max_steps, scale) for start in starts]
+    equations = [normal_equations(fit.field, windows, solver, CHUNK, None, scale) for fit in fits]
+    return _selection(fits, equations, windows.horizon)
+
+
+@kept_jit
+def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
+    disturbed, plain = fits
+    gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)
+    gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))
+    needed = gain > error  # False where one of them is not finite
+    zero = jax.tree.map(jnp.zeros_like, disturbance_of(disturbed.field))
+    padded = with_physics(plain.field, Hybrid(physics_of(plain.field), zero))
+    plain = eqx.tree_at(lambda fit: fit.field, plain, padded)
+    kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
+    return DisturbanceSelection(kept, needed, gain, error)

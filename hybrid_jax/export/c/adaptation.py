@@ -1,0 +1,151 @@
+"""The step of an `OnlineAdaptation` as C99: its state is an array, as `ravel_pytree` makes one."""
+
+import re
+from collections.abc import Callable
+from pathlib import Path
+from string import Template
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.flatten_util import ravel_pytree
+
+from hybrid_jax import checks
+from hybrid_jax.export.c.code import body_of, shared_by
+from hybrid_jax.export.c.loops import Tables
+from hybrid_jax.export.program import Size, sizes_of
+from hybrid_jax.io.files import write_atomic
+
+HEADER = """\
+/* A filter that adapts a model while it runs, written by hybrid_jax.
+
+   state: $layout.
+   theta holds the changes of $names,
+   in the standard deviations of their prior.
+   No function allocates or keeps a state; results must not overlap what is read. */
+#ifndef ${NAME}_H
+#define ${NAME}_H
+
+#define ${NAME}_STATE_SIZE $d
+#define ${NAME}_INPUT_SIZE $m
+#define ${NAME}_PARAMETERS $p
+#define ${NAME}_SIZE $size /* of the filter's state */
+#define ${NAME}_TRUSTED $trusted /* where the last good theta begins in it */
+#define ${NAME}_DT $dt /* time between two samples [s] */
+
+#ifdef __cplusplus
+extern "C" {
+#endif
+
+/* The state of the filter before the first sample x. */
+void ${name}_begin(const $type x[$d], $type state[$size]);
+
+/* After a sample x, NaN where nothing was measured, and the mean input u since the last update, $elapsed. */
+void ${name}_update(const $type state[$size], const $type x[$d], const $type u[$m], $type periods, $type next[$size]);
+
+#ifdef __cplusplus
+}
+#endif
+#endif
+"""
+
+SOURCE = """\
+/* See $name.h; written by hybrid_jax. */
+#include "$name.h"
+
+#include <math.h>
+
+typedef $type real;
+
+$tables
+
+$helpers
+void ${name}_begin(const real x[$d], real state[$size]) {
+$begin
+}
+
+void ${name}_update(const real state[$size], const real x[$d], const real u[$m], real periods, real next[$size]) {
+    const real elapsed[1] = {periods};
+    (void)elapsed;
+$update
+}
+"""
+
+
+def export_adaptation_c(
+    folder: str | Path,
+    adaptation: Any,
+    *,
+    name: str = "adaptation",
+    double: bool = False,
+    state_size: Size = None,
+    input_size: Size = None,
+) -> tuple[Path, Path]:
+    """Write NAME.h and NAME.c: NAME_begin and NAME_update of an `OnlineAdaptation`, as its methods.
+
+    Arguments and errors as of `export_c`.
+
+    Returns:
+        The paths of the header and of the source.
+    """
+    if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
+        raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
+    d, m = sizes_of(adaptation.field, state_size, input_size)
+    tables = Tables(double)
+    with jax.enable_x64(True):
+        exact = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, adaptation)
+        first = exact.begin(jnp.zeros(d))
+        flat, unravel = ravel_pytree(first)
+        sizes = {"state": flat.size, "x": d, "u": m, "elapsed": 1}
+        likes = {key: jax.ShapeDtypeStruct((size,), float) for key, size in sizes.items()}
+
+        def update(state, x, u, elapsed):
+            return [ravel_pytree(exact.update(unravel(state), x, u, elapsed[0], _in_turn))[0]]
+
+        def begin(x):
+            return [ravel_pytree(exact.begin(x))[0]]
+
+        stepped = body_of(update, list(likes.values()), tables, ("next",), tuple(likes))
+        begun = body_of(begin, [likes["x"]], tables, ("state",), ("x",))
+    parts = (
+        _parts(exact, first, tables)
+        | shared_by(tables, stepped, begun)
+        | {
+            "name": name,
+            "NAME": name.upper(),
+            "type": "double" if double else "float",
+            "d": d,
+            "m": m,
+            "size": flat.size,
+            "begin": begun,
+            "update": stepped,
+            "elapsed": f"periods of {name.upper()}_DT ago",
+        }
+    )
+    written = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
+    for path, template in zip(written, (HEADER, SOURCE), strict=True):
+        write_atomic(path, Template(template).substitute(parts))
+    return written
+
+
+def _in_turn(one: Callable) -> Callable:
+    """As `jax.vmap`, but a loop, which keeps C small."""
+    return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
+
+
+def _parts(adaptation: Any, state: Any, tables: Tables) -> dict[str, Any]:
+    """Where what lies in the state, in words."""
+    places, at = [], 0
+    for path, value in jax.tree_util.tree_leaves_with_path(state):
+        places.append((jax.tree_util.keystr(path, simple=True, separator="."), at, value.size))
+        at += value.size
+    layout = ",\n   ".join(f"{key} at {start} ({size})" for key, start, size in places)
+    names: Callable = ", ".join
+    return {
+        "layout": layout,
+        "names": names(adaptation.names),
+        "p": len(adaptation.names),
+        "trusted": next(start for key, start, _ in places if key == "trusted"),
+        "dt": tables.text(adaptation.dt),
+    }

@@ -1,0 +1,292 @@
+"""Translate JAX programs into C99: few entries as expressions, of which zeros and ones vanish, many as loops.
+
+A column is a NumPy array of objects: numbers (floats, or bools), and `Entry` for what is computed. Sparse Jacobians of
+physics thus become straight code, and layers of a network loops over tables and arrays.
+"""
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass, field, replace
+from functools import reduce
+from typing import Any, ClassVar, NamedTuple
+
+import numpy as np
+
+from hybrid_jax.export.c import loops
+from hybrid_jax.export.c.loops import Entry
+from hybrid_jax.export.translation import Entries, Translation, Value
+
+EXPANDED = 24  # operations on at most so many entries are written out; more become a loop if they can
+COPIED = 200  # and on at most so many if they cannot
+PRODUCTS = 160  # multiplications of a matrix product that are written out
+
+# Name → C of operands in braces. {f} is the suffix of a function of math.h, {r} the type.
+_FUNCTIONS = (
+    *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt"),
+    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
+)
+CODE: dict[str, str] = {
+    **{name: f"{name}{{f}}({{0}})" for name in _FUNCTIONS},
+    **{name: f"{{0}} {sign} {{1}}" for name, sign in zip(("add", "sub", "mul", "div"), "+-*/", strict=True)},
+    **{
+        name: f"{{0}} {sign} {{1}}" for name, sign in zip(("lt", "le", "gt", "ge"), ("<", "<=", ">", ">="), strict=True)
+    },
+    "eq": "{0} == {1}",
+    "ne": "{0} != {1}",
+    "and": "{0} && {1}",
+    "or": "{0} || {1}",
+    "not": "!{0}",
+    "neg": "-{0}",
+    "abs": "fabs{f}({0})",
+    "atan2": "atan2{f}({0}, {1})",
+    "pow": "pow{f}({0}, {1})",
+    "rem": "fmod{f}({0}, {1})",
+    "sign": "({r})(({0} > 0) - ({0} < 0))",
+    "max": "larger({0}, {1})",
+    "min": "smaller({0}, {1})",
+    "square": "{0} * {0}",
+    "rsqrt": "1 / sqrt{f}({0})",
+    "logistic": "1 / (1 + exp{f}(-{0}))",
+    "select_n": "{0} ? {2} : {1}",
+    "convert_element_type": "({r}){0}",
+}
+LOGICAL = ("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")
+IDENTITY = ("copy", "copy_p", "stop_gradient")
+_NUMBERS: dict[str, Callable] = {
+    "add": lambda a, b: a + b,
+    "sub": lambda a, b: a - b,
+    "mul": lambda a, b: a * b,
+    "div": lambda a, b: float(np.float64(a) / b),
+    "neg": lambda a: -a,
+}
+
+
+@dataclass
+class CTranslation(Translation[np.ndarray]):
+    """Writes the body of one function; `tables` are shared by all functions of a file."""
+
+    language: ClassVar[str] = "C"
+    operations: ClassVar[dict[str, Callable]] = dict.fromkeys(
+        (*CODE, *IDENTITY, "add_any", "integer_pow", "clamp"), lambda *_: None
+    )
+    tables: loops.Tables
+    statements: list[loops.Statement] = field(default_factory=list)
+    _written: dict[Any, Entry] = field(default_factory=dict)  # (operation, operands) → what holds its result
+
+    def known(self, array):
+        return column(value.item() if value.dtype == bool else float(value) for value in np.asarray(array).ravel())
+
+    def join(self, columns):
+        return np.concatenate([np.asarray(one, object) for one in columns])
+
+    def take(self, column, places):
+        return column[list(places)]
+
+    def entrywise(self, name, columns, shape, parameters):
+        name = "add" if name == "add_any" else name
+        if name in IDENTITY:
+            return columns[0]
+        if name == "clamp":
+            low, value, high = columns
+            value = self.entrywise("max", (value, low), shape, ())
+            return self.entrywise("min", (value, high), shape, ())
+        if name == "convert_element_type" and not any(self._is_logical(one) for one in columns[0]):
+            return columns[0]
+        if name == "integer_pow":
+            return self._power(columns[0], parameters[0], shape)
+        size = max(map(len, columns))
+        columns = [np.broadcast_to(one, size) for one in columns]
+        done = [self._simple(name, operands) for operands in zip(*columns, strict=True)]
+        count = sum(one is None for one in done)
+        if count > EXPANDED and (loop := self._loop(name, columns, shape)) is not None:
+            return loop
+        if count > COPIED:
+            columns = [self._compact(one, shape) for one in columns]
+            if (loop := self._loop(name, columns, shape)) is not None:
+                return loop
+        pairs = zip(done, zip(*columns, strict=True), strict=True)
+        return column(self._scalar(name, operands) if one is None else one for one, operands in pairs)
+
+    def scan(self, equation, inputs):
+        """A function of one of the arrays, called in a loop; none of them may need the result of another."""
+        inner, count, shared = (equation.params[key] for key in ("jaxpr", "length", "num_consts"))
+        if equation.params["num_carry"]:
+            raise self._refusal(equation)
+        passed = [self._passed(value, value.shape, 0) for value in inputs[:shared]]
+        passed += [self._passed(value, value.shape[1:], 1) for value in inputs[shared:]]
+        called = CTranslation(self.tables)
+        found = called._run(inner.jaxpr, inner.consts, [one.inside for one in passed])
+        results, outs = [called._column(one) for one in found], [self.tables.name("r") for _ in found]
+        body = called.body(results, outs)
+        words = set(re.findall(r"\w+", body))
+        taken = [one for one in passed if one.name in words]
+        name = self.tables.function([*(one.parameter for one in taken), *(f"real *{out}" for out in outs)], body)
+
+        starts = count * np.cumsum([0, *map(len, results)])
+        places = [f"{{{i}}}" for i in range(len(taken))]
+        places += [f"{{out}} + {start} + {len(one)} * i0" for start, one in zip(starts, results, strict=False)]
+        call = loops.nest((count,), f"{name}({', '.join(places)});")
+        whole = self._define(int(starts[-1]), loops.Code(call, [one.given for one in taken]))
+        parts = zip(np.split(whole, starts[1:-1]), found, strict=True)
+        return [Entries(part, (count, *one.shape)) for part, one in parts]
+
+    def _passed(self, value: Value, shape: tuple[int, ...], stride: int) -> "_Passed":
+        """How a value, or an array of this shape in it, comes into a function that is called for each of these."""
+        if not stride and not isinstance(value, Entries):
+            return _Passed(value)  # a constant, which the function may as well have
+        entries, size = self._column(value), int(np.prod(shape))
+        name, logical = self.tables.name("p"), any(self._is_logical(one) for one in entries)
+        kind = "int" if logical else "real"
+        if not stride and size == 1:
+            inside = column([Entry(name, None, logical)])
+            given = loops.Code(self.tables.text(entries[0]), (), loops.used(entries))
+            return _Passed(Entries(inside, shape), name, f"{kind} {name}", given)
+        inside = column(Entry(name, i, logical) for i in range(size))
+        given = loops.address(self.tables, self._gathered(entries))
+        given = replace(given, text=f"{given.text} + {size} * i0") if stride else given
+        return _Passed(Entries(inside, shape), name, f"const {kind} *{name}", given)
+
+    def body(self, results: Sequence[np.ndarray], outs: Sequence[str]) -> str:
+        """The lines of a function that fills some arrays with these results."""
+        read = frozenset().union(*map(loops.used, results))
+        pairs = zip(outs, results, strict=True)
+        end = [self.tables.filled(loops.stores(out, one, self.tables), []) for out, one in pairs]
+        code = loops.declared(loops.needed(self.statements, read), read, end)
+        return "\n".join(f"    {line}" for line in code.splitlines())
+
+    def fold(self, name, rows):
+        if len(rows) * len(rows[0]) > EXPANDED:
+            shape = (len(rows[0]), len(rows))
+            whole = self._compact(np.stack(rows, axis=1).ravel(), shape)
+            operand = loops.indexed(self.tables, whole, shape)
+            return self._define(len(rows[0]), loops.folding(CODE[name], operand, shape))
+        return reduce(lambda a, b: self.entrywise(name, (a, b), (len(a),), ()), rows)
+
+    def matrix_product(self, left, right, sizes):
+        m, k, n = sizes
+        a, b = left.reshape(m, k), right.reshape(k, n)
+        rows, columns = [i for i in range(m) if not _zero(a[i])], [j for j in range(n) if not _zero(b[:, j])]
+        both = (a != 0.0).astype(int) @ (b != 0.0).astype(int)
+        if both.sum() <= PRODUCTS:
+            return column(self._dot(one, other) for one in a for other in b.T)
+        if all(isinstance(one, float) for one in right) and ((b != 0.0).sum(axis=0) <= 1).all():  # a selection
+            chosen = (b != 0.0).argmax(axis=0)
+            factors = np.tile(b[chosen, np.arange(n)], m)
+            return self.entrywise("mul", (a[:, chosen].ravel(), factors), (m, n), ())
+        result = np.full((m, n), 0.0, object)
+        result[np.ix_(rows, columns)] = self._loops(a[rows], b[:, columns])
+        return result.ravel()
+
+    def _loops(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        """A B as loops: of a matrix and a vector if one of them is one, else of two matrices."""
+        (m, k), n = a.shape, b.shape[1]
+        if m == 1 and n > 1 and loops.is_contiguous(b.T.ravel()):
+            return self._loops(b.T, a.T).T
+        operands = [loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
+        call = f"dense({{0}}, {{1}}, {{out}}, {m}, {k}" if n == 1 else f"product({{0}}, {{1}}, {{out}}, {m}, {k}, {n}"
+        return self._define(m * n, loops.Code(f"{call});", operands)).reshape(m, n)
+
+    def _dot(self, row: Iterable, other: Iterable):
+        terms = [self._one("mul", pair) for pair in zip(row, other, strict=True)]
+        return reduce(lambda a, b: self._one("add", (a, b)), terms)
+
+    def _power(self, base: np.ndarray, exponent: int, shape) -> np.ndarray:
+        if exponent < 0:
+            return self.entrywise("div", (column([1.0]), self._power(base, -exponent, shape)), shape, ())
+        if exponent > 4:
+            return self.entrywise("pow", (base, column([float(exponent)])), shape, ())
+        if exponent == 0:
+            return column([1.0] * len(base))
+        return reduce(lambda a, b: self.entrywise("mul", (a, b), shape, ()), [base] * exponent)
+
+    def _one(self, name: str, operands: Sequence):
+        simple = self._simple(name, operands)
+        return self._scalar(name, operands) if simple is None else simple
+
+    def _simple(self, name: str, operands: Sequence) -> Any:
+        """The result where it needs no operation, or None."""
+        if name in _NUMBERS and all(isinstance(one, float) for one in operands):
+            return _NUMBERS[name](*operands)
+        match name, *operands:
+            # As in sparse linear algebra, zero times a value is zero, even if that value is not finite.
+            case ("mul", 0.0, _) | ("mul", _, 0.0) | ("div", 0.0, Entry()):
+                return 0.0
+            case ("add", 0.0, other) | ("add" | "sub", other, 0.0) | ("mul", 1.0, other) | ("mul" | "div", other, 1.0):
+                return other
+            case ("select_n", bool(which), otherwise, chosen):
+                return chosen if which else otherwise
+            case ("select_n", _, otherwise, chosen) if otherwise == chosen:
+                return chosen
+        return self._written.get((name, *operands))
+
+    def _scalar(self, name: str, operands: Sequence) -> Entry:
+        if (found := self._written.get((name, *operands))) is None:
+            texts = [self.tables.text(one) for one in operands]
+            kind = "int" if name in LOGICAL else "real"
+            found = Entry(self.tables.name("t"), None, kind == "int")
+            uses = frozenset(one.name for one in operands if isinstance(one, Entry))
+            code = self.tables.filled(CODE[name], texts)
+            self.statements.append(loops.Statement(found.name, uses, f"const {kind} {found.name} = {code};"))
+            self._written[(name, *operands)] = found
+        return found
+
+    def _loop(self, name: str, columns: Sequence[np.ndarray], shape: tuple[int, ...]) -> np.ndarray | None:
+        """An operation on each entry as a loop, or None if the columns do not have their entries in order."""
+        operands = [loops.indexed(self.tables, one, shape) for one in columns]
+        known = [one for one in operands if one is not None]
+        if len(known) < len(operands):
+            return None
+        return self._define(int(np.prod(shape)), loops.mapping(CODE[name], known, shape), name in LOGICAL)
+
+    def _gathered(self, entries: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
+        """The entries, of an array of this shape, one after the other in one array, copied there unless they are."""
+        if loops.is_contiguous(entries):
+            return entries
+        logical = any(self._is_logical(one) for one in entries)
+        if shape is not None and (found := loops.indexed(self.tables, entries, shape)) is not None:
+            return self._define(len(entries), loops.mapping("{0}", [found], shape), logical)
+        lines = loops.stores("{out}", entries, self.tables)
+        return self._define(len(entries), loops.Code(lines, (), loops.used(entries)), logical)
+
+    def _compact(self, entries: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+        """Entries of an array of this shape, of which each that is there along a whole axis is copied once."""
+        if loops.indexed(self.tables, entries, shape) is not None:
+            return entries
+        grid = entries.reshape(shape)
+        for axis in range(grid.ndim):
+            first = grid.take([0], axis)
+            grid = first if (grid == first).all() else grid
+        return np.broadcast_to(self._gathered(grid.ravel(), grid.shape).reshape(grid.shape), shape).ravel()
+
+    def _define(self, size: int, code: loops.Code, logical: bool = False) -> np.ndarray:
+        """A new array that the code fills."""
+        name, kind = self.tables.name("a"), "int" if logical else "real"
+        text = self.tables.filled(code.text, [one.text for one in code.operands], out=name)
+        uses = code.uses.union(*(one.uses for one in code.operands))
+        self.statements.append(loops.Statement(name, uses, text, (kind, size)))
+        return column(Entry(name, i, logical) for i in range(size))
+
+    @staticmethod
+    def _is_logical(one) -> bool:
+        return isinstance(one, bool) or (isinstance(one, Entry) and one.logical)
+
+
+class _Passed(NamedTuple):
+    """A value as a function has it, and how it comes in; a constant does not."""
+
+    inside: Value
+    name: str = ""
+    parameter: str = ""
+    given: loops.Code = loops.Code("")
+
+
+def column(entries: Iterable[Any]) -> np.ndarray:
+    """An array of objects."""
+    listed = list(entries)
+    made = np.empty(len(listed), object)
+    made[:] = listed
+    return made
+
+
+def _zero(entries: np.ndarray) -> bool:
+    return all(isinstance(one, float) and one == 0 for one in entries)

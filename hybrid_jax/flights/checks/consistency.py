@@ -1,0 +1,221 @@
+"""Consistency checks of a log: each compares two independent records of one motion.
+
+Where they disagree, common mistakes are undone one at a time, and the one that resolves the disagreement is suggested.
+"""
+
+import math
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.flights.attitude import rotation_of
+from hybrid_jax.flights.checks import readings
+from hybrid_jax.flights.checks.airborne import flying_intervals, on_ground
+from hybrid_jax.flights.checks.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
+from hybrid_jax.flights.log import FlightLog, gaps, repeats
+from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
+from hybrid_jax.vehicle import Vehicle
+
+OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
+GROUND = "cut it out: --cleaning.in-flight, cut_ground=True"
+MORE_FLIGHT = "check on a flight with more motion"
+UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
+THRUST = "v̇ against thrust along body z"
+RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
+SPIN, GYRO = "spin against yaw", "lag of the gyro behind the motors"
+NEED_VEHICLE = (RATIO, ORDER, SPIN, GYRO)  # checks that are not run without one
+MAX_SAMPLES = 100_000  # the middle of longer logs is checked
+
+LONGEST_INTERVAL = 0.5  # s; slower logs are implausible
+# Relative errors: 0 for equal records, 1 for uncorrelated ones, √2 for opposite ones.
+KINEMATICS_LIMIT = 0.5
+THRUST_LIMIT = 0.6
+AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
+FEWEST = 20  # intervals to compare
+SPAN = 0.05  # s of moving average on both sides of an equation
+GAIN_LIMIT = 1.25  # of one record regressed on the other
+THRUST_RATIO_LIMIT = 1.25
+ORDER_LIMIT = 0.4  # correlation
+YAW_LIMIT = 0.3  # correlation: rotor torque about z is small, and two wrong signs of four leave half of it
+OPPOSED = -0.1  # correlation
+NOISE = 0.2  # share of the least motion below which two readings count as equal
+CLEAR = 1.0  # multiple of the least motion needed to check a single axis
+FATAL_LAG = 40.0  # ms
+LAG = "motor_time_constant"  # its name in the vehicle file
+LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
+
+
+@dataclass(frozen=True)
+class Check:
+    """The result of one check."""
+
+    name: str  # of the two records compared
+    value: float
+    unit: str
+    limit: float  # maximum of the value; of correlations the minimum
+    verdict: str  # "ok", "warns", "fails" or "cannot tell"
+    suggestion: str  # what to correct, if anything
+
+
+def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
+    """Run all checks of a log against itself and its vehicle; without a vehicle, those that need none.
+
+    Raises:
+        ValueError: fewer than two samples, or another number of motors than the vehicle has.
+    """
+    if vehicle is not None and log.u.shape[1] != vehicle.rotors:
+        found = f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}"
+        raise ValueError(f"{found}; log all of them, or name those of its rotors: --motor-order, motor_order=")
+    skip = max(0, (len(log) - MAX_SAMPLES) // 2)
+    log = log[skip : skip + MAX_SAMPLES]
+    lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
+    clock = "the time is in ms or µs: declare its unit"
+    split = "windows stop at each; --cleaning.resample with --cleaning.longest-gap bridges short ones"
+    return [
+        _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
+        _at_most("gaps", lost, "share of intervals", 0.01, split),
+        _at_most("repeated samples", stale, "share of samples", 0.01, split),
+        _compare(log, "dp/dt against v", readings.velocities(log), LEAST_MOTION["velocity"]),
+        _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
+        _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
+        _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
+        _columns(log),
+        *([_thrust(log, vehicle), *_motors(log, vehicle)] if vehicle is not None else []),
+    ]
+
+
+def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) -> Check:
+    return _check(name, value, unit, limit, suggestion if value > limit else "")
+
+
+def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
+    return Check(name, value, unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
+
+
+def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
+    """Check the mean specific force along body z in flight, over k Σu² / m."""
+    flying = flying_intervals(log)
+    thrust = vehicle.thrust_coefficient / vehicle.mass * (log.u[:-1] ** 2).sum(axis=1)[flying]
+    specific = np.diff(log.x[:, VELOCITY], axis=0) / np.diff(log.t)[:, None] + [0, 0, vehicle.gravity]
+    along = (specific * middle(rotation_of(log.x[:, QUATERNION]).apply(UP))).sum(axis=1)[flying]
+    if not len(thrust) or thrust.mean() <= 0:
+        still = "the vehicle stays on the ground: check a log in flight"
+        return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
+    ratio = float(along.mean() / thrust.mean())
+    fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
+    return _check(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
+
+
+def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
+    if ratio <= 0:
+        return "body z points down: correct the frames first"
+    for unit, factor in (("rpm", np.pi / 30), ("rev/s", 2 * np.pi), ("deg/s", np.pi / 180)):
+        if 0.7 < ratio / factor**2 < 1.4:
+            return f"rotor speeds are in {unit}: declare it"
+    if log.u.max() < 0.02 * vehicle.hover_speed:
+        return "rotor speeds are normalised commands: give the polynomial that maps them to rad/s"
+    return f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+
+
+def _columns(log: FlightLog) -> Check:
+    """Check for equal motors and constant columns: a column was read twice or not recorded."""
+    values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
+    names = (*STATE_NAMES[VELOCITY.start :], *input_names(log.u.shape[1]))
+    columns: dict[str, np.ndarray] = dict(zip(names, values, strict=True))
+    moving = [name for name, values in columns.items() if (values != values[0]).any()]
+    kinds = {name[0] for name in moving}  # v, w, u: a vehicle at rest does not change any of a kind
+    alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
+    problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
+    problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
+    advice = f"{'; '.join(problems)}: name the measured columns"
+    return _at_most("columns", float(len(problems)), "suspect", 0.0, advice)
+
+
+def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
+    found, limit = respond(log, vehicle), 1000 * log.dt
+    if found is None or sum(found.correlations[:2]) < 2 * ORDER_LIMIT:
+        value = math.nan if found is None else min(found.correlations[:2])
+        correlated = (ORDER, value, "correlation", ORDER_LIMIT), (SPIN, math.nan, "correlation", 0.0)
+        return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (GYRO, math.nan, "ms", limit))]
+    columns = " ".join(f"u{motor}" for motor in found.order)
+    rotors, numbers = " ".join(map(str, range(vehicle.rotors))), ",".join(map(str, found.order))
+    ordered = found.order == tuple(range(vehicle.rotors))
+    advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}: --motor-order {numbers}"
+    lag, late = 1000 * found.lag, found.lag > 0
+    shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: --cleaning.delay {found.lag:.4f}"
+    shift += f', or learn "{LAG}" if they are commands' if late else ""
+    lagging = _at_most(GYRO, abs(lag), "ms", limit, shift)
+    # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
+    lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
+    return [
+        _check(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
+        _spin(log, vehicle, found.yaw_sign * found.correlations[2]),
+        replace(lagging, value=lag),
+    ]
+
+
+def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
+    if abs(sum(vehicle.spin)) > 1:
+        turning = FAILS, "the vehicle would turn in hover: half of its rotors must spin each way"
+    elif yaw >= OPPOSED:
+        turning = (OK, NOTHING) if yaw > YAW_LIMIT else (UNKNOWN, MORE_FLIGHT)
+    else:
+        # Of equal Ix and Iy, roll and pitch leave yaw alone. The difference of two estimates may be all there is.
+        ix, _, iz = vehicle.inertia
+        even = respond(log, replace(vehicle, inertia=(ix, ix, iz)))
+        sure = even is not None and even.yaw_sign * even.correlations[2] < OPPOSED
+        hangs = "opposed only with the vehicle's Iy − Ix: check its inertia, which may be estimated, then its spins"
+        turning = (FAILS, "flip the sign of every spin of the vehicle") if sure else (WARNS, hangs)
+    return Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning)
+
+
+def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
+    """Compare two records in flight under every reading; kinematics hold for each axis, wind and drag move v̇, too."""
+    sound, limit = flying_intervals(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
+    width = min(max(1, round(SPAN / log.dt)), len(sound))
+    whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
+    pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
+    a, b = pairs[NOTHING]
+    if len(a) < FEWEST or max(_size(a), _size(b)) < least:
+        return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
+    value = _relative_error(a, b)
+    advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
+    if name != THRUST:
+        advice = advice or _axes_apart(a, b, least) or _other_scale(a, b)
+    return _check(name, value, "relative error", limit, advice)
+
+
+def _nearer(pairs: Readings, limit: float, least: float) -> str:
+    """The reading under which the records agree best; empty if that is the unchanged log."""
+    left = {reading: a - b for reading, (a, b) in pairs.items()}
+    own = left[NOTHING]
+    # Any improvement counts if two readings differ by more than noise: an axis with little motion contributes little.
+    nearer = [r for r, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
+    best = min(nearer, key=lambda reading: _size(left[reading]), default=NOTHING)
+    return best if nearer and _relative_error(*pairs[best]) <= limit else ""
+
+
+def _axes_apart(a: Vectors, b: Vectors, least: float) -> str:
+    pairs = {axis: (a[:, [i]], b[:, [i]]) for i, axis in enumerate("xyz")}
+    moving = {axis: pair for axis, pair in pairs.items() if max(map(_size, pair)) > CLEAR * least}
+    apart = [axis for axis, pair in moving.items() if _relative_error(*pair) > AXIS_LIMIT]
+    return f"{' and '.join(apart)} alone: {UNUSUAL}" if apart else ""
+
+
+def _other_scale(a: Vectors, b: Vectors) -> str:
+    gain = float((a * b).sum() / (b * b).sum())
+    if 1 / GAIN_LIMIT <= gain <= GAIN_LIMIT:
+        return ""
+    return f"the first is {gain:.2f} times the second: is the time, or one of them, in another unit?"
+
+
+def _size(values: Float[np.ndarray, "n d"]) -> float:
+    """Root mean square of the vectors' lengths."""
+    return float(np.sqrt((values**2).sum(axis=1).mean()))
+
+
+def _relative_error(a: Float[np.ndarray, "n d"], b: Float[np.ndarray, "n d"]) -> float:
+    """RMS of a − b over the root of the summed mean squares."""
+    return _size(a - b) / float(np.hypot(_size(a), _size(b)))

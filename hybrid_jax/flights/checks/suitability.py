@@ -1,0 +1,152 @@
+"""Checks of a recording before it becomes a flight: is it whole, of such a vehicle, and fast enough for its use?
+
+They judge signals as they were recorded, before anything is interpolated. `consistency` then compares the signals.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+import numpy as np
+
+from hybrid_jax.flights.checks.consistency import FAILS, NOTHING, OK, UNKNOWN, Check
+from hybrid_jax.flights.conversion import ADVICE, missing_states, motors_of, what_to_log
+from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
+from hybrid_jax.vehicle import Vehicle
+
+SLOWER = 1.5  # times the interval asked for
+REST_SHARE = 0.05  # of the largest command or speed below which a motor does not carry
+REST_SPEED = 20.0  # rad/s, where the largest is not known
+BEYOND = 0.02  # share by which a motor may exceed the largest
+JUMP = 0.5  # share of the whole time that one gap may last
+USED = ("position", "velocity", "body_velocity", "attitude", "rates")
+
+
+def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
+    """Run all checks of a recording.
+
+    Args:
+        vehicle: the vehicle that the log is to be of; without it, its rotors and largest speed are not compared.
+        dt: interval [s] that the flight is to have; without it, the rates of the signals are not judged.
+    """
+    return [
+        _whole(recording),
+        _airframe(recording),
+        _flown(recording, vehicle),
+        _quantities(recording),
+        _rotors(recording, vehicle),
+        _rates(recording, dt or np.inf),
+        _clock(recording),
+        _limits(recording, vehicle),
+    ]
+
+
+def failures(checks: Sequence[Check], name: str) -> list[str]:
+    """A line for each check that failed."""
+    return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]
+
+
+def _check(name: str, advice: str, value: float = 0.0, unit: str = "", limit: float = 0.0) -> Check:
+    return Check(name, float(value), unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
+
+
+def _whole(recording: Recording) -> Check:
+    damage = recording.facts.get("damage", "")
+    return _check(
+        "whole file", f"{damage}; copy it again, or use what is whole: --anyway" if damage else "", bool(damage)
+    )
+
+
+def _airframe(recording: Recording) -> Check:
+    kind = recording.facts.get("vehicle", "unknown")
+    if kind in ("unknown", "generic"):
+        return Check("airframe", np.nan, "", 0.0, UNKNOWN, "the log does not say what flew")
+    number = recording.facts.get("airframe")
+    advice = f"{kind}{f' (SYS_AUTOSTART {number})' if number else ''}, no multirotor: leave the file out"
+    return _check("airframe", "" if kind.startswith("multirotor") else advice)
+
+
+def _quantities(recording: Recording) -> Check:
+    missing = missing_states(recording)
+    advice = f"no {', no '.join(missing)}: {what_to_log(recording)}"
+    return _check("quantities", advice if missing else "", len(missing), "missing")
+
+
+def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
+    found, kind = recording.rotors, recording.facts.get("vehicle", "")
+    stated = [int(word) for word in kind.split() if word.isdigit()]
+    expected = len(vehicle.rotor_positions) if vehicle is not None else stated[0] if stated else found
+    if not found:
+        return Check("number of motors", 0.0, "motors", expected, UNKNOWN, "no motors")
+    who = "the vehicle file has" if vehicle is not None else "the airframe has"
+    chosen = ",".join(map(str, range(expected)))
+    mend = f"name those of the rotors (--motor-order {chosen})" if found > expected else "log all motors"
+    advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
+    return _check("number of motors", "" if found == expected else advice, found, "motors", expected)
+
+
+def _motors(recording: Recording) -> Signal | None:
+    return motors_of(recording) if recording.signals.keys() & ROTOR_UNITS.keys() else None
+
+
+def _rates(recording: Recording, dt: float) -> Check:
+    intervals = {name: recording.signals[name].interval for name in USED if name in recording.signals}
+    if (motors := _motors(recording)) is not None:
+        intervals["motors"] = motors.interval
+    slow = {name: interval for name, interval in intervals.items() if interval > SLOWER * dt * (1 + 1e-6)}
+    worst = max(intervals.values(), default=np.nan)
+    listed = ", ".join(f"{name} {_hertz(each)}" for name, each in slow.items())
+    coarser = f"--cleaning.resample {float(f'{max(slow.values(), default=0.0):.2g}'):g}"
+    kind = recording.facts.get("format", "")
+    advice = f"slower than {_hertz(dt)}: {listed}; {ADVICE.get(kind, 'log faster')}; or take {coarser}"
+    return _check("slowest signal", advice if slow else "", worst, "s", SLOWER * dt)
+
+
+def _hertz(interval: float) -> str:
+    return f"{1 / interval:.3g} Hz"
+
+
+def _clock(recording: Recording) -> Check:
+    longest = (0.0, 0.0, "")
+    for signal in recording.signals.values():
+        longest = max([longest, *((end - start, start, signal.source) for start, end in signal.gaps())])
+    length, start, source = longest
+    advice = f"{source} stops at {start:.4g} s for {length:.4g} s, most of the log: split the file there"
+    return _check(
+        "longest gap", advice if length > JUMP * recording.duration else "", length, "s", JUMP * recording.duration
+    )
+
+
+def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
+    """No command is below 0 or above 1, and no speed above that of the vehicle file."""
+    for name, most in _largest(recording, vehicle):
+        signal = recording.signals[name]
+        beyond = (signal.values > (1 + BEYOND) * most) | (signal.values < -BEYOND * min(most, 1.0))
+        share = float(beyond.any(axis=1).mean())
+        for row, column in np.argwhere(beyond)[:1].tolist():
+            value = signal.values[row, column]
+            wrap = name == "command" and -0.51 < signal.values.min() < 0 and signal.values.max() < 0.51
+            mend = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
+            mend += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
+            where = f"{name} of motor {column} is {value:.4g} at {signal.t[row]:.4g} s, must be from 0 to {most:.4g}"
+            return _check("motors within limits", f"{where}: {mend}", share, "share of samples")
+    return _check("motors within limits", "", 0.0, "share of samples")
+
+
+def _largest(recording: Recording, vehicle: Vehicle | None) -> Iterator[tuple[str, float]]:
+    if "command" in recording.signals:
+        yield "command", 1.0
+    if "rotor_speed" in recording.signals:
+        yield "rotor_speed", np.inf if vehicle is None else vehicle.max_rotor_speed
+
+
+def _flown(recording: Recording, vehicle: Vehicle | None) -> Check:
+    motors: Any = _motors(recording)
+    name = "motors turn"
+    if motors is None or not len(motors):
+        return Check(name, np.nan, "", 0.0, UNKNOWN, "no motors")
+    speeds = motors is recording.signals.get("rotor_speed")
+    most = vehicle.max_rotor_speed if vehicle is not None else REST_SPEED / REST_SHARE
+    limit = REST_SHARE * (most if speeds else 1.0)
+    value = float(motors.values.mean(axis=1).max())
+    advice = "the motors rest throughout, so nothing flew: leave the file out"
+    return _check(name, advice if value < limit else "", value, "rad/s" if speeds else "of the largest", limit)

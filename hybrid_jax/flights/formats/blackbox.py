@@ -1,0 +1,122 @@
+"""Read blackbox logs of Betaflight with orangebox (extra `logs`; it is under the GPL, version 3).
+
+Betaflight's body is forward-left-up. Units of fields are those of betaflight/src/main/blackbox/blackbox.c: gyroADC in
+deg/s times `gyro_scale`, accSmooth in 1 g / `acc_1G`, eRPM in 100 / min of the field, of `motor_poles` poles.
+"""
+
+import contextlib
+import logging
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hybrid_jax.flights.formats import raw
+from hybrid_jax.flights.formats.raw import BATTERY, XYZ, Samples
+from hybrid_jax.flights.recording import Recording
+
+GRAVITY, MOST, POLES, DSHOT = 9.81, 12, 14, 2047
+FULL = {True: (48.0, 2047.0), False: (1000.0, 2000.0)}  # motors at rest and at most: of DShot and of PWM
+
+
+def read_blackbox(path: str | Path) -> Recording:
+    """Read the longest flight of a file. Commands are shares of the largest; rotor speeds need bidirectional DShot.
+
+    Raises:
+        ValueError: file, field, time and what to do, in one line; or orangebox is not installed.
+    """
+    try:
+        import orangebox
+    except ImportError as error:
+        raise ValueError(f"{path}: reading blackbox needs orangebox: pip install 'hybrid_jax[logs]'") from error
+    logging.getLogger("orangebox").setLevel(logging.ERROR)
+    try:
+        count = orangebox.Parser.load(str(path)).reader.log_count
+        flights = [_frames(orangebox.Parser.load(str(path), index + 1)) for index in range(count)]
+    except OSError as error:
+        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+    except Exception as error:  # orangebox raises any exception for a damaged header
+        raise ValueError(f"{path}: is no blackbox log or is damaged; save it again ({type(error).__name__})") from error
+    parser, rows, damage = max(flights, key=lambda flight: len(flight[1]), default=(None, np.zeros((0, 0)), ""))
+    if parser is None or not len(rows):
+        raise ValueError(f"{path}: holds no frames; save the log again")
+    columns = dict(zip(parser.field_names, rows.T, strict=False))
+    if "time" not in columns:
+        raise ValueError(f"{path}: has no field time; save the log again")
+    headers = parser.headers
+    program = str(headers.get("Firmware revision", headers.get("Firmware type", "unknown")))
+    facts = {"format": "Betaflight blackbox", "program": program, "vehicle": "multirotor"}
+    facts |= {"damage": damage} if damage else {}
+    notes = [] if "betaflight" in program.lower() else ["not of Betaflight: its units are assumed"]
+    notes += [f"holds {count} flights: the longest is read; save each by itself"] * (count > 1)
+    return raw.record(path, dict(_parts(path, columns, headers)), 1e-6, notes, facts)
+
+
+def _frames(parser: Any) -> tuple[Any, np.ndarray, str]:
+    """The parser, its frames as rows of the fields of main frames, and how the log is damaged; empty if it is not."""
+    width, rows, ended = len(parser.reader.field_defs[_intra()]), [], True
+    try:
+        rows.extend(frame.data[:width] for frame in parser.frames())
+    except Exception:  # at the end of a file that was cut off; orangebox does not look for it
+        ended = False
+    sound = [row for row in rows if all(isinstance(value, int | float) for value in row)]
+    invalid = parser._ctx.invalid_frame_count + len(rows) - len(sound)
+    damage = "ends within a frame: cut off" if not ended else f"{invalid} frames are damaged" if invalid else ""
+    return parser, np.array(sound, float).reshape(len(sound), width), damage
+
+
+def _intra():
+    from orangebox.types import FrameType
+
+    return FrameType.INTRA
+
+
+def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
+    ticks = columns["time"]
+
+    def part(names: list[str], factor: float, rest: float = 0.0, axes: tuple[str, ...] = XYZ) -> Samples:
+        values = (np.stack([columns[name] for name in names], axis=1) - rest) * factor
+        return Samples(ticks, values, axes, " ".join(names))
+
+    gyro, acc = ([f"{field}[{i}]" for i in range(3)] for field in ("gyroADC", "accSmooth"))
+    if {*gyro} <= {*columns}:
+        yield "rates", part(gyro, _scale(path, headers) * np.pi / 180)
+    if {*acc} <= {*columns}:
+        unit = _number(path, headers, "acc_1G")
+        yield "specific_force", part(acc, GRAVITY / unit)
+    if "vbatLatest" in columns:
+        # Cells in 0.1 V until Betaflight 3, in 0.01 V from 4 on.
+        cells = headers.get("vbatcellvoltage", [0])
+        fine = max(cells if isinstance(cells, list) else [cells]) > 100
+        yield "voltage", part(["vbatLatest"], 0.01 if fine else 0.1, axes=BATTERY)
+    for quantity, field in (("command", "motor"), ("rotor_speed", "eRPM")):
+        names = [f"{field}[{i}]" for i in range(MOST) if f"{field}[{i}]" in columns]
+        axes = tuple(map(str, range(len(names))))
+        if names and quantity == "command":
+            outputs = headers.get("motorOutput", [0])
+            digital = max(outputs if isinstance(outputs, list) else [outputs]) == DSHOT
+            low, high = FULL[digital]
+            found = part(names, 1 / (high - low), low, axes)
+            yield quantity, found._replace(values=np.maximum(found.values, 0.0))
+        elif names and columns[names[0]].any():
+            poles = headers.get("motor_poles", POLES)
+            yield quantity, part(names, 100 * 2 / float(poles) * np.pi / 30, axes=axes)
+
+
+def _scale(path, headers) -> float:
+    """deg/s of one count of the gyro: the bits of a float."""
+    given = headers.get("gyro_scale", 0x3F800000)
+    with contextlib.suppress(struct.error):
+        (scale,) = struct.unpack("<f", struct.pack("<I", given))
+        if 0 < scale < 100:
+            return scale
+    raise ValueError(f"{path}: header gyro_scale must be the bits of a float, got {str(given)[:40]!r}")
+
+
+def _number(path, headers, name: str) -> float:
+    given = headers.get(name)
+    if not isinstance(given, int | float) or given <= 0:
+        raise ValueError(f"{path}: header {name} must be a positive number, got {str(given)[:40]!r}")
+    return float(given)

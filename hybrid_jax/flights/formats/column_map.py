@@ -1,0 +1,225 @@
+"""Read any CSV log through a TOML file that states the meaning of its columns; no unit or frame is assumed.
+
+frames = {world = "NED", body = "FRD", velocity = "world"}      # or "ENU" (any world with z up), "FLU", "body"
+time = {columns = ["timestamp"], unit = "us"}                   # s, ms, us, ns
+position = {columns = ["x", "y", "z"], unit = "mm"}             # m, cm, mm
+attitude = {columns = ["q0", "q1", "q2", "q3"], unit = "wxyz"}  # body → world; wxyz, xyzw; roll, pitch, yaw: rad, deg
+velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}         # m/s, cm/s, mm/s
+body_rates = {columns = ["p", "q", "r"], unit = "deg/s"}        # rad/s, deg/s
+specific_force = {columns = ["ax", "ay", "az"], unit = "g"}     # of the body, as an accelerometer measures it; m/s², g
+voltage = {columns = ["vbat"], unit = "V"}                      # V, mV
+motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, rev/s, or commands; in the vehicle's order
+format = {delimiter = ";", decimal = ","}                       # optional, by default "," and "."
+
+All but frames and time may be left out; training on states needs position, attitude, velocity, body_rates and motors.
+Commands are in unit share (0 … 1), pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047); or in any unit of the
+log, called command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
+"""
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.flights.attitude import Frames, from_euler, to_library
+from hybrid_jax.flights.formats import raw
+from hybrid_jax.flights.formats.csv import flight_log, read_table
+from hybrid_jax.flights.log import FlightLog, wrong_norms
+from hybrid_jax.flights.recording import Recording
+from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
+
+SCALES = {
+    "time": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+    "position": {"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    "attitude": {"wxyz": 1.0, "xyzw": 1.0, "rad": 1.0, "deg": math.pi / 180},
+    "velocity": {"m/s": 1.0, "cm/s": 1e-2, "mm/s": 1e-3},
+    "body_rates": {"rad/s": 1.0, "deg/s": math.pi / 180},
+    "specific_force": {"m/s²": 1.0, "m/s^2": 1.0, "g": 9.81},
+    "voltage": {"V": 1.0, "mV": 1e-3},
+    "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0}
+    | {"share": 1.0, "pwm": 1e-3, "16bit": 1 / 65535, "dshot": 1 / 1999},
+}
+REST = {"pwm": 1000.0, "dshot": 48.0}  # values of motors at rest
+SHARES = ("share", "pwm", "16bit", "dshot")  # units of commands
+COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "specific_force": 3, "voltage": 1}
+STATES = ("position", "attitude", "velocity", "body_rates", "motors")  # what training on states needs
+
+
+@dataclass(frozen=True)
+class Columns:
+    """The columns of one quantity and their unit; for motor commands also the coefficients c0, c1, … of their map."""
+
+    columns: tuple[str, ...]
+    unit: str
+    polynomial: tuple[float, ...] = ()
+
+
+@dataclass(frozen=True)
+class Format:
+    """How the numbers stand in the file."""
+
+    delimiter: str = ","
+    decimal: str = "."
+
+    def __post_init__(self):
+        if self.decimal not in (".", ",") or self.decimal == self.delimiter:
+            raise ValueError(f'decimal must be "." or "," and not the delimiter, got {self.decimal!r}')
+        if not isinstance(self.delimiter, str) or len(self.delimiter) != 1 or self.delimiter in "\r\n":
+            raise ValueError(f"delimiter must be one character, got {self.delimiter!r}")
+
+
+@dataclass(frozen=True)
+class ColumnMap:
+    """The meaning of the columns of a CSV log: the tables of the TOML file, with a quantity for each key of `SCALES`.
+
+    Raises:
+        ValueError: the table, the key and what was expected, in one line.
+    """
+
+    frames: Frames
+    time: Columns
+    position: Columns | None = None
+    attitude: Columns | None = None
+    velocity: Columns | None = None
+    body_rates: Columns | None = None
+    specific_force: Columns | None = None
+    voltage: Columns | None = None
+    motors: Columns | None = None
+    format: Format = Format()
+
+    def __post_init__(self):
+        for name, stated in self.quantities.items():
+            _check(name, stated)
+        for column in self.names:
+            if self.names.count(column) > 1:
+                raise ValueError(f"columns: {column!r} is named twice")
+
+    @property
+    def quantities(self) -> dict[str, Columns]:
+        """The columns of each quantity that is given, in the order of `SCALES`."""
+        return {name: getattr(self, name) for name in SCALES if getattr(self, name) is not None}
+
+    @property
+    def names(self) -> list[str]:
+        """All columns, in the order of `SCALES`."""
+        return [column for stated in self.quantities.values() for column in stated.columns]
+
+
+def load_column_map(path: str | Path) -> ColumnMap:
+    """Read a column map.
+
+    Raises:
+        ValueError: file, table, key and what was expected, in one line.
+    """
+    tables, parts = read_tables(path), {}
+    require_known(str(path), tables, [*ColumnMap.__dataclass_fields__])
+    for name, table in tables.items():
+        if not isinstance(table, dict):
+            raise ValueError(f"{path}: [{name}]: must be a table, got {table!r}")
+        kind = {"frames": Frames, "format": Format}.get(name, Columns)
+        parts[name] = from_table(kind, table, f"{path}: [{name}]")
+    return from_table(ColumnMap, parts, str(path))
+
+
+def read_mapped(path: str | Path, column_map: ColumnMap) -> FlightLog:
+    """Read one flight of a CSV file, plain or gzip, into the library's units and frames, at the times of its rows.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    stated = column_map.quantities
+    for name in STATES:
+        if name not in stated:
+            raise ValueError(
+                f"{path}: the column map states no {name}; a model of states is trained on all of {STATES}"
+            )
+    if stated["motors"].unit in SHARES and not stated["motors"].polynomial:
+        raise ValueError(f"{path}: [motors] are commands; add polynomial = [c0, c1, …]: rad/s = c0 + c1 share …")
+    parts = _parts(path, column_map)
+    q = _attitude(parts["attitude"], stated["attitude"], path)
+    u = _speeds(parts["motors"], stated["motors"])
+    x = to_library(parts["position"], q, parts["velocity"], parts["body_rates"], column_map.frames)
+    return flight_log(path, np.concatenate([parts["time"], x, u], axis=1))
+
+
+def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
+    """Read what a CSV file, plain or gzip, holds of the quantities of a recording.
+
+    Raises:
+        ValueError: file, row, field and what to do, in one line.
+    """
+    parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
+    t, found, notes = parts.pop("time")[:, 0], {}, []
+    for name, values in parts.items():
+        quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), raw.XYZ
+        if name == "attitude":
+            values = raw.attitude(_attitude(values, stated[name], path), frames.world, frames.body)
+            axes = raw.WXYZ
+        elif name == "motors":
+            commands = stated[name].unit in SHARES and not stated[name].polynomial
+            quantity, values = ("command", values) if commands else (quantity, _speeds(values, stated[name]))
+            axes = tuple(map(str, range(values.shape[1])))
+        elif name == "voltage":
+            axes = raw.BATTERY
+        elif name == "position" or (name == "velocity" and frames.velocity == "world"):
+            values = raw.world(values, frames.world)
+        else:
+            values = raw.body(values, frames.body)
+            quantity = "body_velocity" if name == "velocity" else quantity
+        source = f"columns {' '.join(stated[name].columns)}"
+        own, values = raw.uninterpolated(t, values)
+        if len(own) < len(t):
+            apart = float(np.median(np.diff(own)))
+            notes.append(f"{source}: lines between samples {apart:.3g} s apart; read as these samples")
+        found[quantity] = raw.Samples(own, values, axes, source)
+    return raw.record(path, found, notes=notes, facts={"format": "CSV"})
+
+
+def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
+    """The columns of each quantity, scaled to SI units and shares."""
+    form, stated = column_map.format, column_map.quantities
+    table = read_table(path, column_map.names, delimiter=form.delimiter, decimal=form.decimal)
+    parts, begin = {}, 0
+    for name, each in stated.items():
+        end = begin + len(each.columns)
+        rest = REST.get(each.unit, 0.0) if name == "motors" else 0.0
+        parts[name], begin = (table[:, begin:end] - rest) * SCALES[name][each.unit], end
+    return parts
+
+
+def _speeds(motors: Float[np.ndarray, "n m"], stated: Columns) -> Float[np.ndarray, "n m"]:
+    return np.polynomial.polynomial.polyval(motors, stated.polynomial) if stated.polynomial else motors
+
+
+def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | Path) -> Float[np.ndarray, "n 4"]:
+    fields = " ".join(stated.columns)
+    if len(stated.columns) == 3:
+        # Yaw may be counted over turns, tilt may not.
+        for row in np.flatnonzero((np.abs(values[:, :2]) > 2 * math.pi).any(axis=1))[:1]:
+            advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
+            raise ValueError(f"{origin}: row {row + 2}, field {fields}: {advice}")
+        return from_euler(values)
+    q = np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
+    for row, norm in wrong_norms(q):
+        advice = "cut out samples without an attitude, or name the four quaternion columns"
+        raise ValueError(f"{origin}: row {row + 2}, field {fields}: norm is {norm:.4g}, not 1; {advice}")
+    return q
+
+
+def _check(name: str, stated: Columns) -> None:
+    if stated.unit not in tuple(SCALES[name]):
+        raise ValueError(f"[{name}]: unit must be one of {', '.join(SCALES[name])}, got {stated.unit!r}")
+    columns, count = stated.columns, COUNTS.get(name, 4 if stated.unit in ("wxyz", "xyzw") else 3)
+    if name == "motors" and isinstance(columns, tuple):
+        count = min(max(len(columns), FEWEST_ROTORS), MOST_ROTORS)
+    named = isinstance(columns, tuple) and all(isinstance(column, str) for column in columns)
+    if not named or len(columns) != count:
+        raise ValueError(f"[{name}]: columns must be a list of {count} names for unit {stated.unit}, got {columns!r}")
+    given = stated.polynomial
+    numbers = isinstance(given, tuple) and all(isinstance(c, int | float) and math.isfinite(c) for c in given)
+    needed = stated.unit == "command"
+    if not numbers or bool(given) < needed or (given and not (needed or stated.unit in SHARES)):
+        what = "polynomial must be numbers c0, c1, … of a unit of commands"
+        raise ValueError(f"[{name}]: {what}, got {given!r} for {stated.unit}")

@@ -1,0 +1,148 @@
+"""Predictions of windows of measurements, their errors, and the normal equations of the parameters.
+
+Each window's initial state and constant disturbance are eliminated from the equations; see `fitting`.
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.chunks import in_chunks
+from hybrid_jax.dynamics.actuators import Actuated, held_means
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.measurement import TANGENT, difference, measure, moved
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.normal_equations import NormalEquations
+from hybrid_jax.identification import slow_commands
+from hybrid_jax.identification.recordings import Inputs, Layout, Windows
+from hybrid_jax.integrate import RK4, integrate
+from hybrid_jax.matrices import solve
+from hybrid_jax.programs import kept_jit
+from hybrid_jax.state import STATE_SIZE, VELOCITY
+
+CHUNK = 64  # windows at a time
+
+
+class Problem(NamedTuple):
+    """What does not change while parameters are fitted."""
+
+    windows: Windows
+    inputs: Inputs
+    columns: dict[str, tuple[int, ...]]  # of each quantity, which of its axes were measured
+    scale: dict[str, Array]
+    spread: Float[Array, "n 18"]  # of the priors: initial states, constant accelerations and angular accelerations
+    whitening: Float[Array, "n r r"] | None = None  # of a window's errors in units of their scale; see `between`
+
+
+class Pushed(AbstractVectorField):
+    """A field with a constant acceleration and angular acceleration (6) in its v̇ and ω̇."""
+
+    field: AbstractVectorField
+    push: Float[Array, "6"]
+
+    def __call__(self, x, u):
+        return self.field(x, u).at[VELOCITY.start : STATE_SIZE].add(self.push)
+
+    def speeds(self, x, u):
+        return physics_of(self.field).speeds(x, u)  # pyright: ignore[reportAttributeAccessIssue]
+
+
+def errors_of(
+    field, theta, change, window: Windows, inputs: Inputs, columns, layout: Layout, strayed=None
+) -> dict[str, Array]:
+    """y − ŷ of one window for parameters and a change of its initial state; 0 where nothing was measured.
+
+    `strayed` are the ξ of `between`, by default zero.
+    """
+    _, unravel = ravel_parameters(field)
+    field, ahead = unravel(theta), layout.ahead
+    physics, x = physics_of(field), moved(jnp.asarray(window.start), change[:TANGENT])
+    delay = physics.delay if isinstance(physics, Actuated) else 0.0
+    u = held_means(inputs.t, inputs.values, window.edges, delay)
+    if strayed is not None:
+        u = u + slow_commands.means(strayed, window.between, inputs.root, window.edges, delay)
+    if isinstance(physics, Actuated):
+        if physics.reads_voltage:
+            u = jnp.concatenate([u, window.voltage[:, None]], axis=1)
+        if physics.rotor_states:
+            x = jnp.concatenate([x, physics.settled(u[:ahead] if ahead else u[:1], layout.dt)])
+    u = u[ahead:]
+    pushed = Pushed(field, change[TANGENT:])
+    states = integrate(pushed, x, u, layout.dt, RK4())
+    found = {}
+    for name, y in window.y.items():
+        predicted = jax.vmap(partial(measure, name, pushed))(states, u)
+        error = jax.vmap(partial(difference, name))(y, predicted[:, np.array(columns[name])])
+        found[name] = jnp.where(window.there[name][:, None], error, 0.0)
+    return found
+
+
+@kept_jit
+def all_errors(field, theta, changes, problem: Problem, layout: Layout):
+    def one(each):
+        window, change = each
+        return errors_of(field, theta, change, window, problem.inputs, problem.columns, layout)
+
+    return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
+
+
+@kept_jit
+def slopes_between(field, theta, changes, problem: Problem, layout: Layout):
+    """∂ŷ/∂ξ of what commands do between samples: (n, t, k, ξ) of each quantity."""
+    size = problem.windows.between.shape[1] * slow_commands.MODES * len(problem.inputs.root)
+
+    def one(each):
+        window, change = each
+
+        def of(strayed):
+            return errors_of(field, theta, change, window, problem.inputs, problem.columns, layout, strayed)
+
+        return jax.jacfwd(of)(jnp.zeros(size))
+
+    return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
+
+
+@kept_jit
+def rms(field, theta, changes, problem: Problem, layout: Layout) -> dict[str, Array]:
+    found = all_errors(field, theta, changes, problem, layout)
+    counts = {name: jnp.sum(there) for name, there in problem.windows.there.items()}
+    return {name: jnp.sqrt(jnp.sum(part**2, axis=(0, 1)) / counts[name]) for name, part in found.items()}
+
+
+@kept_jit
+def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
+    """The normal equations of θ with each initial state eliminated, and what gives its step: −(a + B Δθ); the cost."""
+
+    def one(each) -> tuple[NormalEquations, Array, Array, Array]:
+        (window, spread, whitening), change = each
+        p = theta.size
+        free = spread > 0
+        unit = jnp.where(free, spread, 1.0)
+
+        def residual(both):
+            found = errors_of(field, both[:p], both[p:] * unit, window, problem.inputs, problem.columns, layout)
+            r = jnp.concatenate([jnp.ravel(part / problem.scale[name]) for name, part in found.items()])
+            r = r if whitening is None else whitening @ r
+            return r, r
+
+        # A prior of one standard deviation on each initial state; those that are exact do not move.
+        jacobian, r = jax.jacfwd(residual, has_aux=True)(jnp.concatenate([theta, change / unit]))
+        of_theta, of_start = jacobian[:, :p], jnp.where(free, jacobian[:, p:], 0.0)
+        start = change / unit
+        inner = of_start.T @ of_start + jnp.eye(len(unit))
+        score = of_start.T @ r + start
+        right = jnp.concatenate([score[:, None], of_start.T @ of_theta, jnp.eye(len(unit))], axis=1)
+        step, by_theta, inverse = jnp.split(solve(inner, right), [1, 1 + p], axis=1)
+        gram = of_theta.T @ of_theta - (of_theta.T @ of_start) @ by_theta
+        reduced = of_theta.T @ r - (of_theta.T @ of_start) @ step[:, 0]
+        cost = r @ r + start @ start
+        known = jnp.diagonal(inverse) * unit**2
+        return NormalEquations(gram, reduced, cost), step[:, 0] * unit, by_theta * unit[:, None], known
+
+    every = problem.windows, problem.spread, problem.whitening
+    return in_chunks(jax.vmap(one), (every, changes), CHUNK)

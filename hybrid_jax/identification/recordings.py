@@ -1,0 +1,277 @@
+"""Windows of recordings, each with an estimate of its initial state from the samples before it."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal, NamedTuple
+
+import jax
+import numpy as np
+import scipy
+from jaxtyping import Bool, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.measurement import MEASURED, TANGENT
+from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.recording import AXES, Recording, Signal
+from hybrid_jax.identification import slow_commands
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+
+Initial = Literal["estimated", "sample"]
+UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of what nothing measures: m/s, rad, rad/s
+WARM = 0.3  # s of commands before a window that the rotors' speeds at its start follow from
+PADDING = 1024
+BREAK = 10.0  # s between two recordings on the common clock
+
+
+@dataclass(frozen=True)
+class Layout:
+    """How recordings are cut into windows."""
+
+    dt: float = 0.01  # s, of the solver's steps and of the grid on which measurements are compared
+    steps: int = 50  # intervals of a window
+    most: int = 400  # windows at most, spread evenly
+    span: float = 0.1  # s of samples before a window that its initial state is estimated from
+    initial: Initial = "estimated"  # or the nearest sample before it, taken as exact
+    warm: float = WARM
+    # First guess of the constant disturbances of a window; 0 for none: m/s² in x, y, z, rad/s² about x, y, z.
+    disturbance: tuple[float, ...] = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
+
+    def __post_init__(self):
+        for name in ("dt", "span"):
+            checks.positive(name, getattr(self, name), "a positive number of seconds")
+        checks.not_negative("warm", self.warm)
+        checks.count("steps", self.steps)
+        checks.count("most", self.most)
+        if self.initial not in Initial.__args__:
+            raise ValueError(f"initial must be one of {', '.join(Initial.__args__)}, got {self.initial!r}")
+
+    @property
+    def ahead(self) -> int:
+        """Intervals of commands before a window."""
+        return round(self.warm / self.dt)
+
+
+class Windows(NamedTuple):
+    """n windows of t intervals, on a clock common to all recordings."""
+
+    edges: Float[np.ndarray, "n ahead+t+1"]  # of the intervals [s]
+    voltage: Float[np.ndarray, "n ahead+t"]  # V; 0 if unknown
+    y: dict[str, Float[np.ndarray, "n t k"]]  # at the end of each interval, by quantity; 0 where there is none
+    there: dict[str, Bool[np.ndarray, "n t"]]
+    start: Float[np.ndarray, "n 13"]
+    spread: Float[np.ndarray, "n 12"]  # standard deviation of its error; 0 of what is taken as exact
+    recording: Float[np.ndarray, " n"]  # which of them
+    between: Float[np.ndarray, "n i 2"]  # intervals between samples of slow commands [s]; none of fast ones
+
+
+class Inputs(NamedTuple):
+    """The commands, or measured rotor speeds, of all recordings on the common clock, each held until the next."""
+
+    t: Float[np.ndarray, " s"]
+    values: Float[np.ndarray, "s m"]
+    root: Float[np.ndarray, "m m"]  # of the covariance of what slow commands do between samples, see `between`
+
+
+def cut(
+    recordings: Sequence[Recording], layout: Layout, told: str = "command", measured: Sequence[str] = ()
+) -> tuple[Windows, Inputs, dict[str, tuple[int, ...]]]:
+    """The windows in flight that no gap crosses, the inputs, and the axes of each quantity that is compared.
+
+    Args:
+        told: the quantity that is the field's input, "command" or "rotor_speed".
+        measured: what is compared, by default all of `MEASURED` that every recording has, but for the input.
+
+    Raises:
+        ValueError: a recording lacks a quantity, or no window is left: name and what was expected.
+    """
+    found = [name for name in MEASURED if name != told and all(name in each.signals for each in recordings)]
+    names = tuple(measured) or tuple(found)
+    for each in recordings:
+        for name in (told, *names):
+            if name not in each.signals:
+                raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
+    begin, parts, inputs = 0.0, [], []
+    most = max(slow_commands.count(each.signals[told], layout.dt * layout.steps) for each in recordings)
+    for i, each in enumerate(recordings):
+        parts.append(_windows(each, layout, told, names, begin, i, most))
+        t, values = slow_commands.lines(each.signals[told], layout.dt)
+        inputs.append((t + begin, values))
+        begin += max(signal.t[-1] for signal in each.signals.values()) + BREAK
+    parts = [part for part in parts if len(part.start)]
+    if not parts:
+        span = layout.dt * layout.steps
+        raise ValueError(
+            f"{recordings[0].name}: no {span:.3g} s in flight without a gap in {', '.join((told, *names))}"
+        )
+    windows = jax.tree.map(lambda *each: np.concatenate(each), *parts)
+    kept = np.unique(np.linspace(0, len(windows.start) - 1, layout.most).round().astype(int))
+    columns = {name: columns_of(name, recordings) for name in names}
+    return (
+        jax.tree.map(lambda part: part[kept], windows),
+        Inputs(
+            *_padded(*map(np.concatenate, zip(*inputs, strict=True))),
+            slow_commands.root([each.signals[told] for each in recordings]),
+        ),
+        columns,
+    )
+
+
+def _padded(t: Float[np.ndarray, " s"], values: Float[np.ndarray, "s m"]) -> tuple[np.ndarray, np.ndarray]:
+    """The inputs, with the last repeated up to a multiple of `PADDING` samples: logs of like length share a program."""
+    more = -len(t) % PADDING
+    return np.append(t, t[-1] + 1 + np.arange(more)), np.concatenate([values, np.repeat(values[-1:], more, 0)])
+
+
+def columns_of(name: str, recordings: Sequence[Recording]) -> tuple[int, ...]:
+    """Which axes of a quantity were measured; ValueError unless the recordings agree."""
+    axes = recordings[0].signals[name].axes
+    for each in recordings:
+        if each.signals[name].axes != axes:
+            raise ValueError(f"{each.name}: {name} has axes {each.signals[name].axes}, those before {axes}")
+    known = AXES[name][0] if name in AXES else axes
+    return tuple(map(known.index, axes))
+
+
+def _windows(recording: Recording, layout: Layout, told: str, names, begin: float, number: int, most) -> Windows:
+    signals, length = recording.signals, layout.dt * layout.steps
+    before = max(layout.span, layout.warm)
+    first, last = (limit(signals[name].t[end] for name in (told, *names)) for limit, end in ((max, 0), (min, -1)))
+    starts = np.arange(first + before, last - length, length)
+    starts = starts[_clear(recording, told, names, starts - before, starts + length)]
+    edges = starts[:, None] + layout.dt * np.arange(-layout.ahead, layout.steps + 1)
+    y, there = {}, {}
+    for name in names:
+        y[name], there[name] = on_grid(signals[name], edges[:, layout.ahead + 1 :], layout.dt)
+    voltage = signals.get("voltage")
+    volts = np.zeros_like(edges[:, 1:]) if voltage is None else _at(voltage, (edges[:, 1:] + edges[:, :-1]) / 2)[..., 0]
+    start, spread = initial_states(recording, starts, layout)
+    slow = slow_commands.spans(signals[told], starts + length, most) + begin
+    return Windows(edges + begin, volts, y, there, start, spread, np.full(len(starts), number), slow)
+
+
+def _clear(recording: Recording, told: str, names, begin, end) -> Bool[np.ndarray, " n"]:
+    """Whether each span is in flight and meets no gap."""
+    flights = airborne(recording, told)
+    clear = np.any([(begin >= first) & (end <= last) for first, last in flights] or [np.zeros(len(begin))], axis=0)
+    for name in (told, *names):
+        for left, right in recording.signals[name].gaps():
+            clear &= (end < left) | (begin > right)
+    return clear
+
+
+def _at(signal: Signal, t: Float[np.ndarray, "*n"]) -> Float[np.ndarray, "*n k"]:
+    return np.stack([np.interp(t, signal.t, column) for column in np.asarray(signal.values).T], axis=-1)
+
+
+def on_grid(signal: Signal, t: Float[np.ndarray, "n t"], dt: float):
+    """The signal at times dt apart, and whether there is one: of a slow signal at the time nearest to each sample.
+
+    A signal of more than two samples in dt is the mean over it, without delay; attitudes are never averaged.
+    """
+    values, attitude = np.asarray(signal.values), set(signal.axes) == set(AXES["attitude"][0])
+    if attitude:
+        values = values * np.cumprod([1.0, *np.where((values[1:] * values[:-1]).sum(axis=1) < 0, -1.0, 1.0)])[:, None]
+    signal = Signal(signal.t, values, signal.axes, signal.source)
+    if signal.interval < dt / 2 and not attitude:
+        steps = np.diff(signal.t)[:, None] * (values[1:] + values[:-1]) / 2
+        area = Signal(signal.t, np.concatenate([0 * values[:1], np.cumsum(steps, axis=0)]), signal.axes, signal.source)
+        found = (_at(area, t + dt / 2) - _at(area, t - dt / 2)) / dt
+    else:
+        found = _at(signal, t)
+    if attitude:
+        found = found / np.linalg.norm(found, axis=-1, keepdims=True)
+    near = np.searchsorted(signal.t, t.ravel() - dt / 2), np.searchsorted(signal.t, t.ravel() + dt / 2)
+    there = (near[1] > near[0]).reshape(t.shape) | (signal.interval <= 1.5 * dt)
+    return found, there & (t >= signal.t[0]) & (t <= signal.t[-1])
+
+
+def initial_states(
+    recording: Recording, starts: Float[np.ndarray, " n"], layout: Layout
+) -> tuple[Float[np.ndarray, "n 13"], Float[np.ndarray, "n 12"]]:
+    """The state at each time and the standard deviations of its error, from samples up to that time.
+
+    A quadratic is fitted to the samples of `layout.span` before it; velocity and rates that are not measured are the
+    slopes of position and attitude. What nothing measures is zero, with the deviations of `UNKNOWN`; unknown position
+    and heading are exact by choice of the origin. With `initial="sample"` the last sample stands, taken as exact.
+    """
+    n, signals = len(starts), recording.signals
+    x, spread = np.zeros((n, STATE_SIZE)), np.zeros((n, TANGENT))
+    x[:, QUATERNION.start] = 1
+    spread[:, 3:5], spread[:, 6:9], spread[:, 9:] = UNKNOWN["tilt"], UNKNOWN["velocity"], UNKNOWN["rates"]
+    if "position" in signals:
+        _fill(x, spread, POSITION, 0, *fitted(signals["position"], starts, layout))
+        _fill(x, spread, VELOCITY, 6, *fitted(signals["position"], starts, layout, slope=True))
+    if "attitude" in signals:
+        q, error, slope, slope_error = _attitudes(signals["attitude"], starts, layout)
+        x[:, QUATERNION], spread[:, 3:6] = q, error
+        _fill(x, spread, BODY_RATES, 9, slope, slope_error)
+    for name, place, at in (("velocity", VELOCITY, 6), ("rates", BODY_RATES, 9)):
+        if name in signals and len(signals[name].axes) == 3:
+            _fill(x, spread, place, at, *fitted(signals[name], starts, layout))
+    if "body_velocity" in signals and len(signals["body_velocity"].axes) == 3:
+        value, error = fitted(signals["body_velocity"], starts, layout)
+        _fill(x, spread, VELOCITY, 6, _rotation(x[:, QUATERNION]).apply(value), error)
+    return x, spread
+
+
+def _fill(x, spread, place: slice, at: int, value, error) -> None:
+    x[:, place], spread[:, at : at + 3] = value, error
+
+
+def _rotation(q) -> "scipy.spatial.transform.Rotation":
+    return scipy.spatial.transform.Rotation.from_quat(np.roll(q, -1, axis=-1))
+
+
+def _attitudes(signal: Signal, starts, layout: Layout):
+    """Attitude, its error, its rate in the body and the error of that."""
+    at = np.clip(np.searchsorted(signal.t, starts, side="right") - 1, 0, None)
+    every = _rotation(np.asarray(signal.values))
+    found = [
+        _of_one(signal, starts[i], layout, (every[int(k)].inv() * every[_before(signal, t, layout)]).as_rotvec())
+        for i, (k, t) in enumerate(zip(at, starts, strict=True))
+    ]
+    value, slope, variance = (np.array(part) for part in zip(*found, strict=True)) if found else np.zeros((3, 0, 3))
+    noise = np.sqrt(np.median(variance[:, :3], axis=0)) if len(found) else np.zeros(3)
+    q = np.roll((every[at] * scipy.spatial.transform.Rotation.from_rotvec(value.reshape(-1, 3))).as_quat(), 1, axis=1)
+    here, slopes = (np.median([_gains(signal, t, layout)[i] for t in starts] or [0.0]) for i in (0, 1))
+    return q, 0 * noise if layout.initial == "sample" else noise * here, slope.reshape(-1, 3), noise * slopes
+
+
+def fitted(signal: Signal, starts, layout: Layout, slope: bool = False):
+    """Value or slope of a signal at each time (n, k), and the standard deviation of its error (k)."""
+    found = [_of_one(signal, t, layout, np.asarray(signal.values)[_before(signal, t, layout)]) for t in starts]
+    if not found:
+        return np.zeros((0, len(signal.axes))), np.zeros(len(signal.axes))
+    value, rate, variance = (np.array(part) for part in zip(*found, strict=True))
+    gains = np.median([_gains(signal, t, layout) for t in starts], axis=0)
+    noise = np.sqrt(np.median(variance, axis=0))
+    if layout.initial == "sample" and not slope:
+        return value, 0 * noise
+    return (rate, noise * gains[1]) if slope else (value, noise * gains[0])
+
+
+def _before(signal: Signal, t: float, layout: Layout) -> slice:
+    """The samples of the span before a time, at least six, or as many as there are."""
+    end = int(np.searchsorted(signal.t, t, side="right"))
+    return slice(max(0, min(int(np.searchsorted(signal.t, t - layout.span)), end - 6)), max(end, 1))
+
+
+def _of_one(signal: Signal, t: float, layout: Layout, values):
+    """Value and slope at t of a quadratic through the samples before, or the last sample, and the variance about it."""
+    basis = _basis(signal, t, layout)
+    weights, *_ = np.linalg.lstsq(basis, values, rcond=None)
+    left = max(len(basis) - basis.shape[1], 1)
+    variance = ((values - basis @ weights) ** 2).sum(axis=0) / left
+    return values[-1] if layout.initial == "sample" else weights[0], weights[1], variance
+
+
+def _basis(signal: Signal, t: float, layout: Layout):
+    past = signal.t[_before(signal, t, layout)] - t
+    return past[:, None] ** np.arange(3 if len(past) > 4 else 2)
+
+
+def _gains(signal: Signal, t: float, layout: Layout) -> tuple[float, float]:
+    """Standard deviation of value and slope for samples of deviation 1."""
+    basis = _basis(signal, t, layout)
+    covariance = np.linalg.pinv(basis.T @ basis)
+    return float(np.sqrt(covariance[0, 0])), float(np.sqrt(covariance[1, 1]))

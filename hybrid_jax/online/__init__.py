@@ -1,0 +1,11 @@
+"""Adapt while the system runs, one sample at a time.
+
+`OnlineAdaptation` is an extended Kalman filter of the parameters.
+"""
+
+from hybrid_jax.online.estimator import OnlineAdaptation
+from hybrid_jax.online.hypotheses import Cause
+from hybrid_jax.online.state import Flags, OnlineState
+from hybrid_jax.online.tuning import Tuning
+
+__all__ = ["Cause", "Flags", "OnlineAdaptation", "OnlineState", "Tuning"]

@@ -1,0 +1,297 @@
+"""Adapt while it runs: extended Kalman filters of state, θ_p and a constant disturbance, one sample at a time.
+
+The state of the filter is z = [x, θ]: the state x of the system, which the one-step predictions need without noise,
+and θ, all parameters of the physics and the disturbance.
+
+- A test of the innovations finds a change (`change_test`). An alarm opens the covariance.
+- Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster while it is pulled. Parameters
+  of a vehicle are constant between two changes; they do so only where no disturbance is estimated, or beside causes, as
+  the filter of all parameters then matters where the model is wrong in a way that no cause explains.
+- Causes: with these, filters of a few parameters compete with that of all (`causes_bank`).
+- Consistency: while the mean of the normalised innovations squared (NIS) is far too large, what the filter says is not
+  used (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the
+  last good estimate is.
+"""
+
+from collections.abc import Mapping
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_disturbance
+from hybrid_jax.dynamics.estimator import AbstractEstimator
+from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import Interval, intervals
+from hybrid_jax.integrate import check_callable
+from hybrid_jax.online import change_test, hypothesis_bank, kalman
+from hybrid_jax.online.hypotheses import Bank, Cause, Directions, bank_of, directions
+from hybrid_jax.online.kalman import Belief, Each, Plant
+from hybrid_jax.online.samples import HUGE, Heard, Sample, nearer, sampled
+from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, named_priors
+from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.rotation import normalise
+from hybrid_jax.state import QUATERNION
+
+FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
+UNEXCITED = 0.5  # share of its variance without data, above which the data have said nothing on a parameter
+
+
+class OnlineAdaptation(AbstractEstimator):
+    """Recursive estimator of the parameters of any field, and of a constant disturbance, with their covariance.
+
+        filter = hj.OnlineAdaptation(field, dt=0.01, noise=0.02, disturbance=1.0)
+        state = filter.begin(x)
+        state = filter.update(state, x, u)  # at each sample; then filter.model(state), filter.intervals(state)
+
+    Pure: its methods compile and map over stacked states. They refuse samples of another shape; numbers that are bad
+    raise nothing, see `flags`.
+
+    Attributes:
+        field: its physics is adapted from the values that it has; a network beside it stays as it is.
+        dt: time between two samples [s].
+        noise: standard deviation of what is measured of each state.
+        prior: standard deviation of each parameter before and after a change, in the physics' own parametrisation (for
+            a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
+            array, efficiency. Zero holds a parameter.
+        disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
+        indices: of the disturbed states; by default those that the field has, or v̇ and ω̇ of a rigid body.
+        process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
+        initial: share of the prior that is uncertain at the start, before a change.
+        causes: of which one may change at a time, each of a few parameters, found by how well it explains the samples.
+            With causes the model stays the field's own until a change is found.
+
+    Raises:
+        ValueError: a number out of range, an unknown name, or physics without parameters.
+    """
+
+    field: AbstractVectorField
+    dt: float = eqx.field(static=True)
+    noise: tuple[float, ...] = eqx.field(static=True)  # one for each state, or one for all
+    process: tuple[float, ...] = eqx.field(static=True)
+    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters, in the order of θ
+    scales: tuple[float, ...] = eqx.field(static=True)  # the prior standard deviation of each
+    initial: float = eqx.field(static=True)
+    causes: tuple[Directions, ...] = eqx.field(static=True)
+    tuning: Tuning = eqx.field(static=True)
+
+    def __init__(
+        self,
+        field: AbstractVectorField,
+        dt: float,
+        noise: Numbers,
+        prior: float | Mapping[str, float] = 0.3,
+        disturbance: Numbers = 0.0,
+        indices: tuple[int, ...] | None = None,
+        process: Numbers = 0.0,
+        initial: float = 1.0,
+        causes: tuple[Cause, ...] = (),
+        tuning: Tuning | None = None,
+    ):
+        checks.positive("dt", dt, "a positive number of seconds")
+        for name, numbers, check in (("noise", noise, checks.positive), ("process", process, checks.not_negative)):
+            for number in np.ravel(numbers):
+                check(name, number)
+        if not 0 < (checks.real(initial) or 0) <= 1:
+            raise ValueError(f"initial must be a share above 0 and at most 1, got {checks.short_repr(initial)}")
+        check_callable(field)
+        self.tuning = Tuning() if tuning is None else tuning
+        checks.instance("tuning", self.tuning, Tuning)
+        indices = None if indices is None else checks.places("indices", indices)
+        if np.any(disturbance):
+            known = disturbance_of(field) is not None or moves_a_rigid_body(physics_of(field))
+            if indices is None and not known:
+                raise ValueError("indices must say which states are disturbed, as the system is no rigid body")
+            field = with_disturbance(field, indices)
+        self.field, self.dt, self.initial = field, float(dt), float(initial)
+        self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
+        self.names, self.scales = named_priors(field, prior, disturbance)
+        self.causes = tuple(
+            directions(cause, self.names, self.scales) for cause in checks.list_of("causes", causes, Cause)
+        )
+
+    def begin(self, x: Float[Array, " d"]) -> OnlineState:
+        """Before the first sample x, at the field's own parameters."""
+        x, indices = jnp.asarray(x, float), getattr(disturbance_of(self.field), "indices", None)
+        check_sizes(x, {"noise": self.noise, "process": self.process}, indices)
+        p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
+        zero, theta, start = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype), jnp.full(p, self.initial**2, x.dtype)
+        variances, mixture = self._variances(x), None
+        if self.causes:
+            mixture = hypothesis_bank.begun(self._bank(), x, variances, self.tuning.floor)
+        return OnlineState(
+            x=x,
+            theta=theta,
+            covariance=jnp.diag(jnp.concatenate([variances, start])),
+            free=start,
+            test=change_test.started(p, x.dtype),
+            mixture=mixture,
+            trusted=theta,
+            nis=zero + 1,
+            silent=zero,
+            last=x,
+            equal=none,
+            unseen=none,
+            changes=zero,
+            restarts=zero,
+        )
+
+    def update(
+        self,
+        state: OnlineState,
+        x: Float[Array, " d"],
+        u: Float[Array, " m"],
+        elapsed: Float[Array, ""] | float = 1.0,
+        each: Each = jax.vmap,
+    ) -> OnlineState:
+        """After one period.
+
+        Args:
+            x: the new sample; NaN where nothing was measured.
+            u: the mean input over the period, as it acted: delayed and lagged, not as it was commanded.
+            elapsed: periods since the last update. Over more than one nothing is learned of the input, and the state is
+                taken from the sample.
+            each: turns a function of the filter of one cause into one of arrays of all.
+        """
+        tuning, d = self.tuning, len(state.x)
+        checks.not_negative("elapsed", elapsed)
+        x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
+        if x.shape != state.x.shape:
+            raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
+        x = nearer(x, state.x) if moves_a_rigid_body(self.field) else x
+        heard = Heard(state.last, state.equal, state.silent)
+        sample, heard = sampled(x, u, elapsed, heard, self.dt, tuning.gap)
+        plant = self._plant(sample, each)
+        belief, free = self._predicted(state, plant, sample)
+        belief = kalman.restarted(belief, sample, sample.anew, plant.variances)
+        belief, correction = kalman.correct(belief, sample, plant)
+        white, gains, _ = correction
+        test, changed = change_test.after_sample(state.test, white, gains, sample, self.dt, tuning, tuning.pause)
+        mean, squares, mixture, found = belief.z[d:], jnp.square(white), None, changed
+        if state.mixture is not None:
+            verdict = hypothesis_bank.after_sample(state.mixture, self._bank(), plant, sample, belief, correction)
+            mixture, mean, squares, found, lost = verdict
+            lost = lost & (test.quiet > tuning.hold)
+            test, changed = change_test.reset(test, lost, 0.0), changed | lost
+        # The state, too, has followed the wrong model since the change.
+        belief = kalman.restarted(belief, sample, changed, plant.variances)
+        ones = jnp.ones_like(state.theta)
+        open_up = jnp.concatenate([jnp.zeros(d, x.dtype), jnp.where(changed, ones, 0.0)])
+        nis = self._mean_square(state.nis, squares, sample)
+        new = OnlineState(
+            x=belief.z[:d],
+            theta=belief.z[d:],
+            covariance=belief.covariance + jnp.diag(open_up),
+            free=jnp.where(changed, ones, free),
+            test=test,
+            mixture=mixture,
+            trusted=jnp.where(nis < tuning.reject, mean, state.trusted),
+            nis=nis,
+            silent=heard.silent,
+            last=jnp.where(jnp.abs(sample.x) < HUGE, sample.x, state.last),
+            equal=heard.equal,
+            unseen=jnp.where(sample.seen, 0.0, 1.0),
+            changes=state.changes + jnp.where(found, 1.0, 0.0),
+            restarts=state.restarts,
+        )
+        return self._sound(new, state)
+
+    def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
+        """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation."""
+        scales, d = jnp.asarray(self.scales, state.x.dtype), len(state.x)
+        covariance = state.covariance[d:, d:]
+        if state.mixture is not None:
+            joint, tuning = self._joint(state), self.tuning
+            covariance = hypothesis_bank.covariance(state.mixture, self._bank(), joint, tuning.least)
+        return scales * state.trusted, scales[:, None] * covariance * scales
+
+    def model(self, state: OnlineState) -> AbstractVectorField:
+        """The field at the last good estimate, with its disturbance."""
+        theta, unravel = ravel_parameters(self.field)
+        return unravel((theta + jnp.asarray(self.scales, theta.dtype) * state.trusted).astype(theta.dtype))
+
+    def intervals(self, state: OnlineState, level: float = 0.95) -> dict[str, Interval]:
+        """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`."""
+        return intervals(self.model(state), self.estimate(state)[1], level)
+
+    def flags(self, state: OnlineState) -> Flags:
+        """What is wrong with samples, parameters and model, or was found."""
+        tuning, d = self.tuning, state.x.shape[-1]
+        variance, free, test = jnp.diagonal(state.covariance, axis1=-2, axis2=-1)[..., d:], state.free, state.test
+        if state.mixture is not None:
+            test = state.mixture.test
+        return Flags(
+            missing=state.unseen > 0,
+            frozen=state.equal >= tuning.frozen,
+            gap=state.silent > tuning.gap,
+            changed=test.quiet < 1,
+            inconsistent=state.nis >= tuning.reject,
+            unexcited=variance > UNEXCITED * free,
+            at_bound=jnp.abs(state.trusted) >= tuning.bound,
+        )
+
+    def _variances(self, x) -> Float[Array, " d"]:
+        return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
+
+    def _unit(self, x):
+        return x.at[QUATERNION].set(normalise(x[QUATERNION])) if moves_a_rigid_body(self.field) else x
+
+    def _rates(self, u):
+        """ẋ as a function of x and θ."""
+        start, unravel = ravel_parameters(self.field)
+
+        def rates(x, theta):
+            moved = start + jnp.asarray(self.scales, x.dtype) * theta
+            return unravel(moved.astype(start.dtype))(x, u)
+
+        return rates
+
+    def _joint(self, state: OnlineState) -> Belief:
+        return Belief(jnp.concatenate([state.x, state.theta]), state.covariance)
+
+    def _plant(self, sample: Sample, each: Each) -> Plant:
+        x = sample.x
+        added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
+        return Plant(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning, each)
+
+    def _predicted(self, state: OnlineState, plant: Plant, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
+        """The filter of all parameters before the sample, and the variances without data."""
+        tuning, ones = self.tuning, jnp.ones_like(state.theta)
+        pulled = jnp.max(state.test.squares, axis=0)
+        varies = np.array([name.startswith(DISTURBANCE) for name in self.names])
+        all_vary = bool(self.causes) or not varies.any()
+        forgotten = np.where(varies | all_vary, tuning.forgetting, 0.0)
+        faster = 1 + jnp.asarray(forgotten, ones.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
+        walked = self.dt * sample.elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
+        belief = kalman.predict(self._joint(state), plant, plant.field, None, walked, sample.acted)
+        return kalman.capped(belief, ones), jnp.minimum(state.free + walked, 1.0)
+
+    def _mean_square(self, nis, squares, sample: Sample):
+        """The mean NIS with another sample."""
+        share = jnp.sum(squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
+        return nis + jnp.where(sample.measured, -jnp.expm1(-self.dt / self.tuning.window), 0.0) * (share - nis)
+
+    def _bank(self) -> Bank:
+        return bank_of(self.causes, len(self.names), self.dt)
+
+    def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
+        """The new state, or a beginning at the last good θ if a number of it is not finite."""
+        parts = [new.covariance, new.x, new.theta, new.nis]
+        if new.mixture is not None:
+            parts += [new.mixture.z, new.mixture.covariance, new.mixture.odds]
+        total = sum(jnp.sum(jnp.abs(part)) for part in parts)
+        sound = (total < HUGE) & (jnp.min(kalman.diagonal(new.covariance)) > 0)
+        x, ones = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0), jnp.ones_like(old.theta)
+        covariance = jnp.diag(jnp.concatenate([self._variances(x), ones]))
+        values = old.trusted, old.trusted, covariance, ones, old.changes, old.restarts + 1
+        again = eqx.tree_at(
+            lambda s: (s.theta, s.trusted, s.covariance, s.free, s.changes, s.restarts), self.begin(x), values
+        )
+        if (mixture := again.mixture) is not None:
+            again = eqx.tree_at(lambda s: s.mixture.odds, again, mixture.odds[::-1])  # it is for all parameters now
+        return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, again)

@@ -1,0 +1,134 @@
+"""Steps of an extended Kalman filter of z = [x, a]: the state of a system, and numbers a that move its parameters.
+
+Samples enter one number after the other, so that an update needs no matrix inverse (Bierman, "Factorization methods for
+discrete sequential estimation", 1977, ch. V.2). All functions are pure and map over filters of one size.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax.integrate import rk4_step
+from hybrid_jax.online.samples import Sample
+from hybrid_jax.online.tuning import Tuning
+
+Each = Callable[[Callable], Callable]  # a function of one filter → of arrays of several, as `jax.vmap`
+Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
+
+
+class Belief(NamedTuple):
+    """Mean and covariance of z."""
+
+    z: Float[Array, " n"]
+    covariance: Float[Array, "n n"]
+
+
+class Plant(NamedTuple):
+    """What all filters have in common in a period."""
+
+    field: Field
+    unit: Callable[[Array], Array]  # x with a unit quaternion
+    variances: Float[Array, " d"]  # of a sample
+    added: Float[Array, " d"]  # variance that a period adds to x
+    dt: float
+    tuning: Tuning
+    each: Each  # does the same for several filters
+
+    def tidy(self, belief: Belief) -> Belief:
+        """With a unit quaternion, and a within its bounds."""
+        z, d, bound = belief.z, len(self.variances), self.tuning.bound
+        return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -bound, bound)]), belief.covariance)
+
+
+class Correction(NamedTuple):
+    """What a sample did."""
+
+    white: Float[Array, " d"]  # innovations over their standard deviations
+    gains: Float[Array, "d k"]  # of the numbers a by these
+    likelihood: Float[Array, ""]  # logarithm, but for a constant
+
+
+def slope_of(plant: Plant, field: Field, x: Float[Array, " d"], a: Float[Array, " k"]) -> tuple[Array, Array]:
+    """The next x by RK4, and its Jacobian in x and a, which one Jacobian of ẋ midway gives up to O(dt³)."""
+    moved = plant.unit(rk4_step(field, x, a, plant.dt))
+    push = jax.linearize(field, (x + moved) / 2, a)[1]
+    d, eye = len(x), jnp.eye(len(x) + len(a), dtype=x.dtype)
+    rates = jax.vmap(push, out_axes=1)(eye[:, :d], eye[:, d:])
+    slope = eye[:d] + plant.dt * (rates + plant.dt / 2 * rates[:, :d] @ rates)
+    return moved, jax.vmap(jax.linearize(plant.unit, moved)[1], 1, 1)(slope)
+
+
+def predict(
+    belief: Belief,
+    plant: Plant,
+    field: Field,
+    turned: Float[Array, "k k"] | None,
+    walked: Float[Array, " k"],
+    acted: Bool[Array, ""],
+) -> Belief:
+    """One period later, if a known input acted in it.
+
+    Args:
+        field: ẋ as a function of x and a.
+        turned: the next a as a matrix times a; None if it stays.
+        walked: variance that the period adds to a.
+    """
+    z, covariance = belief
+    d = len(plant.variances)
+    moved, slope = slope_of(plant, field, z[:d], z[d:])
+    top, own = slope @ covariance, covariance[d:, d:]
+    inner, beside, a = top @ slope.T, top[:, d:], z[d:]
+    by_a = slope[:, d:]
+    # Products of errors of a and of x, which a linear filter leaves out, move the state while a is uncertain.
+    noise = plant.added + plant.tuning.caution**2 * jnp.sum((by_a @ own) * by_a, axis=1)
+    if turned is not None:
+        beside, own, a = beside @ turned.T, turned @ own @ turned.T, turned @ a
+    later = jnp.block([[inner, beside], [beside.T, own]])
+    later = jnp.where(acted, (later + later.T) / 2, covariance) + jnp.diag(jnp.concatenate([noise, walked]))
+    return Belief(jnp.where(acted, jnp.concatenate([moved, a]), z), later)
+
+
+def restarted(belief: Belief, sample: Sample, anew: Bool[Array, ""] | bool, variances: Float[Array, " d"]) -> Belief:
+    """With x as the sample has it, if `anew`; a stays."""
+    z, covariance = belief
+    d, k = len(variances), len(z) - len(variances)
+    kept = jnp.concatenate([jnp.full(d, jnp.where(anew, 0.0, 1.0), z.dtype), jnp.ones(k, z.dtype)])
+    variance = jnp.where(sample.seen, variances, 1e4 * variances)
+    added = jnp.concatenate([jnp.where(anew, variance, 0.0), jnp.zeros(k, z.dtype)])
+    z = jnp.concatenate([jnp.where(anew & sample.seen, sample.x, z[:d]), z[d:]])
+    return Belief(z, kept[:, None] * covariance * kept + jnp.diag(added))
+
+
+def correct(belief: Belief, sample: Sample, plant: Plant) -> tuple[Belief, Correction]:
+    """With one measured number after the other; innovations are cut off at some standard deviations."""
+    (z, covariance), variances, clip = belief, plant.variances, plant.tuning.clip
+    d = len(variances)
+    white, gains, likelihood = [], [], jnp.zeros((), z.dtype)
+    for i in range(d):
+        used, column = sample.used[i], covariance[:, i]
+        variance = column[i] + variances[i]
+        size = jnp.sqrt(variance)
+        error = jnp.where(used, jnp.clip((sample.x[i] - z[i]) / size, -clip, clip), 0.0)
+        gain = jnp.where(used, column / size, 0.0)
+        z, covariance = z + gain * error, covariance - gain[:, None] * gain
+        likelihood = likelihood - jnp.where(used, jnp.square(error) + jnp.log(variance), 0.0) / 2
+        white.append(error)
+        gains.append(gain[d:])
+    return plant.tidy(Belief(z, covariance)), Correction(jnp.stack(white), jnp.stack(gains), likelihood)
+
+
+def capped(belief: Belief, prior: Float[Array, " k"]) -> Belief:
+    """No number a becomes less certain than the prior, also if nothing excites it for long."""
+    z, covariance = belief
+    variance = diagonal(covariance)[len(z) - len(prior) :]
+    most = jnp.where(prior > 0, prior, 1.0)
+    shrink = jnp.concatenate([jnp.ones(len(z) - len(prior), z.dtype), jnp.sqrt(most / jnp.maximum(variance, most))])
+    return Belief(z, shrink[:, None] * covariance * shrink)
+
+
+def diagonal(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
+    """As jnp.diagonal, by operations that the export to C knows."""
+    return matrix.ravel()[:: len(matrix) + 1]

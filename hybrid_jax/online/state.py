@@ -1,0 +1,101 @@
+"""What an `OnlineAdaptation` carries from sample to sample, and what its parameters are called."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.online.change_test import ChangeTest
+from hybrid_jax.online.hypothesis_bank import Mixture
+
+DISTURBANCE = "disturbance"
+Numbers = float | tuple[float, ...] | np.ndarray
+
+
+class OnlineState(eqx.Module):
+    """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold."""
+
+    x: Float[Array, "*n d"]  # estimated state
+    theta: Float[Array, "*n p"]  # change of θ in prior standard deviations, as the filter of all parameters has it
+    covariance: Float[Array, "*n d+p d+p"]  # of both, in these units
+    free: Float[Array, "*n p"]  # variances that θ would have, had nothing been measured since the last alarm
+    test: ChangeTest  # of the filter of x and θ
+    mixture: Mixture | None  # of the causes, if there are
+    trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
+    nis: Float[Array, "*n"]  # mean normalised innovation squared, 1 if noise and model are as stated
+    silent: Float[Array, "*n"]  # time since something was measured [s]
+    last: Float[Array, "*n d"]  # the last sample
+    equal: Float[Array, "*n d"]  # how many samples in a row were equal
+    unseen: Float[Array, "*n d"]  # 1 where the last sample was not used
+    changes: Float[Array, "*n"]  # how many alarms there were
+    restarts: Float[Array, "*n"]  # how often the filter had to begin anew, since a number was not finite
+
+
+class Flags(NamedTuple):
+    """What is wrong, or was found."""
+
+    missing: Bool[Array, " d"]  # not measured in the last sample: NaN, or equal to the one before
+    frozen: Bool[Array, " d"]  # sensors that repeat their last value
+    gap: Bool[Array, ""]  # nothing was measured for longer than `Tuning.gap`
+    changed: Bool[Array, ""]  # an alarm in the last second
+    inconsistent: Bool[Array, ""]  # errors are too large for the model at any θ: the last good estimate is used
+    unexcited: Bool[Array, " p"]  # parameters on which the data say nothing
+    at_bound: Bool[Array, " p"]  # parameters at the end of their range
+
+
+def named_priors(
+    field: AbstractVectorField, prior: float | Mapping[str, float], disturbance: Numbers
+) -> tuple[tuple[str, ...], tuple[float, ...]]:
+    """Name and prior standard deviation of each parameter of the physics, in the order of the vector of all."""
+    names = _names(field)
+    groups = [name.partition("[")[0] for name in names]
+    own = prior if isinstance(prior, Mapping) else dict.fromkeys(groups, prior)
+    if unknown := sorted(own.keys() - {*names, *groups}):
+        raise ValueError(f"prior: {', '.join(unknown)}: must be among {', '.join(dict.fromkeys(groups))}")
+    size, sizes = groups.count(DISTURBANCE), np.ravel(disturbance)
+    if len(sizes) not in (1, size):
+        raise ValueError(f"disturbance must be one number, or one for each of {size} disturbed, got {len(sizes)}")
+    disturbed = iter(np.broadcast_to(sizes, size).tolist())
+    found = []
+    for name, group in zip(names, groups, strict=True):
+        scale = next(disturbed) if group == DISTURBANCE else own.get(name, own.get(group))
+        if scale is None:
+            raise ValueError(f"prior: {group} must be given, 0 if it is to stay as it is")
+        checks.not_negative(group if group == DISTURBANCE else f"prior of {name}", scale)
+        found.append(float(scale))
+    if not any(found):
+        raise ValueError("prior must be positive for a parameter at least, got 0 for all")
+    return names, tuple(found)
+
+
+def check_sizes(x: Array, numbers: Mapping[str, tuple[float, ...]], indices: tuple[int, ...] | None) -> None:
+    """Refuse what is no sample x (d,), numbers that are not one for each of its states or for all, and indices."""
+    if x.ndim != 1:
+        raise ValueError(f"x must be one sample (d,), got shape {x.shape}")
+    for name, values in numbers.items():
+        if len(values) not in (1, len(x)):
+            raise ValueError(f"{name} must be one number, or one for each of the {len(x)} of x, got {len(values)}")
+    if indices is not None:
+        checks.places("indices", indices, len(x))
+
+
+def _names(field: AbstractVectorField) -> tuple[str, ...]:
+    """The name of each parameter; the field may be traced."""
+
+    def numbers(theta, unravel):
+        return jnp.stack(list(named_parameters(unravel(theta)).values()))
+
+    with jax.ensure_compile_time_eval():
+        like = jax.tree.map(lambda a: jnp.zeros(a.shape, jnp.result_type(a)) if eqx.is_inexact_array(a) else a, field)
+        theta, unravel = ravel_parameters(like)
+        slopes = np.asarray(jax.jacfwd(numbers)(theta, unravel))  # each number depends on one parameter
+        labels = list(named_parameters(like))
+    return tuple(labels[i] for i in np.argmax(np.abs(slopes), axis=0))

@@ -1,0 +1,75 @@
+"""What a planned trajectory will tell of the parameters: the covariance of least squares, before any flight.
+
+A trajectory is cut into windows that touch. Least squares compares the samples of each with a rollout from its first
+sample (`hybrid_jax.adaptation.fit_least_squares`). So the noise of a first sample acts on the whole window, and that
+of a sample that two windows share on both.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
+from hybrid_jax.estimation.normal_equations import inverse
+from hybrid_jax.integrate import compact, rollout
+
+
+class Information(NamedTuple):
+    """Sums over all windows, of errors over the noise's standard deviation; J = ∂x̂/∂θ_p."""
+
+    gram: Float[Array, "p p"]  # JᵀJ, the Gauss–Newton information if the first samples were exact
+    noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples
+
+    def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
+        """The covariance of θ_p by least squares on the free parameters, zero for the others.
+
+        The variance is infinite of parameters that the trajectory does not tell apart.
+        """
+        both = free & free[:, None]
+        bread, told, _ = inverse(jnp.where(both, self.gram, jnp.diag(jnp.where(free, 0.0, 1.0))))
+        return bread @ jnp.where(both, self.noise, 0.0) @ bread + jnp.diag(jnp.where(told, 0.0, jnp.inf))
+
+
+def information_of(
+    field: AbstractVectorField,
+    x: Float[Array, "n+1 d"],
+    u: Float[Array, "n m"],
+    dt: float,
+    steps: int,
+    noise: Float[Array, " d"],
+    solver: Solver = None,
+) -> Information:
+    """The information in a trajectory, cut into windows of `steps` intervals; what is left at its end is not used.
+
+    Args:
+        x: the true states, one before each interval of `dt` [s] and one after the last.
+        noise: standard deviation of the white noise on each state.
+    """
+    count = len(u) // steps
+    starts, inputs = x[: count * steps : steps], u[: count * steps].reshape(count, steps, -1)
+    theta, unravel = ravel_parameters(field)
+
+    def one(x0, u):
+        def predicted(theta, start):
+            return rollout(unravel(theta), x0 + noise * start, u, dt, compact(solver)) / noise
+
+        return jax.jacfwd(predicted, argnums=(0, 1))(theta, jnp.zeros_like(x0))
+
+    effects, of_start = jax.vmap(one)(starts, inputs)  # (n, t, d, p) and (n, t, d, d)
+    first = -jnp.einsum("ntdp,ntde->nep", effects, of_start)  # what the noise of each first sample does to Jᵀ(x − x̂)
+    zero = jnp.zeros_like(first[:1])
+    shared = jnp.concatenate([zero, effects[:, -1]]) + jnp.concatenate([first, zero])
+    alone = effects[:, :-1].reshape(-1, theta.size)
+    shared = shared.reshape(-1, theta.size)
+    return Information(jnp.einsum("ntdp,ntdq->pq", effects, effects), alone.T @ alone + shared.T @ shared)
+
+
+def told_apart(information: Information, free: Bool[Array, " p"], least: float) -> tuple[bool, Float[Array, " p"]]:
+    """Whether the free parameters are told apart, and how much each takes part in what is told least."""
+    gram = jnp.where(free & free[:, None], information.gram, jnp.diag(jnp.where(free, 0.0, 1.0)))
+    size = jnp.sqrt(jnp.diagonal(gram))
+    values, vectors = jnp.linalg.eigh(gram / (size[:, None] * size))
+    return bool(values[0] > least), jnp.abs(vectors[:, 0])

@@ -1,0 +1,291 @@
+"""The experiment that tells the parameters best: a D-optimal reference or input inside limits.
+
+D-optimal: the smallest volume of the parameters' confidence ellipsoid (Fedorov, Theory of Optimal Experiments, 1972;
+Mehra, "Optimal input signals for parameter estimation in dynamic systems", IEEE TAC 1974; as Fourier series within
+limits Swevers, Ganseman, Tükel, De Schutter and Van Brussel, "Optimal robot excitation and identification", 1997).
+"""
+
+import math
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.disturbance import sized
+from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.estimation.least_squares import ravel_parameters, rounding
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.planning.fisher_information import Information, information_of, told_apart
+from hybrid_jax.planning.input_designs import (
+    RAMP,
+    Coefficients,
+    Design,
+    FlatOutputs,
+    FlightBounds,
+    InputBounds,
+    InputSeries,
+    Trajectory,
+)
+from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.trajectories import windows_of
+
+SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
+SHRUNK = 1 - np.arange(64) / 64  # factors on a series, the first of which that keeps the limits is taken
+PENALTY = 30.0, 3000.0  # on the mean squared excess over a limit, at the first and at the last step
+TOLD_APART = 1e-5  # least eigenvalue of the scaled information, ten times its rounding in float32
+RATE = 0.05  # of Adam, in units of the coefficients
+Starts = Float[Array, "s outputs harmonics 2"]
+# Of motion capture and a gyroscope: m, quaternion, m/s, rad/s.
+NOISE = ((POSITION, 0.001), (QUATERNION, 0.002), (VELOCITY, 0.02), (BODY_RATES, 0.02))
+
+
+@dataclass(frozen=True)
+class Excitation:
+    """The result of `excitation`."""
+
+    reference: Callable[..., Any]  # t [s] → (position [m], yaw [rad]) of a multirotor, or → the inputs
+    t: Float[np.ndarray, " n+1"]  # s
+    states: Float[np.ndarray, "n+1 d"]  # planned
+    inputs: Float[np.ndarray, "n m"]  # planned, held over each interval
+    parameters: tuple[str, ...]  # those asked for that the inputs excite
+    information: Float[np.ndarray, "q q"]  # of these, in the physics' own parametrisation, the others being unknown too
+    standard_errors: dict[str, float]  # predicted, of those asked for, in the units of `intervals`; inf if not excited
+    margins: dict[str, float]  # share of each limit that is left
+
+    @property
+    def log_det(self) -> float:
+        """log det of the information: D-optimality."""
+        return float(np.linalg.slogdet(self.information)[1])
+
+
+def excitation(
+    model: AbstractVectorField,
+    parameters: Sequence[str] | None,
+    bounds: FlightBounds | InputBounds,
+    *,
+    seconds: float = 10.0,
+    noise: Sequence[float] | None = None,
+    window: float = 0.1,
+    dt: float = 0.01,
+    bandwidth: float = 2.0,
+    starts: int = 4,
+    steps: int = 200,
+    seed: int = 0,
+) -> Excitation:
+    """Find the flight, or the inputs, whose data tell parameters best.
+
+    Maximised is log det of the inverse covariance of `parameters` that `fit_least_squares(…, scale=noise)` will have on
+    windows of the flight. All other parameters of the model's physics are fitted, too: with
+    `with_disturbance(model)`, an unknown constant force and torque. Adam from random series; a series that leaves the
+    limits is shrunk until it keeps them, so the result keeps them and tells no less than any start.
+
+    The vehicle need not follow the reference exactly: what it tells is computed from the plan.
+
+    Args:
+        model: of a multirotor with `FlightBounds`, else any field with `InputBounds`, at a guess of its parameters.
+        parameters: names as in `intervals`; by default all but a disturbance.
+        noise: standard deviation of each state's white noise; by default that of motion capture for a multirotor.
+        window: length of the windows [s], a multiple of `dt` [s].
+        bandwidth: highest frequency of the series [Hz].
+        starts: random series to start from, of which the best end is kept.
+        steps: of Adam.
+
+    Raises:
+        ValueError: an unknown parameter, bounds of the wrong kind, limits that not even rest keeps, or parameters that
+            no start tells apart. A parameter that nothing excites is a warning that names it.
+    """
+    design = _design(model, bounds, seconds, window, dt, bandwidth)
+    for name, value in (("starts", starts), ("steps", steps)):
+        checks.count(name, value, least=int(name == "starts"))
+    checks.count("seed", seed, least=0)
+    states = STATE_SIZE if isinstance(design, FlatOutputs) else len(bounds.start)  # pyright: ignore
+    model, sizes = sized(model, states), _noise(noise, states)
+    wanted = _wanted(model, parameters)
+    search = _Search(design, model, jnp.asarray(sizes), round(window / dt))
+    coarse = (
+        search if search.window % 2 else _Search(replace(design, dt=2 * dt), model, search.noise, search.window // 2)
+    )
+    begun = _begun(search, starts, seed)
+    asked, seen = _excited(search, begun, wanted)
+    found = jnp.concatenate([begun, coarse.improved(begun, asked, seen, steps)])
+    found = jnp.where(jnp.isfinite(found), found, 0.0)
+    best = search.kept(found[jnp.argmax(search.values(found, asked, seen))])
+    return _result(search, best, wanted, asked, seen)
+
+
+class _Search(eqx.Module):
+    design: Design
+    model: AbstractVectorField
+    noise: Float[Array, " d"]
+    window: int = eqx.field(static=True)
+
+    @eqx.filter_jit
+    def planned(self, coefficients: Coefficients) -> Trajectory:
+        return self.design.trajectory(coefficients, self.model)
+
+    @eqx.filter_jit
+    def information(self, x: Float[Array, "n+1 d"], u: Float[Array, "n m"]) -> Information:
+        return information_of(self.model, x, u, self.design.dt, self.window, self.noise)
+
+    def value(self, x, u, asked: Bool[Array, " p"], seen: Bool[Array, " p"]) -> Float[Array, ""]:
+        """log det of the inverse covariance of the parameters asked for, over their number."""
+        covariance = self.information(x, u).covariance(seen)
+        size = jnp.sqrt(jnp.where(asked, jnp.diagonal(covariance), 1.0))
+        scaled = jnp.where(asked & asked[:, None], covariance / (size * size[:, None]), jnp.eye(len(size)))
+        return -(jnp.linalg.slogdet(scaled)[1] + 2 * jnp.sum(jnp.log(size))) / jnp.sum(asked)
+
+    @eqx.filter_jit
+    def kept(self, coefficients: Coefficients) -> Coefficients:
+        """The series shrunk until it keeps the limits."""
+
+        def keeps(factor):
+            uses = self.design.uses(*self.planned(factor * coefficients))
+            return (uses <= SPARE).all()
+
+        inside = jax.lax.map(keeps, jnp.asarray(SHRUNK, coefficients.dtype))
+        return jnp.where(inside.any(), jnp.asarray(SHRUNK)[jnp.argmax(inside)], 0.0) * coefficients
+
+    @eqx.filter_jit
+    def values(self, found: Starts, asked, seen) -> Float[Array, " s"]:
+        """What each series tells once it keeps the limits, −∞ if nothing finite."""
+
+        def one(coefficients):
+            value = self.value(*self.planned(self.kept(coefficients)), asked, seen)
+            return jnp.where(jnp.isfinite(value), value, -jnp.inf)
+
+        return jax.lax.map(one, found)
+
+    # Equinox passes the options to jax.jit, but does not declare them.
+    @eqx.filter_jit(compiler_options=FAST_COMPILE)  # pyright: ignore[reportCallIssue]
+    def improved(self, begun: Starts, asked, seen, steps: int) -> Starts:
+        """The series after some steps of Adam."""
+
+        def loss(coefficients, penalty):
+            x, u = self.planned(coefficients)
+            excess = jnp.maximum(self.design.uses(x, u) - SPARE, 0.0)
+            return penalty * jnp.sum(jnp.mean(jnp.square(excess), axis=0)) - self.value(x, u, asked, seen)
+
+        adam = optax.chain(optax.zero_nans(), optax.adam(optax.cosine_decay_schedule(RATE, max(steps, 1))))
+
+        def step(carry, penalty):
+            coefficients, state = carry
+            slopes = jax.vmap(jax.grad(loss), in_axes=(0, None))(coefficients, penalty)
+            changes, state = adam.update(slopes, state)
+            return (coefficients + changes, state), None
+
+        return jax.lax.scan(step, (begun, adam.init(begun)), jnp.geomspace(*PENALTY, steps))[0][0]
+
+
+def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: float) -> Design:
+    for name, value in (("seconds", seconds), ("window", window), ("dt", dt), ("bandwidth", bandwidth)):
+        checks.positive(name, value)
+    if isinstance(bounds, FlightBounds) and seconds < 2 * RAMP:
+        raise ValueError(f"seconds must be at least {2 * RAMP:g}, as a flight starts and ends in hover, got {seconds}")
+    if abs(round(window / dt) * dt - window) > 1e-6 * window or not window <= seconds:
+        raise ValueError(f"window must be a multiple of dt {dt} and at most seconds {seconds}, got {window}")
+    if not 1 / seconds <= bandwidth <= 0.5 / dt:
+        raise ValueError(f"bandwidth must be between 1 / seconds and half of 1 / dt, in Hz, got {bandwidth}")
+    numbers = seconds, math.floor(bandwidth * seconds + 1e-9), dt
+    if isinstance(bounds, InputBounds):
+        return InputSeries(bounds, *numbers)
+    if not isinstance(bounds, FlightBounds):
+        raise ValueError(f"bounds must be FlightBounds or InputBounds, got {checks.short_repr(bounds)}")
+    parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
+    bodies = [part for part in parts if isinstance(part, AbstractRigidBody)]
+    if not bodies or any(getattr(part, "rotor_states", 0) for part in (model, *bodies)):
+        raise ValueError("bounds must be InputBounds, as the model is no multirotor that is told its rotor speeds")
+    vehicle = bodies[0].vehicle  # pyright: ignore[reportAttributeAccessIssue]
+    least, most = bounds.rotor_speed
+    if not least < vehicle.hover_speed / vehicle.max_rotor_speed < most or vehicle.rotors < 4:
+        share = vehicle.hover_speed / vehicle.max_rotor_speed
+        raise ValueError(
+            f"rotor_speed must allow hover, a share of {share:.2g}, on four rotors or more; got {bounds.rotor_speed}"
+        )
+    return FlatOutputs(vehicle, bounds, *numbers)
+
+
+def _noise(noise: Sequence[float] | None, states: int) -> Float[np.ndarray, " d"]:
+    if noise is None:
+        if states != STATE_SIZE:
+            raise ValueError(f"noise must be given: the standard deviation of each of {states} states")
+        sizes = np.zeros(STATE_SIZE, np.float32)
+        for part, size in NOISE:
+            sizes[part] = size
+        return sizes
+    sizes = np.asarray(checks.finite("noise", checks.real_array("noise", noise)), np.float32)
+    if sizes.shape != (states,) or not (sizes > 0).all():
+        raise ValueError(f"noise must be {states} positive numbers, got {checks.short_repr(noise)}")
+    return sizes
+
+
+def _wanted(model: AbstractVectorField, parameters: Sequence[str] | None) -> tuple[str, ...]:
+    known = named_parameters(model)
+    if parameters is None:
+        return tuple(name for name in known if not name.startswith("disturbance["))
+    if isinstance(parameters, str) or not parameters or not set(parameters) <= set(known):
+        raise ValueError(f"parameters must be names of {', '.join(known)}, got {checks.short_repr(parameters)}")
+    return tuple(dict.fromkeys(parameters))
+
+
+def _begun(search: _Search, starts: int, seed: int) -> Starts:
+    rest = jnp.zeros(search.design.shape)
+    uses = np.asarray(search.design.uses(*search.planned(rest))).max(axis=0, initial=0.0)
+    for name, use in zip(search.design.names, uses, strict=True):
+        if not use <= SPARE:
+            raise ValueError(f"bounds: {name} leaves its limits even at rest, with inputs in the middle of theirs")
+    draws = jax.random.normal(jax.random.key(seed), (starts, *search.design.shape))
+    return jax.lax.map(search.kept, draws / math.sqrt(search.design.harmonics))
+
+
+def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Array, " p"], Bool[Array, " p"]]:
+    """Which parameters are asked for and which have an effect, with a warning for those that are not both."""
+    names = list(named_parameters(search.model))
+    found = [search.planned(one) for one in begun]
+    each = [search.information(*flown) for flown in found]
+    gram = np.max([np.diagonal(one.gram) for one in each], axis=0)
+    x, u = (np.asarray(part) for part in found[0])
+    least = float(rounding(windows_of(x, u, search.design.dt, steps=search.window), search.noise)) ** 2
+    seen = jnp.asarray(gram > least)
+    for name in (name for name, known in zip(names, seen, strict=True) if not known):
+        warnings.warn(f"excitation: no input excites {name}; it is left out", stacklevel=3)
+    asked = jnp.asarray([name in wanted for name in names]) & seen
+    if not asked.any():
+        raise ValueError(f"parameters: no input excites any of {', '.join(wanted)}")
+    apart, shares = max((told_apart(one, seen, TOLD_APART) for one in each), key=lambda pair: pair[0])
+    if not apart:
+        alike = [name for name, share in zip(names, shares, strict=True) if share > 0.3]
+        raise ValueError(f"parameters: no input tells {' and '.join(alike)} apart; learn one of them")
+    return asked, seen
+
+
+def _result(search: _Search, best: Coefficients, wanted: tuple[str, ...], asked, seen) -> Excitation:
+    design, names = search.design, list(named_parameters(search.model))
+    x, u = search.planned(best)
+    covariance = np.asarray(search.information(x, u).covariance(seen), float)
+    theta, unravel = ravel_parameters(search.model)
+    slopes = jax.jvp(lambda theta: named_parameters(unravel(theta)), (theta,), (jnp.ones_like(theta),))[1]
+    own = np.flatnonzero(asked)
+    errors = dict.fromkeys(wanted, math.inf) | {
+        names[i]: abs(float(slopes[names[i]])) * math.sqrt(covariance[i, i]) for i in own
+    }
+    left = 1 - np.asarray(design.uses(x, u)).max(axis=0, initial=0.0)
+    return Excitation(
+        reference=design.path(best),
+        t=design.dt * np.arange(len(x)),
+        states=np.asarray(x),
+        inputs=np.asarray(u),
+        parameters=tuple(names[i] for i in own),
+        information=np.linalg.inv(covariance[np.ix_(own, own)]),
+        standard_errors=errors,
+        margins=dict(zip(design.names, left.tolist(), strict=True)),
+    )

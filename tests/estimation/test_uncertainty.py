@@ -1,0 +1,212 @@
+"""Laws of the covariance of θ_p, against closed forms, and of its intervals, against simulation."""
+
+from dataclasses import replace
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+from pendulum import pendulum, swings
+from rich.console import Console
+from test_least_squares import Brake, Push, log_lengths, pushes
+
+from experiments.paper import known_body
+from experiments.paper.known_body import KnownBody, coverage, known_body_table
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.estimation.least_squares import fit_least_squares
+from hybrid_jax.estimation.uncertainty import covariance_of, intervals
+from hybrid_jax.vehicle import IRIS
+
+SWINGS = swings(40)
+COVARIANCE = jnp.diag(jnp.array([0.01, 0.02, 0.03]) ** 2)  # of log Ix, log Iy, log k
+
+
+def closed_form(windows, design, gains, kind):
+    """The covariance of a linear problem, in double precision, as the docstring writes it."""
+    n, _, p = design.shape
+    errors = np.asarray(windows.x, float).reshape(n, -1) - design @ np.asarray(gains, float)
+    bread = np.linalg.inv(np.einsum("nip,niq->pq", design, design))
+    if kind == "homoscedastic":
+        return (errors**2).sum() / (errors.size - p) * bread
+    scores = np.einsum("nip,ni->np", design, errors)
+    return n / (n - p) * bread @ (scores.T @ scores) @ bread
+
+
+@pytest.mark.parametrize("kind", ["sandwich", "homoscedastic"])
+def test_a_linear_problem_meets_its_closed_form(kind):
+    windows, design = pushes(30, 0.1)
+    offset = 0.2 * np.random.default_rng(1).normal(size=(30, 1, 2))  # an error that a whole window shares
+    windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
+    field = fit_least_squares(Push(jnp.ones(2)), windows).field
+    expected = closed_form(windows, design, field.gains, kind)
+    np.testing.assert_allclose(covariance_of(field, windows, kind), expected, rtol=1e-4)  # float32 sums
+    # In pieces that do not divide the windows the sums are the same.
+    np.testing.assert_allclose(covariance_of(field, windows, kind, chunk=7), expected, rtol=1e-4)
+
+
+def test_under_white_noise_the_two_agree():
+    windows, _ = pushes(2000, 0.1)
+    field = fit_least_squares(Push(jnp.ones(2)), windows).field
+    sandwich, plain = (np.diag(covariance_of(field, windows, kind)) for kind in ("sandwich", "homoscedastic"))
+    # A variance from 2000 scores has a relative error of about √(3/2000) = 4 %; four of these.
+    np.testing.assert_allclose(sandwich, plain, rtol=0.16)
+
+
+def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
+    windows, design = pushes(60, 0.0)
+    rng = np.random.default_rng(2)
+    solve = np.linalg.pinv(design.reshape(-1, 2))
+    shared = np.repeat(rng.normal(size=(4000, 60, 1, 2)), 6, axis=2).reshape(4000, -1)
+    spread = (shared @ solve.T).std(axis=0)
+    seen = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(shared[0], np.float32).reshape(60, 6, 2))
+    field = fit_least_squares(Push(jnp.ones(2)), seen).field
+    sandwich, plain = (np.sqrt(np.diag(covariance_of(field, seen, kind))) for kind in ("sandwich", "homoscedastic"))
+    # A standard deviation from 60 scores is good to √(3/60) / 2 = 11 %; three of these.
+    np.testing.assert_allclose(sandwich, spread, rtol=0.34)
+    assert (plain < 0.7 * spread).all()
+
+
+def test_a_lane_is_the_covariance_alone():
+    lengths = (0.45, 0.55, 0.6)
+    together = eqx.filter_jit(eqx.filter_vmap(lambda field: covariance_of(field, SWINGS)))(log_lengths(*lengths))
+    alone = [covariance_of(pendulum(length), SWINGS) for length in lengths]
+    np.testing.assert_allclose(together, alone, rtol=1e-5)  # another order of float32 sums
+
+
+def test_a_residual_is_taken_as_given():
+    bare, hybrid = (covariance_of(field, SWINGS) for field in (pendulum(), Hybrid(pendulum(), Brake(jnp.array(0.0)))))
+    np.testing.assert_allclose(hybrid, bare, rtol=1e-5)  # float32
+
+
+@pytest.mark.parametrize(("level", "z"), [(0.6827, 1.0), (0.95, 1.95996)])  # of the normal distribution's table
+def test_an_interval_is_the_value_times_and_over_a_factor(level, z):
+    for field in (rigid_body(IRIS), Hybrid(rigid_body(IRIS), Push(jnp.ones(2)))):
+        found = intervals(field, COVARIANCE, level)
+        assert list(found) == ["Ix", "Iy", "k"]
+        for name, error in zip(found, (0.01, 0.02, 0.03), strict=True):
+            value, low, high = found[name]
+            assert value == rigid_body(IRIS).theta()[name]
+            np.testing.assert_allclose([high / value, value / low], np.exp(z * error), rtol=1e-5)  # float32
+
+
+def test_a_parameter_that_the_windows_do_not_depend_on_stays_and_may_be_anything():
+    windows, _ = pushes(30, 0.1)
+    still = eqx.tree_at(lambda w: w.u, windows, windows.u * np.float32([1, 0]))
+    first = np.float32([1, np.inf])  # the second state, which the second gain moves as well, does not count
+    found = fit_least_squares(Push(jnp.array([1.0, 7.0])), still, scale=first)
+    covariance = covariance_of(found.field, still, scale=first)
+    assert tuple(intervals(found.field, covariance)["gains[1]"]) == (7, -np.inf, np.inf)
+    # The other one is found as it is where the second is known.
+    known = covariance_of(found.field, still, scale=first, free=np.array([True, False]))
+    assert found.converged
+    assert 0 < known[0, 0] < np.inf
+    np.testing.assert_allclose(covariance[0, 0], known[0, 0] * 29 / 28, rtol=1e-5)  # the factor n / (n - p)
+
+
+class Sum(AbstractVectorField):
+    """ẋ = (a + b) u₀ + c u₁: no window tells a and b apart."""
+
+    a: Float[Array, ""]
+    b: Float[Array, ""]
+    c: Float[Array, ""]
+
+    def __call__(self, x, u):
+        return jnp.stack([(self.a + self.b) * u[0] + self.c * u[1], 0 * x[1]])
+
+
+@pytest.mark.parametrize("unit", [0.01, 0.3, 1.0, 7.0, 100.0])
+@pytest.mark.parametrize("cluster", [1, 6])
+def test_parameters_that_no_window_tells_apart_have_no_interval_and_others_have_theirs(unit, cluster):
+    windows, _ = pushes(30, 0.1, unit)
+    found = fit_least_squares(Sum(*map(jnp.array, (1.0, 0.5, 0.0))), windows)
+    variances = np.diagonal(covariance_of(found.field, windows, cluster=cluster))
+    assert np.isinf(variances[:2]).all()
+    alone = Sum(found.field.a + found.field.b, jnp.zeros(()), found.field.c)
+    known = covariance_of(alone, windows, cluster=cluster, free=np.array([True, False, True]))
+    factor = 1.0 if cluster > 1 else 28 / 27  # n - p
+    np.testing.assert_allclose(variances[2], known[2, 2] * factor, rtol=1e-3)
+
+
+def test_what_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
+        covariance_of(pendulum(), SWINGS[:1])
+    with pytest.raises(ValueError, match="kind must be one of sandwich, homoscedastic, got 'plain'"):
+        covariance_of(pendulum(), SWINGS, "plain")
+    with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
+        covariance_of(pendulum(), SWINGS, "homoscedastic", error=jnp.sum)
+    for level in (0.0, 1.0, 95, float("nan")):
+        with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
+            intervals(rigid_body(IRIS), COVARIANCE, level)
+
+
+REPEATS = 100
+
+
+@pytest.fixture(scope="module")
+def found():
+    return coverage(KnownBody(repeats=REPEATS), Console(quiet=True))
+
+
+@pytest.fixture(scope="module")
+def rows(found):
+    return {(row["case"], row["noise_on"], row["parameter"]): row for row in found}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("noise_on", ["targets", "all"])
+@pytest.mark.parametrize("name", ["Ix", "Iy", "k"])
+def test_intervals_cover_the_truth_of_exact_physics(noise_on, name, rows):
+    row = rows["exact physics", noise_on, name]
+    assert row["converged"] == 1
+    # 100 draws of 95 %: a standard deviation of 2.2 %, four of these down; all draws up are two and a half.
+    assert row["coverage"] > 0.95 - 4 * np.sqrt(0.95 * 0.05 / REPEATS)
+    # A half-width is 1.96 standard errors; the mean of 100 fits is within four of its own: there is no bias.
+    assert abs(row["bias"]) < 4 * row["half_width"] / 1.96 / np.sqrt(REPEATS)
+
+
+@pytest.mark.slow
+def test_intervals_miss_the_truth_when_the_vehicle_has_drag_that_the_model_has_not(rows):
+    """Drag pulls against the lean into the velocity, as a smaller k would."""
+    row = rows["unknown drag", "targets", "k"]
+    assert row["coverage"] < 0.5
+    # c v / m of drag against a lean of c v / (m g): c² E[v_x² + v_y²] / (m g)², with 2 m/s along each axis. The mean
+    # of 100 fits is good to 0.03 %; drag on what is vertical or beside the lean averages out.
+    np.testing.assert_allclose(row["bias"], -100 * 0.4**2 * 8 / (1.5 * 9.81) ** 2, atol=0.15)
+
+
+@pytest.mark.slow
+def test_the_table_has_a_line_for_every_case(found, rows):
+    lines = {tuple(line[:3]): line[3] for line in known_body_table(found, 0.95).lines}
+    assert lines.keys() == rows.keys()  # two truths, noise on targets or on all, three parameters
+    assert all(text.startswith(f"{100 * rows[case]['coverage']:.1f} ±") for case, text in lines.items())
+
+
+@pytest.mark.parametrize(
+    ("changed", "said"),
+    [
+        ({"n_train": 3}, "--known.n-train must be more than the 3 parameters, got 3"),
+        ({"repeats": 0}, "--known.repeats must be an integer of at least 1, got 0"),
+        ({"seed": -1}, "--known.seed must be an integer of at least 0, got -1"),
+        ({"level": 95.0}, "--known.level must be between 0 and 1, got 95.0"),
+        ({"noise_on": ()}, "--known.noise-on must be targets, all or both, got nothing"),
+        (
+            {"noise": known_body.Noise(body_rates=-1.0)},
+            "--known.noise.body-rates must be a finite number of at least 0",
+        ),
+        ({"drag": float("nan")}, "--known.drag must be a finite number of at least 0, got nan"),
+    ],
+)
+def test_options_that_make_no_sense_are_refused(changed, said):
+    with pytest.raises(ValueError, match=said):
+        coverage(replace(KnownBody(), **changed), Console(quiet=True))
+
+
+@pytest.mark.parametrize(("repeats", "batch"), [(100, 1), (25, 1), (25, 4), (3, 8)])
+def test_parts_of_one_size_hold_every_repeat_in_its_order(repeats, batch):
+    parts = known_body._parts(KnownBody(repeats=repeats, batch=batch))
+    together = np.concatenate([jax.random.key_data(part) for part in parts])
+    assert {len(part) for part in parts} == {len(together) // len(parts)}
+    np.testing.assert_array_equal(together[:repeats], jax.random.key_data(jax.random.split(jax.random.key(0), repeats)))

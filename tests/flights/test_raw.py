@@ -1,0 +1,59 @@
+"""Slow signals that a program drew as lines on a fast clock are read as the samples that they were."""
+
+import numpy as np
+import pytest
+
+from hybrid_jax.flights.formats.column_map import load_column_map, record_mapped
+from hybrid_jax.flights.formats.raw import uninterpolated
+
+
+def drawn(t, own, values):
+    return np.stack([np.interp(t, own, column) for column in values.T], axis=1)
+
+
+@pytest.mark.parametrize("beside", [0.0, 0.004])
+def test_lines_become_the_samples_at_their_bends(beside):
+    rng, t = np.random.default_rng(0), 0.01 * np.arange(501)
+    own = np.append(0.1 * np.arange(50) + beside * (np.arange(50) % 3 == 1), 5.0)
+    values = rng.normal(size=(51, 4))
+    values[30:33] = values[29] + np.arange(1, 4)[:, None] * 0.5  # a line over three intervals
+    found, rows = uninterpolated(t, drawn(t, own, values))
+    assert len(found) == len(own)
+    np.testing.assert_allclose(np.delete(found, [30, 31, 32]), np.delete(own, [30, 31, 32]), atol=1e-6)
+    np.testing.assert_allclose(rows, drawn(found, own, values), atol=1e-5)
+
+
+def test_a_line_over_a_gap_is_no_measurement():
+    t, own = 0.01 * np.arange(501), np.delete(0.1 * np.arange(51), np.arange(20, 29))
+    found, _ = uninterpolated(t, drawn(t, own, np.random.default_rng(3).normal(size=(42, 4))))
+    np.testing.assert_allclose(found, own, atol=1e-6)
+
+
+def test_noise_steps_and_rest_stay_as_they_are():
+    rng, t = np.random.default_rng(1), 0.01 * np.arange(500)
+    noise = rng.normal(size=(500, 3))
+    held = np.repeat(rng.normal(size=(50, 3)), 10, axis=0)
+    smooth = np.sin(3 * t)[:, None]
+    for values in (noise, held, smooth, 0 * noise, np.where(t[:, None] > 2, noise, 0.0), noise * np.nan):
+        assert uninterpolated(t, values)[1] is values
+
+
+def test_a_mapped_csv_says_which_columns_were_lines(tmp_path):
+    rng, t = np.random.default_rng(2), 0.01 * np.arange(501)
+    slow = drawn(t, 0.1 * np.arange(51), 1500 + rng.integers(-100, 100, size=(51, 4)))
+    rates = rng.normal(size=(501, 3))
+    names = ["t", "u0", "u1", "u2", "u3", "p", "q", "r"]
+    rows = [",".join(map(repr, row)) for row in np.column_stack([t, slow, rates]).tolist()]
+    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]))
+    (tmp_path / "map.toml").write_text(
+        'frames = { world = "NED", body = "FRD", velocity = "world" }\n'
+        'time = { columns = ["t"], unit = "s" }\n'
+        'body_rates = { columns = ["p", "q", "r"], unit = "rad/s" }\n'
+        'motors = { columns = ["u0", "u1", "u2", "u3"], unit = "pwm" }\n'
+    )
+    found = record_mapped(tmp_path / "log.csv", load_column_map(tmp_path / "map.toml"))
+    assert len(found.signals["command"]) == 51
+    assert len(found.signals["rates"]) == 501
+    (note,) = found.notes
+    assert "u0 u1 u2 u3" in note
+    assert "0.1 s apart" in note

@@ -1,0 +1,162 @@
+"""Laws of the causes of a change: which one is found, what stays as it was, and what lies outside them."""
+
+from functools import cache
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.integrate import rk4_step
+from hybrid_jax.online import OnlineAdaptation
+
+DT, NOISE, STEPS, CHANGE = 0.05, 0.01, 220, 80
+
+
+class Cart(hj.AbstractVectorField):
+    """ẍ = −stiffness x − friction ẋ + gain u + push."""
+
+    stiffness: jax.Array
+    friction: jax.Array
+    gain: jax.Array
+    push: jax.Array
+
+    def __call__(self, x, u):
+        force = -self.stiffness * x[0] - self.friction * x[1] + self.gain * u[0] + self.push
+        return jnp.stack([x[1], force])
+
+
+TRUTH = {"stiffness": 1.0, "friction": 0.5, "gain": 1.0, "push": 0.0}
+CAUSES = (
+    hj.Cause("spring", {"stiffness": 0.5}),
+    hj.Cause("damper", {"friction": 0.5}),
+    hj.Cause("load", together=({"stiffness": -0.3, "friction": -0.15, "gain": -0.3},)),
+    hj.Cause("wind", {"push": 1.0}, rates={"push": 0.5}, lead=0.2),
+)
+
+
+def cart(**changes):
+    return Cart(**{name: jnp.asarray(value, float) for name, value in (TRUTH | changes).items()})
+
+
+@cache
+def adaptation(causes=True):
+    return OnlineAdaptation(cart(), DT, NOISE, prior=0.5, process=0.01, causes=CAUSES if causes else ())
+
+
+@jax.jit
+def flown(after, key, rate=0.0):
+    """Samples and inputs of a cart whose parameters change at a step, and whose push then grows at a rate."""
+    u_key, noise_key = jax.random.split(key)
+    u = 2 * jax.random.normal(u_key, (STEPS, 1))
+
+    def step(x, given):
+        i, held = given
+        field = jax.tree.map(lambda a, b: jnp.where(i < CHANGE, a, b), cart(), after)
+        grown = field.push + rate * DT * jnp.maximum(i - CHANGE, 0)
+        x = rk4_step(Cart(field.stiffness, field.friction, field.gain, grown), x, held, DT)
+        return x, x
+
+    x = jax.lax.scan(step, jnp.zeros(2), (jnp.arange(STEPS), u))[1]
+    return x + NOISE * jax.random.normal(noise_key, x.shape), u
+
+
+@cache
+def watch(causes):
+    """One program for the runs of all tests."""
+    filter = adaptation(causes)
+
+    def run(samples, inputs):
+        def step(state, given):
+            state = filter.update(state, *given)
+            return state, state.trusted * jnp.asarray(filter.scales)
+
+        return jax.lax.scan(step, filter.begin(jnp.zeros(2)), (samples, inputs))
+
+    return jax.jit(run)
+
+
+def watched(causes, after, seeds=6, rate=0.0):
+    """The last state of the filter of each run, and the θ of its model after each sample."""
+    runs = [watch(causes)(*flown(after, key, rate)) for key in jax.random.split(jax.random.key(3), seeds)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *runs)
+
+
+def errors(theta, after):
+    """The mean distance of the last θ from the truth."""
+    true = np.stack([getattr(after, name) - TRUTH[name] for name in adaptation().names])
+    return np.mean(np.linalg.norm(theta[:, -40:] - true, axis=-1))
+
+
+def test_until_a_change_the_model_stays_exactly_as_it_was():
+    found, theta = watched(True, cart())
+    assert not found.changes.any()
+    np.testing.assert_array_equal(theta, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "after"),
+    [
+        ("spring", {"stiffness": 1.6}),
+        ("damper", {"friction": 1.2}),
+        ("load", {"stiffness": 0.7, "friction": 0.35, "gain": 0.7}),
+    ],
+)
+def test_a_cause_is_found_and_told_better_than_by_all_parameters(name, after):
+    found, theta = watched(True, cart(**after))
+    assert (found.changes > 0).all()
+    place = 2 + [cause.name for cause in CAUSES].index(name)
+    kind = found.mixture.before + np.where(found.mixture.odds[:, 1:-1] == 0, 1.0, 0.0)
+    assert (kind[:, place - 1] > 0).mean() >= 0.8
+    assert errors(theta, cart(**after)) < 0.8 * errors(watched(False, cart(**after))[1], cart(**after))
+
+
+def test_what_is_outside_all_causes_is_found_no_worse_than_by_the_filter_of_all():
+    """Two things at once, which only the filter of all parameters explains."""
+    both = cart(stiffness=1.8, gain=0.5, push=0.6)
+    found, alone = (errors(watched(causes, both, seeds=24)[1], both) for causes in (True, False))
+    assert found < 1.15 * alone
+
+
+def test_a_push_that_grows_is_delivered_ahead():
+    ahead, rate = CAUSES[-1].lead, 0.15
+    _, theta = watched(True, cart(push=0.5), rate=rate)
+    push = adaptation().names.index("push")
+    wanted = 0.5 + rate * (DT * (STEPS - 1 - CHANGE) + ahead)
+    np.testing.assert_allclose(theta[:, -1, push].mean(), wanted, atol=0.12)
+
+
+def test_intervals_hold_the_truth_with_and_without_a_number_of_their_own():
+    after = cart(stiffness=1.6)
+    found, _ = watched(True, after, seeds=12)
+    inside = []
+    for i in range(12):
+        made = adaptation().intervals(jax.tree.map(lambda leaf, i=i: leaf[i], found))
+        inside += [made[name].low <= getattr(after, name) <= made[name].high for name in TRUTH]
+        assert all(made[name].high > made[name].low for name in TRUTH)
+    assert np.mean(inside) >= 0.85
+
+
+def test_bad_samples_keep_the_model_and_its_weights():
+    filter = adaptation()
+    state = jax.tree.map(lambda leaf: leaf[0], watched(True, cart(stiffness=1.6))[0])
+    update = jax.jit(lambda *given: filter.update(*given))
+    for _ in range(6):
+        after = update(state, jnp.full(2, jnp.nan), jnp.zeros(1))
+        np.testing.assert_allclose(after.trusted, state.trusted, atol=1e-3)
+        np.testing.assert_allclose(after.mixture.odds, state.mixture.odds, atol=1e-6)
+        state = after
+    assert filter.flags(state).gap
+    assert state.restarts == 0
+
+
+def test_causes_that_cannot_be_are_refused():
+    for make, words in (
+        (lambda: hj.Cause("none"), "cause none: it must have a parameter"),
+        (lambda: hj.Cause("a", {"push": 0.0}), "cause a: push must be"),
+        (lambda: hj.Cause("a", {"push": 1.0}, rates={"gain": 1.0}), "cause a: rates of gain"),
+        (lambda: OnlineAdaptation(cart(), DT, NOISE, causes=(hj.Cause("a", {"pusch": 1.0}),)), "pusch must be among"),
+    ):
+        with pytest.raises(ValueError, match=words):
+            make()

@@ -1,0 +1,265 @@
+"""Laws of adaptation while a system runs."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.disturbance import disturbance_of, disturbed, with_disturbance
+from hybrid_jax.integrate import rk4_step
+from hybrid_jax.online import OnlineAdaptation, Tuning
+
+DT, NOISE = 0.05, 0.01
+CALM = Tuning(caution=0.0, alarm=1e3, forgetting=0.0, drift=0.0, clip=1e3)  # the plain Kalman filter
+
+
+class Slide(hj.AbstractVectorField):
+    """ẋ = u − c x, and a parameter that no data show."""
+
+    friction: jax.Array
+    idle: jax.Array
+
+    def __call__(self, x, u):
+        return u - self.friction * x + 0 * self.idle
+
+
+class Pushed(hj.AbstractVectorField):
+    """ẋ = u + p, linear in state and parameter together."""
+
+    push: jax.Array
+
+    def __call__(self, x, u):
+        return u + self.push
+
+
+class Towed(hj.AbstractVectorField):
+    """ẋ = u − c x + p."""
+
+    friction: jax.Array
+    push: jax.Array | float
+
+    def __call__(self, x, u):
+        return u - self.friction * x + self.push
+
+
+SLIDE = Slide(jnp.array(1.0), jnp.array(1.0))
+
+
+def run(field, steps, seed=0, change=None, noise=NOISE):
+    """Samples and inputs of a slide, whose friction is another from a step on."""
+    rng = np.random.default_rng(seed)
+    u = 2 * rng.normal(size=(steps, 1)).astype(np.float32)
+    fields = [change[1] if change and i >= change[0] else field for i in range(steps)]
+    x, samples, step = jnp.zeros(1), [], eqx.filter_jit(rk4_step)
+    for one, held in zip(fields, u, strict=True):
+        x = step(one, x, jnp.asarray(held), DT)
+        samples.append(np.asarray(x) + noise * rng.normal(size=1))
+    return np.array(samples, np.float32), u
+
+
+@eqx.filter_jit
+def watch(adaptation, samples, inputs, elapsed=None):
+    """The states of the filter after each sample."""
+    elapsed = jnp.ones(len(samples)) if elapsed is None else elapsed
+    start = adaptation.begin(jnp.zeros(samples.shape[1]))
+
+    def step(state, given):
+        state = adaptation.update(state, *given)
+        return state, state
+
+    return jax.lax.scan(step, start, (samples, inputs, elapsed))[1]
+
+
+def last(states):
+    return jax.tree.map(lambda leaf: leaf[-1], states)
+
+
+def kalman(samples, inputs, prior):
+    """The textbook filter of z = [x, p] for ẋ = u + p, in double precision."""
+    z, covariance = np.zeros(2), np.diag([NOISE**2, prior**2])
+    ahead, row = np.array([[1, DT], [0, 1]]), np.array([1.0, 0.0])
+    for (y,), (u,) in zip(samples.astype(float), inputs.astype(float), strict=True):
+        z, covariance = ahead @ z + [DT * u, 0], ahead @ covariance @ ahead.T
+        gain = covariance @ row / (covariance[0, 0] + NOISE**2)
+        z, covariance = z + gain * (y - z[0]), covariance - np.outer(gain, covariance[0])
+    return z, covariance
+
+
+def test_on_a_linear_system_it_is_the_kalman_filter():
+    samples, inputs = run(Pushed(jnp.array(0.4)), 60)
+    adaptation = OnlineAdaptation(Pushed(jnp.array(0.0)), DT, NOISE, prior=0.5, tuning=CALM)
+    found, (z, covariance) = last(watch(adaptation, samples, inputs)), kalman(samples, inputs, 0.5)
+    scales = np.array([1.0, 0.5])
+    np.testing.assert_allclose(np.concatenate([found.x, 0.5 * found.theta]), z, atol=2e-5)
+    np.testing.assert_allclose(scales[:, None] * found.covariance * scales, covariance, rtol=1e-2, atol=1e-8)
+
+
+@cache
+def adaptation():
+    return OnlineAdaptation(SLIDE, DT, NOISE, prior=0.5)
+
+
+def test_intervals_hold_what_is_found_after_a_change():
+    """Of twenty runs at least 16 must contain the true value, which 95 % intervals miss once in 400 times."""
+    changed = Slide(jnp.array(1.8), jnp.array(1.0))
+    runs = [run(SLIDE, 160, seed, (60, changed)) for seed in range(20)]
+    states = jax.vmap(lambda s, u: watch(adaptation(), s, u))(*(jnp.stack(part) for part in zip(*runs, strict=True)))
+    inside = 0
+    for i in range(20):
+        found = adaptation().intervals(jax.tree.map(lambda leaf, i=i: leaf[i, -1], states))["friction"]
+        assert found.high - found.low < 0.4
+        inside += bool(found.low <= 1.8 <= found.high)
+    assert inside >= 16
+    assert (states.changes[:, 59] == 0).mean() >= 0.8
+    assert (states.changes[:, 100] > 0).mean() >= 0.9
+
+
+def test_without_a_change_the_estimate_stays_within_its_interval():
+    states = watch(adaptation(), *run(SLIDE, 200, seed=5))
+    assert states.changes[-1] == 0
+    away = jnp.abs(states.theta[50:, 0]) / jnp.sqrt(states.covariance[50:, 1, 1])
+    assert away.max() < 3.5
+
+
+def test_a_parameter_that_nothing_excites_is_reported_and_stays():
+    state = last(watch(adaptation(), *run(SLIDE, 100)))
+    names, flags = adaptation().names, adaptation().flags(state)
+    assert dict(zip(names, flags.unexcited.tolist(), strict=True)) == {"friction": False, "idle": True}
+    assert state.theta[names.index("idle")] == 0
+
+
+SPOILED = {
+    "missing": lambda x, u: (x.at[50:90].set(jnp.nan), u),
+    "infinite": lambda x, u: (x.at[50:90].set(jnp.inf), u),
+    "unknown input": lambda x, u: (x, u.at[50:90].set(jnp.nan)),
+    "frozen": lambda x, u: (x.at[50:90].set(x[50]), u),
+}
+
+
+@pytest.mark.parametrize("name", SPOILED)
+def test_bad_samples_keep_the_last_good_estimate(name):
+    samples, inputs = SPOILED[name](*map(jnp.asarray, run(SLIDE, 90)))
+    states = watch(adaptation(), samples, inputs)
+    flags = adaptation().flags(last(states))
+    np.testing.assert_allclose(states.trusted[-1], states.trusted[51], atol=0.2)
+    assert np.isfinite(jax.tree.leaves(eqx.filter(last(states), eqx.is_array))[2]).all()
+    assert states.restarts[-1] == 0
+    if name != "unknown input":
+        assert flags.missing.all()
+        assert flags.gap
+        assert flags.frozen.all() == (name == "frozen")
+
+
+def test_after_a_gap_it_goes_on_from_the_sample():
+    samples, inputs = map(jnp.asarray, run(SLIDE, 120))
+    jumped = jnp.concatenate([samples[:60], samples[80:]]), jnp.concatenate([inputs[:60], inputs[80:]])
+    elapsed = jnp.ones(100).at[60].set(21.0)
+    states = watch(adaptation(), *jumped, elapsed)
+    assert adaptation().flags(jax.tree.map(lambda leaf: leaf[60], states)).gap
+    np.testing.assert_allclose(states.x[60], samples[80], atol=1e-6)
+    np.testing.assert_allclose(states.trusted[60], states.trusted[59], atol=1e-6)
+    assert states.changes[-1] == 0
+
+
+def test_what_the_model_cannot_explain_is_not_believed():
+    samples, inputs = run(SLIDE, 120)
+    samples[60:] += 3 * np.random.default_rng(1).normal(size=(60, 1))  # the sensor has broken
+    states = watch(adaptation(), samples, inputs)
+    assert adaptation().flags(last(states)).inconsistent
+    rejected = np.flatnonzero(np.asarray(states.nis) >= adaptation().tuning.reject)
+    np.testing.assert_array_equal(states.trusted[-1], states.trusted[rejected[0] - 1])
+
+
+def test_a_field_that_has_a_disturbance_is_adapted_with_it_or_keeps_it():
+    pushed = disturbed(SLIDE, jnp.array([0.5]), (0,))
+    samples, u = run(pushed, 100)
+    held = watch(OnlineAdaptation(pushed, DT, NOISE), samples, u)
+    assert OnlineAdaptation(pushed, DT, NOISE).names[-1] == "disturbance[0]"
+    assert not held.theta[:, -1].any()
+    learning = OnlineAdaptation(with_disturbance(SLIDE, (0,)), DT, NOISE, disturbance=1.0, tuning=CALM)
+    found = learning.model(jax.tree.map(lambda leaf: leaf[-1], watch(learning, samples, u)))
+    assert disturbance_of(found).value == pytest.approx([0.5], abs=0.05)
+
+
+def test_a_run_beside_others_is_the_run_alone():
+    runs = [run(SLIDE, 40, seed) for seed in range(3)]
+    together = jax.vmap(lambda s, u: watch(adaptation(), s, u))(*(jnp.stack(part) for part in zip(*runs, strict=True)))
+    alone = watch(adaptation(), *runs[1])
+    np.testing.assert_allclose(together.theta[1], alone.theta, atol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        ({"prior": {"frition": 0.1}}, "prior: frition: must be among friction, idle"),
+        ({"prior": {"friction": 0.1}}, "prior: idle must be given, 0 if it is to stay as it is"),
+        ({"prior": 0.0}, "prior must be positive for a parameter at least, got 0 for all"),
+        ({"disturbance": 1.0}, "indices must say"),
+        (
+            {"disturbance": (1.0, 1.0), "indices": (0,)},
+            "disturbance must be one number, or one for each of 1 disturbed",
+        ),
+        ({"disturbance": 1.0, "indices": (0, 0)}, "indices must be different integers of at least 0, got"),
+        ({"initial": 0.0}, "initial must be"),
+        ({"initial": "a"}, "initial must be a share above 0 and at most 1, got 'a'"),
+        ({"noise": 0.0}, "noise must be"),
+        ({"tuning": "x"}, "tuning must be a Tuning, got 'x'"),
+        ({"causes": hj.Cause("a", {"friction": 0.3})}, "causes must be a list of Cause, got Cause"),
+        ({"causes": ("friction",)}, "causes must be a list of Cause, got"),
+        (
+            {"prior": {"friction": 0.1, "idle": 0.0}, "causes": [hj.Cause("a", {"idle": 1})]},
+            "cause a: idle must be among",
+        ),
+        ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
+    ],
+)
+def test_a_filter_that_makes_no_sense_is_refused(options, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        OnlineAdaptation(**({"field": SLIDE, "dt": DT, "noise": NOISE} | options))
+
+
+@pytest.mark.parametrize(
+    ("options", "x", "said"),
+    [
+        ({"noise": (NOISE, NOISE)}, [0.0], "noise must be one number, or one for each of the 1 of x, got 2"),
+        ({"process": (0.1, 0.1)}, [0.0], "process must be one number, or one for each of the 1 of x, got 2"),
+        (
+            {"disturbance": 1.0, "indices": (3,)},
+            [0.0],
+            "indices must be different integers of at least 0 and at most 0",
+        ),
+        ({}, [[0.0]], r"x must be one sample \(d,\), got shape \(1, 1\)"),
+    ],
+)
+def test_a_first_sample_of_another_size_is_refused(options, x, said):
+    with pytest.raises(ValueError, match=f"^{said}"):
+        OnlineAdaptation(SLIDE, DT, **({"noise": NOISE} | options)).begin(x)
+
+
+def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
+    state = adaptation().begin([0.0])
+    assert eqx.tree_equal(adaptation().update(state, [0.1], [1]), adaptation().update(state, np.array([0.1]), [1.0]))
+    with pytest.raises(ValueError, match=r"^x must be one sample \(1,\), as the state is, got shape \(2,\)"):
+        adaptation().update(state, [0.0, 0.0], [0.0])
+    with pytest.raises(ValueError, match=r"^elapsed must be a finite number of at least 0, got -1"):
+        adaptation().update(state, [0.0], [0.0], elapsed=-1)
+
+
+@pytest.mark.parametrize("causes", [(), (hj.Cause("push", {"push": 1.0}),)], ids=["alone", "causes"])
+def test_a_parameter_with_a_prior_of_zero_is_held(causes):
+    field, prior = Towed(jnp.array(1.0), jnp.array(0.0)), {"friction": 0.0, "push": 1.0}
+    state = last(watch(OnlineAdaptation(field, DT, NOISE, prior, causes=causes), *run(Towed(field.friction, 0.7), 150)))
+    held = OnlineAdaptation(field, DT, NOISE, prior, causes=causes)
+    found, intervals = held.model(state), held.intervals(state)
+    assert found.friction == intervals["friction"].low == intervals["friction"].high == field.friction
+    assert intervals["push"].low < 0.7 < intervals["push"].high
+    assert state.restarts == 0
+
+
+def test_a_tuning_that_makes_no_sense_is_refused():
+    with pytest.raises(ValueError, match="pause must be"):
+        Tuning(pause=-1.0)

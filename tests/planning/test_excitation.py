@@ -1,0 +1,162 @@
+"""The experiment that tells parameters best: known optima, limits, what is predicted, and what is refused."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.control.references import reference_state
+from hybrid_jax.planning.fisher_information import information_of
+from hybrid_jax.trajectories import windows_of
+
+DT, NOISE = 0.02, 0.05
+ONE = jnp.ones(1, bool)
+
+
+class Pushed(hj.AbstractVectorField):
+    """ẋ = b u − a x, and c, which nothing shows."""
+
+    a: jax.Array | float = 0.0
+    b: jax.Array | float = 1.0
+    c: jax.Array | float = 1.0
+
+    def __call__(self, x, u):
+        return self.b * u - self.a * x + 0 * self.c
+
+
+class Doubled(hj.AbstractVectorField):
+    """ẋ = (a + b) u."""
+
+    a: jax.Array
+    b: jax.Array
+
+    def __call__(self, x, u):
+        return (self.a + self.b) * u
+
+
+def search(model, bounds, parameters=None, **options):
+    given = {"seconds": 2.0, "noise": [NOISE], "window": 0.1, "dt": DT, "bandwidth": 2.0, "starts": 2}
+    return hj.excitation(model, parameters, bounds, **given | options)
+
+
+FREE = hj.InputBounds(low=(-2.0,), high=(1.0,), start=(0.0,))
+GAIN = Pushed(b=jnp.array(0.7))
+
+
+def test_the_best_input_of_an_integrator_is_at_its_larger_limit_throughout():
+    """J of a sample is t u, so each window tells u² ∫t², and the larger limit is the best for all of them."""
+    found = search(GAIN, FREE)
+    u = jnp.full((100, 1), -2.0)
+    x = jnp.concatenate([jnp.zeros((1, 1)), DT * jnp.cumsum(0.7 * u, axis=0)])
+    best = jax.jit(lambda x, u: information_of(GAIN, x, u, DT, 5, jnp.array([NOISE])).covariance(ONE))(x, u)
+    assert found.inputs.min() >= -2.0
+    assert np.mean(found.inputs) < -1.9
+    assert found.standard_errors["b"] == pytest.approx(float(jnp.sqrt(best[0, 0])), rel=0.03)
+    # By hand: one window of N samples at t_i has σ²(Σt² + (Σt)²) / (Σt²)² with a noisy start; sharing samples helps.
+    t = DT * np.arange(1, 6)
+    alone = NOISE**2 * (np.sum(t**2) + np.sum(t) ** 2) / (4 * np.sum(t**2) ** 2)
+    assert found.standard_errors["b"] < np.sqrt(alone / 20)
+
+
+def test_a_box_makes_the_input_switch_and_is_kept():
+    """The state may move by 0.5 only, a quarter of a second at full push, so the input must turn round."""
+    bounds = hj.InputBounds((-2.0,), (2.0,), (0.0,), state_low=(-0.5,), state_high=(0.5,))
+    found = search(GAIN, bounds, steps=100)
+    assert found.margins["x0"] >= 0
+    assert np.abs(found.states).max() <= 0.5
+    assert np.abs(np.diff(np.sign(found.inputs[:, 0]))).sum() > 0
+    assert found.log_det > search(GAIN, bounds, steps=0).log_det
+
+
+def test_predicted_errors_are_those_of_least_squares():
+    """Of 300 noisy logs of one input, whose windows share samples; 12 % are three standard errors of a deviation."""
+    model = Pushed(a=jnp.array(1.5), b=jnp.array(1.0))
+    found = search(model, FREE, steps=0)
+    u = jnp.asarray(found.inputs)
+
+    def fit(key):
+        log = found.states + NOISE * jax.random.normal(key, found.states.shape)
+        windows = hj.Trajectories(log[:-1:5], u.reshape(-1, 5, 1), log[1:].reshape(-1, 5, 1), DT)
+        field = hj.fit_least_squares(model, windows, scale=jnp.array([NOISE])).field
+        return jnp.stack(jax.tree.leaves(field)[:2])
+
+    spread = np.std(jax.jit(jax.vmap(fit))(jax.random.split(jax.random.key(0), 300)), axis=0)
+    assert spread == pytest.approx([found.standard_errors[name] for name in "ab"], rel=0.12)
+
+
+def test_a_parameter_that_nothing_excites_is_named():
+    model = Pushed(b=jnp.array(0.7), c=jnp.array(2.0))
+    with pytest.warns(UserWarning, match="no input excites c"):
+        found = search(model, FREE, ("b", "c"), steps=0)
+    assert found.standard_errors["c"] == np.inf
+    assert found.parameters == ("b",)
+    with pytest.warns(UserWarning, match="excites c"), pytest.raises(ValueError, match="no input excites any of c"):
+        search(model, FREE, ("c",), steps=0)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"parameters": ("d",)}, r"parameters must be names of b, got \('d',\)"),
+        ({"model": Doubled(jnp.array(1.0), jnp.array(2.0))}, "no input tells a and b apart"),
+        ({"bounds": hj.FlightBounds()}, "bounds must be InputBounds"),
+        ({"bounds": hj.InputBounds((-1.0,), (1.0,), (2.0,), (-1.0,), (1.0,))}, "x0 leaves its limits even at rest"),
+        ({"noise": None}, "noise must be given"),
+        ({"noise": [0.0]}, "noise must be 1 positive numbers"),
+        ({"window": 0.05}, "window must be a multiple of dt"),
+        ({"bandwidth": 0.1}, "bandwidth must be between"),
+        ({"starts": 0}, "starts must be an integer of at least 1"),
+    ],
+)
+def test_bad_input_is_refused_in_one_line(change, said):
+    given = {"model": GAIN, "bounds": FREE, "steps": 0} | change
+    with pytest.raises(ValueError, match=said) as refused:
+        search(**given)
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("make", "said"),
+    [
+        (lambda: hj.FlightBounds(low=(0.0, 0.0, 2.0), high=(1.0, 1.0, 1.0)), "low must be below high"),
+        (lambda: hj.FlightBounds(tilt=2.0), "tilt must be between"),
+        (lambda: hj.FlightBounds(speed=0.0), "speed must be a positive"),
+        (lambda: hj.FlightBounds(rotor_speed=(0.5, 1.2)), "two shares between 0 and 1"),
+        (lambda: hj.InputBounds((0.0,), (1.0, 2.0), (0.0,)), "equally many"),
+        (lambda: hj.InputBounds((0.0,), (1.0,), (0.0,), state_low=(0.0,)), "given together"),
+    ],
+)
+def test_an_empty_box_is_refused(make, said):
+    with pytest.raises(ValueError, match=said):
+        make()
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """A flight after no step of the search, the best of its starts, and after a few."""
+    model = hj.with_disturbance(hj.rigid_body(hj.IRIS))
+    given = {"seconds": 3.0, "bandwidth": 1.0, "starts": 2, "dt": DT}
+    return [hj.excitation(model, ("Ix", "k"), hj.FlightBounds(), **given, steps=steps) for steps in (0, 40)]
+
+
+@pytest.mark.slow
+def test_a_flight_tells_more_than_any_start_and_keeps_its_limits(flights):
+    begun, found = flights
+    assert found.log_det > begun.log_det
+    assert all(left >= 0 for left in [*begun.margins.values(), *found.margins.values()])
+    assert found.parameters == ("Ix", "k")
+    for name, value in {"Ix": hj.IRIS.inertia[0], "k": hj.IRIS.thrust_coefficient}.items():
+        assert 0 < found.standard_errors[name] < value
+
+
+@pytest.mark.slow
+def test_a_flight_is_what_its_reference_says_and_the_vehicle_can_do(flights):
+    found = flights[1]
+    wanted = jax.vmap(lambda t: reference_state(found.reference, t, hj.IRIS.gravity))(jnp.asarray(found.t))
+    np.testing.assert_allclose(found.states, wanted, atol=1e-3)
+    windows = windows_of(found.states, found.inputs, DT, steps=1)
+    predicted = hj.rollout_batch(hj.rigid_body(hj.IRIS), windows.x0, windows.u, DT)
+    # Rotor speeds are held, so the plan is met to the order of the interval.
+    np.testing.assert_allclose(predicted, windows.x, atol=0.02)
+    assert np.abs(found.states[0] - found.states[-1]).max() < 1e-3
