@@ -7,11 +7,8 @@ from importlib import util
 import pytest
 from smoke import ROOT
 
-import hybrid_jax
-
 DOCS = ROOT / "docs"
 PACKAGES = sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py"))
-TOP = DOCS / "api" / "hybrid_jax.md"
 WIDEST = 120  # characters of a line, and of a cell without the targets of its links
 TARGET = re.compile(r"\]\([^)]*\)|\]\[[^\]]*\]")
 
@@ -40,11 +37,6 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, kept_programs):
     module = util.module_from_spec(spec)
     monkeypatch.setitem(sys.modules, name, module)
     spec.loader.exec_module(module)
-
-
-def test_every_name_at_the_top_is_in_an_example_that_runs():
-    code = "\n".join(blocks(TOP))
-    assert [name for name in hybrid_jax.__all__ if name[0] != "_" and not re.search(rf"\bhj\.{name}\b", code)] == []
 
 
 def test_every_package_has_a_page():
