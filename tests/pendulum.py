@@ -41,3 +41,17 @@ def swings(count, steps=8, seed=0, dt=0.05, damping=DAMPING, length=LENGTH):
     x0 = jnp.asarray(rng.uniform(-1, 1, (count, 2)) * [2.0, 4.0], np.float32)
     u = jnp.asarray(rng.normal(size=(count, steps, 1)) * 3, np.float32)
     return Trajectories(x0, u, jax.jit(rollout_batch)(pendulum(length, damping), x0, u, dt), dt)
+
+
+class Brake(AbstractVectorField):
+    """What a pendulum without damping lacks, as a residual that could be learned."""
+
+    damping: Float[Array, ""]
+
+    def __call__(self, x, u):
+        return jnp.stack([jnp.zeros_like(x[0]), -self.damping * x[1]])
+
+
+def log_lengths(*lengths):
+    """Stacked pendulums."""
+    return eqx.tree_at(lambda field: field.log_length, pendulum(), jnp.log(jnp.array(lengths)))

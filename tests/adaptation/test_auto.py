@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from pendulum import LENGTH, pendulum, swings
-from test_least_squares import Push, pushes
+from pushes import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import Auto, FineTune, adapt

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy
 from pendulum import LENGTH, pendulum, swings
-from test_least_squares import Push, pushes
+from pushes import Push, pushes
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation.pooling import combined

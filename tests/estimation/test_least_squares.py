@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from jaxtyping import Array, Float
-from pendulum import LENGTH, pendulum, swings
+from pendulum import LENGTH, Brake, log_lengths, pendulum, swings
+from pushes import Push, pushes
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
@@ -18,42 +18,6 @@ from hybrid_jax.vehicle import IRIS
 
 _mse, _flown = eqx.filter_jit(rollout_mse), eqx.filter_jit(rollout_batch)
 EXACT, DAMPED = swings(40, damping=0.0), swings(40)  # of a pendulum as the model has it, and of one with damping
-
-
-class Push(AbstractVectorField):
-    """ẋ = (a u₀ + b u₁, b u₀): linear in its parameters, so least squares has a closed form."""
-
-    gains: Float[Array, " 2"]
-
-    def __call__(self, x, u):
-        a, b = self.gains
-        return jnp.stack([a * u[0] + b * u[1], b * u[0]])
-
-
-class Brake(AbstractVectorField):
-    """What a pendulum without damping lacks, as a residual that could be learned."""
-
-    damping: Float[Array, ""]
-
-    def __call__(self, x, u):
-        return jnp.stack([jnp.zeros_like(x[0]), -self.damping * x[1]])
-
-
-def pushes(count, noise, unit=1.0, steps=6, dt=0.1):
-    """Windows of Push(3, −2) with white noise on the states, gains in units of `unit`; and ∂x/∂gains (n, t·d, 2)."""
-    rng = np.random.default_rng(0)
-    u = rng.normal(size=(count, steps, 2)) / unit
-    reached = dt * np.cumsum(u, axis=1)
-    zero = np.zeros((count, steps))
-    design = np.stack([np.stack([reached[..., 0], zero], -1), reached[..., ::-1]], -1)
-    x = design @ [3.0 * unit, -2.0 * unit] + noise * rng.normal(size=(count, steps, 2))
-    windows = Trajectories(np.zeros((count, 2), np.float32), u.astype(np.float32), x.astype(np.float32), dt)
-    return windows, design.reshape(count, -1, 2)
-
-
-def log_lengths(*lengths):
-    """Stacked pendulums."""
-    return eqx.tree_at(lambda field: field.log_length, pendulum(), jnp.log(jnp.array(lengths)))
 
 
 def test_in_double_precision_the_fit_is_exact_to_more_digits():

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from test_least_squares import Push, pushes
+from pushes import Push, pushes
 
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.disturbance import with_disturbance

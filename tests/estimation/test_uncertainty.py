@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
-from pendulum import pendulum, swings
+from pendulum import Brake, log_lengths, pendulum, swings
+from pushes import Push, pushes
 from rich.console import Console
-from test_least_squares import Brake, Push, log_lengths, pushes
 
 from experiments.paper import known_body
 from experiments.paper.known_body import KnownBody, coverage, known_body_table
