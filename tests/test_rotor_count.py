@@ -12,7 +12,7 @@ import hybrid_jax as hj
 from hybrid_jax.control import Controller
 from hybrid_jax.export.program import sizes_of
 from hybrid_jax.flights.checks.consistency import OK, check_log
-from hybrid_jax.flights.checks.readings import respond
+from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import Domain

@@ -22,7 +22,7 @@ from hybrid_jax import checks, runtime
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.measurement import MEASURED
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
-from hybrid_jax.flights.reading import find_logs, read_recording
+from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification.fitting import identify, identify_in_turn
 from hybrid_jax.identification.recordings import Initial, Layout

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from experiments.runner.command import ChecksFailed
+from experiments.runner.flags import in_flags
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
@@ -67,7 +68,7 @@ def check_consistent(recordings: Sequence[Recording], field: Any, learn: Sequenc
 
 def _require(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
     needed = [(Path(log.name).name, [each for each in checks if each.name not in NOT_NEEDED]) for log, checks in found]
-    lines = [line for name, checks in needed for line in failures(checks, name)]
+    lines = [in_flags("identify", line) for name, checks in needed for line in failures(checks, name)]
     if lines and not anyway:
         raise ChecksFailed(*lines, MEND)
     return lines

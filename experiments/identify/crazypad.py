@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.corrected_body import CorrectedBody
 from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.flights.checks.airborne import airborne
-from hybrid_jax.flights.reading import read_recording
+from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify
 from hybrid_jax.identification.recordings import Layout

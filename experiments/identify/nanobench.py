@@ -28,8 +28,8 @@ from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.formats.column_map import load_column_map
+from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.reading import read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.scores import errors_between
 from hybrid_jax.flights.windows import cut_windows

@@ -2,7 +2,7 @@
 
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated
 
@@ -14,14 +14,12 @@ from experiments.inspect_logs.page import Inspected, write_page
 from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.real_flight.config import read_topics
 from experiments.runner import command
+from experiments.runner.flags import in_flags
 from experiments.runner.options import Positive, check_numbers
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, check_log
-from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.formats.column_map import load_column_map
-from hybrid_jax.flights.load import Reading, asked_interval, read_log
+from hybrid_jax.flights.load import RawLog, find_logs, read_log, read_recording
 from hybrid_jax.flights.log import even_segments
-from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.flights.windows import require_length
 from hybrid_jax.io.files import json_value, write_atomic
@@ -107,24 +105,24 @@ def inspect(options: Options) -> None:
 def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
     """Read and check one log; what refuses it is part of the result."""
     try:
-        columns = None if options.columns is None else load_column_map(options.columns)
-        reading = _read(path, columns, options)
+        raw = _read(path, options)
     except ValueError as error:
-        return Inspected(path, None, [], str(error))
-    checks, refusal = check_recording(reading.recording, vehicle, asked_interval(reading, options.dt)), ""
+        return Inspected(path, None, [], in_flags(NAME, str(error)))
+    checks, refusal = raw.checks(vehicle, options.dt), ""
     # The checks that need no vehicle bear motors in any unit, so commands are compared whatever speed they stand for.
-    unscaled = "rotor_speed" not in reading.recording.signals and not options.polynomial
+    unscaled = "rotor_speed" not in raw.recording.signals and not options.polynomial
     try:
-        flight = reading.flight(options.dt, ONE_TO_ONE if unscaled else options.polynomial)
+        flight = raw.flight(options.dt, ONE_TO_ONE if unscaled else options.polynomial)
         other = vehicle is not None and flight.u.shape[1] != vehicle.rotors  # a check that failed says so
         checks += check_log(flight, None if other or unscaled else vehicle)
         even_segments(flight)
         require_length([flight], WINDOW)
         if unscaled:
-            reading.flight(options.dt)  # says what is missing
+            raw.flight(options.dt)  # says what is missing
     except ValueError as error:
-        refusal = str(error)
-    return Inspected(path, reading, checks, refusal)
+        refusal = in_flags(NAME, str(error))
+    checks = [replace(check, suggestion=in_flags(NAME, check.suggestion)) for check in checks]
+    return Inspected(path, raw, checks, refusal)
 
 
 def trusted(logs: Sequence[Inspected], console: Console) -> list[Recording]:
@@ -132,7 +130,7 @@ def trusted(logs: Sequence[Inspected], console: Console) -> list[Recording]:
     failed = {
         log.path.name: any(check.verdict == FAILS and check.name not in BORNE for check in log.checks) for log in logs
     }
-    kept = [log.reading.recording for log in logs if log.reading is not None and not failed[log.path.name]]
+    kept = [log.raw.recording for log in logs if log.raw is not None and not failed[log.path.name]]
     if not kept:
         raise ValueError("--write-vehicle: no log flew and passed its checks; mend the logs as the page says")
     if left := [name for name, fails in failed.items() if fails]:
@@ -140,12 +138,12 @@ def trusted(logs: Sequence[Inspected], console: Console) -> list[Recording]:
     return kept
 
 
-def _read(path: Path, columns, options: Options) -> Reading:
+def _read(path: Path, options: Options) -> RawLog:
     """The log, also where it is a CSV file without all that a flight needs."""
-    given = {"topics": read_topics(options.topics), "motor_order": options.motor_order}
-    if columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
-        return Reading(read_recording(path, columns, **given))
-    return read_log(path, columns=columns, **given)
+    given = {"columns": options.columns, "topics": read_topics(options.topics), "motor_order": options.motor_order}
+    if options.columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
+        return RawLog(read_recording(path, **given))
+    return read_log(path, **given)
 
 
 def _described(options: Options) -> dict:

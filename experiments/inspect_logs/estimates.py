@@ -13,7 +13,8 @@ from scipy.signal import lfilter
 
 from hybrid_jax.flights.attitude import interpolate, mean_of_held
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
-from hybrid_jax.flights.checks.readings import FAST, moving_mean
+from hybrid_jax.flights.checks.mistakes import moving_mean
+from hybrid_jax.flights.checks.motor_response import FAST
 from hybrid_jax.flights.conversion import motors_of
 from hybrid_jax.flights.recording import Recording, Signal
 

@@ -17,7 +17,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.tables import EMPTY, Table
 from experiments.runner.run_record import environment
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
-from hybrid_jax.flights.load import Reading
+from hybrid_jax.flights.load import RawLog
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Signal
 
 PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
@@ -40,7 +40,7 @@ class Inspected:
     """One log: what was read, its checks, and why it is no flight for a model; empty if it is one."""
 
     path: Path
-    reading: Reading | None
+    raw: RawLog | None
     checks: Sequence[Check]
     refusal: str
 
@@ -48,7 +48,7 @@ class Inspected:
     def result(self) -> str:
         """In a few words: refused, fails, or ready."""
         failed = [f"{check.name}: {check.suggestion}" for check in self.checks if check.verdict == FAILS]
-        if self.reading is None:
+        if self.raw is None:
             return f"not read: {self.refusal.removeprefix(f'{self.path}: ')}"
         if failed:
             return f"FAILS {failed[0]}" + (f" (and {len(failed) - 1} more)" if len(failed) > 1 else "")
@@ -60,10 +60,10 @@ def write_page(
 ) -> None:
     """Write report.md, report.json, rows.csv and the figures; print the tables."""
     rows = Results([{"log": log.path.name, "result": log.result} for log in logs], ("log",))
-    read = [log for log in logs if log.reading is not None]
+    read = [log for log in logs if log.raw is not None]
     tables = [overview(logs), *([signal_table(read), check_table(read), legend(read)] if read else [])]
     tables += [todo(logs)] if todo(logs).lines else []
-    notes = [f"{log.path.name}: {note}" for log in read if log.reading for note in log.reading.recording.notes]
+    notes = [f"{log.path.name}: {note}" for log in read if log.raw for note in log.raw.recording.notes]
     notes += [f"{path.name}: left: {why}" for path, why in left.items()]
     notes += [NOT_RUN] if config["vehicle"] is None and read else []
     pictures = {
@@ -85,9 +85,9 @@ def write_page(
 
 def described(log: Inspected) -> str:
     """Format, vehicle, length and motors of a log that was read."""
-    if log.reading is None:
+    if log.raw is None:
         return ""
-    found = log.reading.recording
+    found = log.raw.recording
     kind = found.facts.get("vehicle", "unknown vehicle")
     return f"{found.facts.get('format')}, {kind}, {found.duration:.1f} s, {found.rotors} motors: "
 
@@ -95,7 +95,7 @@ def described(log: Inspected) -> str:
 def overview(logs: Sequence[Inspected]) -> Table:
     lines = []
     for log in logs:
-        found = log.reading.recording if log.reading else None
+        found = log.raw.recording if log.raw else None
         facts = found.facts if found else {}
         told = (facts.get(key, EMPTY) for key in ("format", "vehicle", "airframe", "program"))
         size = (f"{found.duration:.1f}", str(found.rotors)) if found else (EMPTY, EMPTY)
@@ -106,7 +106,7 @@ def overview(logs: Sequence[Inspected]) -> Table:
 def signal_table(logs: Sequence[Inspected]) -> Table:
     lines = []
     for log in logs:
-        for name, signal in log.reading.recording.signals.items() if log.reading else ():
+        for name, signal in log.raw.recording.signals.items() if log.raw else ():
             rate = f"{1 / signal.interval:.4g}" if 0 < signal.interval < math.inf else EMPTY
             gaps = signal.gaps()
             longest = f", longest {max(end - start for start, end in gaps):.3g} s" if gaps else ""
@@ -158,7 +158,7 @@ def todo(logs: Sequence[Inspected]) -> Table:
 
 def draw(log: Inspected) -> Figure:
     """A panel for each signal over time, gaps in grey."""
-    signals = log.reading.recording.signals if log.reading else {}
+    signals = log.raw.recording.signals if log.raw else {}
     figure, axes = subplots((8, 1.2 + 1.3 * len(signals)), len(signals), 1, sharex=True)
     for panel, (name, signal) in zip(axes[:, 0], signals.items(), strict=True):
         step = max(1, len(signal) // POINTS)

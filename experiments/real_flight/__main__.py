@@ -10,6 +10,7 @@ from rich.console import Console
 
 from experiments.real_flight import logs
 from experiments.real_flight.config import LEARN, PRESETS, RealFlightConfig
+from experiments.real_flight.folds import evenly_spaced, hold_out_validation
 from experiments.real_flight.log_tables import failed_checks
 from experiments.real_flight.logs import LogSet
 from experiments.real_flight.models import thrust_baseline
@@ -88,7 +89,7 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
         time_constant = 0.0 if chooses_lag else model.terms.motor_time_constant
         sets[name] = logs.load_logs(name, folder, model.vehicle, time_constant, config)
     logs.require_distinct(list(sets.values()), config)
-    dt = require_common_interval([log for each in sets.values() for log in each.logs], "--cleaning.resample ")
+    dt = require_common_interval([log for each in sets.values() for log in each.logs])
     if chooses_lag:
         chosen = choose_lag(sets["source"], before, config)
         console.print(f"rotor time constant: {1000 * chosen:.1f} ms", highlight=False)
@@ -133,13 +134,13 @@ def load_vehicle_models(path: Path, config: RealFlightConfig) -> tuple[VehicleMo
 
 def choose_lag(source: LogSet, model: VehicleModel, config: RealFlightConfig) -> float:
     """Choose the rotors' time constant [s]: physics fitted to the source's training flights predicts the others."""
-    train, validation = logs.hold_out_validation(source.logs, config)
+    train, validation = hold_out_validation(source.logs, config)
     baseline = thrust_baseline(model)
 
     def error(cleaned: list[FlightLog]) -> float:
         parts = cleaned[: len(train)], cleaned[len(train) :]
         known, unknown = (cut_windows(part, INTERVAL_STEPS).windows for part in parts)
-        field = fit_least_squares(model.physics(), logs.evenly_spaced(known, LAG_WINDOWS)).field
+        field = fit_least_squares(model.physics(), evenly_spaced(known, LAG_WINDOWS)).field
         return relative_error(flight_errors(field, unknown), flight_errors(baseline, unknown), (INTERVAL_STEPS,))
 
     return choose_time_constant([*train, *validation], error)[0]

@@ -3,43 +3,18 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 from experiments.real_flight.models import Model, RecipeName
-from experiments.runner.options import Activation, Count, NotNegative, Positive, Run, check_numbers, distinct
-from hybrid_jax import checks
+from experiments.runner.options import Activation, Count, Positive, Run, distinct
 from hybrid_jax.dynamics.vehicle_file import check_learned
+from hybrid_jax.flights.checks.cleaning import Cleaning
 
 # By default, the effects that a real vehicle adds to a rigid body; mass is weighed, not learned.
 LEARN = ("Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping", "velocity_lag", "cable_pull")
 NANODRONE_STEPS = 50
 ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "staged")
 PATHS = ("source", "target", "test", "vehicle", "columns")
-
-
-@dataclass(frozen=True)
-class Cleaning:
-    """Changes to every log, in this order; by default none. The report lists the effect of each."""
-
-    in_flight: bool = False
-    """Cut out periods of half a second and more with hardly any thrust: the vehicle is on the ground."""
-    resample: Positive | None = None
-    """New interval between samples [s]."""
-    longest_gap: NotNegative = 0.0
-    """With resample: interpolate across gaps and repeated samples up to this long [s]."""
-    low_pass: Positive | None = None
-    """Cut-off frequency [Hz] of a zero-phase low-pass filter of states and motors."""
-    align: bool = False
-    """Shift the motors of each log by their lag to the gyro, found by cross-correlation."""
-    delay: Annotated[float, checks.number] = 0.0
-    """Instead of align: delay of the motors [s]."""
-
-    def __post_init__(self):
-        if self.align and self.delay:
-            raise ValueError("--cleaning.align finds the delay itself: leave out --cleaning.delay")
-        if self.longest_gap and self.resample is None:
-            raise ValueError("--cleaning.longest-gap needs --cleaning.resample")
-        check_numbers("--cleaning.", self)
 
 
 def read_topics(words: Sequence[str]) -> dict[str, str]:
@@ -87,6 +62,7 @@ class RealFlightConfig(Run):
     anyway: bool = False
     """Train in spite of checks that failed. The report says so in its first line."""
     cleaning: Cleaning = field(default_factory=Cleaning)
+    """Changes to every log, in this order; by default none. The report lists the effect of each."""
     simulated: bool = False
     """Simulate flights, write their logs to --out and use these."""
     protocol: Literal["horizons", "nanodrone"] = "horizons"
@@ -134,7 +110,6 @@ class RealFlightConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-
         read_topics(self.topics)
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):

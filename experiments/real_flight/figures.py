@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
-from experiments.real_flight.logs import Fold, motion_of_logs
+from experiments.real_flight.folds import Fold, motion_of_logs
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs

@@ -13,8 +13,8 @@ from rich.console import Console
 import hybrid_jax
 from experiments.real_flight import scoring
 from experiments.real_flight.figures import make_figures
+from experiments.real_flight.folds import Fold, motion_of_logs
 from experiments.real_flight.log_tables import log_tables
-from experiments.real_flight.logs import Fold, motion_of_logs
 from experiments.real_flight.models import RECIPES
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, pooled, score_labels
 from experiments.real_flight.selection import LEVEL, Selection

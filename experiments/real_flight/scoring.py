@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from experiments.real_flight.config import NANODRONE_STEPS, RealFlightConfig
-from experiments.real_flight.logs import non_overlapping
+from experiments.real_flight.folds import non_overlapping
 from experiments.real_flight.models import body_of
 from experiments.real_flight.train import TrainedModel, TrainingData
 from experiments.reporting import names

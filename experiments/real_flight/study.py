@@ -10,7 +10,7 @@ import numpy as np
 
 from experiments.real_flight import scoring, selection, train
 from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.logs import (
+from experiments.real_flight.folds import (
     GROUP_BY,
     Fold,
     evenly_spaced,

@@ -11,7 +11,8 @@ from jaxtyping import Int
 
 from experiments.real_flight import models
 from experiments.real_flight.config import RealFlightConfig
-from experiments.real_flight.logs import Fold, LogSet, evenly_spaced, sampled_indices
+from experiments.real_flight.folds import Fold, evenly_spaced, sampled_indices
+from experiments.real_flight.logs import LogSet
 from experiments.real_flight.models import CHANGE, ORDER, RECIPES, REFERENCE, Step
 from experiments.runner.stages import Stages
 from hybrid_jax.dynamics.base import AbstractVectorField

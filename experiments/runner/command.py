@@ -17,6 +17,7 @@ import tyro
 from filelock import FileLock, Timeout
 from rich.console import Console
 
+from experiments.runner.flags import in_flags
 from experiments.runner.options import Run
 from experiments.runner.run_record import ChecksFailed, OtherRun, recorded
 from hybrid_jax import checks, native
@@ -130,11 +131,11 @@ def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
         yield
     except (ValueError, OSError, ImportError) as error:
         message = str(error) if isinstance(error, OtherRun) else " ".join(str(error).split())
-        print(f"{name}: {message}", file=sys.stderr)
+        print(f"{name}: {in_flags(name, message)}", file=sys.stderr)
         sys.exit(BAD_INPUT)
     except ChecksFailed as failed:
         for line in failed.args:
-            print(f"{name}: {line}", file=sys.stderr)
+            print(f"{name}: {in_flags(name, line)}", file=sys.stderr)
         sys.exit(FAILED_CHECKS)
     except KeyboardInterrupt as stop:
         print(f"{name}: {interrupted}", file=sys.stderr)

@@ -9,8 +9,10 @@ Its steps can be taken one by one. Split by flight before cutting, since windows
 """
 
 from hybrid_jax.flights.checks.cleaning import (
+    Cleaning,
     align_motors,
     choose_time_constant,
+    clean,
     delay_motors,
     in_flight,
     lag_motors,
@@ -21,15 +23,15 @@ from hybrid_jax.flights.checks.consistency import Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map
-from hybrid_jax.flights.load import load_log, load_logs
+from hybrid_jax.flights.load import find_logs, load_log, load_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
 from hybrid_jax.flights.windows import LogWindows, cut_windows, folds, hold_out, load_windows
 
 __all__ = [
     "Check",
+    "Cleaning",
     "ColumnMap",
     "FlightErrors",
     "FlightLog",
@@ -40,6 +42,7 @@ __all__ = [
     "check_log",
     "check_recording",
     "choose_time_constant",
+    "clean",
     "cut_windows",
     "delay_motors",
     "find_logs",

@@ -17,9 +17,9 @@ STATES = ("position", "velocity", "attitude", "rates")
 ADVICE = {
     "PX4 ULog": "set SDLOG_PROFILE 25, and list vehicle_local_position in logger_topics.txt (docs/howto/logs.md)",
     "Crazyflie µSD": "add stateEstimate.x … z, vx … vz, qw … qz, gyro.x … z, motor.m1 … m4 to the card's config.txt",
-    "ROS bag": "record odometry, IMU and motors, and name them: --topics motors=/TOPIC:FIELD:UNIT",
+    "ROS bag": 'record odometry, IMU and motors, and name them: topics={"motors": "/TOPIC:FIELD:UNIT"}',
     "Betaflight blackbox": "blackbox cannot hold them: it serves to identify thrust, inertia and lag",
-    "CSV": "name the columns in a column map: --columns MAP.toml",
+    "CSV": 'name the columns in a column map: columns="MAP.toml"',
 }
 
 
@@ -89,7 +89,7 @@ def _speeds(recording: Recording, motors: Signal, polynomial: Sequence[float]) -
     if motors is recording.signals.get("rotor_speed"):
         return motors.values
     if not len(polynomial):
-        need = "--polynomial c0,c1,… maps them to rad/s = c0 + c1 command + …"
+        need = "polynomial=(c0, c1, …) maps them to rad/s = c0 + c1 command + …"
         raise ValueError(f"{recording.name}: has only motor commands from 0 to 1 ({motors.source}); {need}")
     # A motor at command 0 stands still, whatever the polynomial says.
     speeds = np.polynomial.polynomial.polyval(motors.values, polynomial)

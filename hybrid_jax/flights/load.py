@@ -1,26 +1,49 @@
-"""Load logs of any format: one, or all of a folder, checked before they become flights."""
+"""Load logs of any format: one, or all of a folder, checked before they become flights, and cleaned.
+
+The format is told by a file's first bytes, and by its suffix.
+"""
 
 import warnings
+import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
+import numpy as np
+
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import DT, to_flight
-from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped
+from hybrid_jax.flights.formats.blackbox import read_blackbox
+from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped, record_mapped
+from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
 from hybrid_jax.flights.formats.csv import notes_on_end, read_csv
-from hybrid_jax.flights.log import FlightLog
-from hybrid_jax.flights.reading import CSV, SUFFIXES, find_logs, format_of, read_recording, recording_of, reordered
-from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.formats.raw import WXYZ, XYZ, is_packed, opened
+from hybrid_jax.flights.formats.rosbag import read_rosbag
+from hybrid_jax.flights.formats.ulog import read_ulog
+from hybrid_jax.flights.log import FlightLog, unevenness
+from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
+CSV, ULOG, CRAZYFLIE, ROSBAG, BLACKBOX = "CSV", "PX4 ULog", "Crazyflie µSD", "rosbag", "Betaflight blackbox"
+SUFFIXES = {".csv": CSV, ".csv.gz": CSV, ".ulg": ULOG, ".mcap": ROSBAG, ".db3": ROSBAG, ".bag": ROSBAG}
+SUFFIXES |= {".bbl": BLACKBOX, ".bfl": BLACKBOX}
+MAGICS = {b"ULog": ULOG, b"\x89MCAP": ROSBAG, b"SQLite format 3": ROSBAG, b"#ROSBAG": ROSBAG}
+MAGICS |= {b"H Product:Blackbox": BLACKBOX}
+BAG = "metadata.yaml"  # makes a folder one recording of ROS 2
 Failed = Literal["refuse", "warn"]
 
 
-class Reading(NamedTuple):
-    """A log as it was recorded, and the samples of one that stand on common times already, as those of a CSV file."""
+class RawLog(NamedTuple):
+    """A log as it was read.
+
+    Attributes:
+        recording: its signals at their own rates.
+        log: its samples, if they stand on common times already, as those of a CSV file.
+    """
 
     recording: Recording
     log: FlightLog | None = None
@@ -28,6 +51,35 @@ class Reading(NamedTuple):
     def flight(self, dt: float | None = None, polynomial: Sequence[float] = ()) -> FlightLog:
         """The flight at its own times, or at intervals of dt [s]: see `to_flight`."""
         return to_flight(self.recording, dt or DT, polynomial) if self.log is None else self.log
+
+    def checks(self, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
+        """`check_recording`, for intervals of dt [s] if the samples do not stand at intervals of their own."""
+        return check_recording(self.recording, vehicle, dt or (DT if self.log is None else None))
+
+
+def load_log(
+    path: str | Path,
+    *,
+    columns: ColumnMap | str | Path | None = None,
+    polynomial: tuple[float, ...] = (),
+    topics: Mapping[str, str] | None = None,
+    motor_order: Sequence[int] = (),
+    dt: float | None = None,
+) -> FlightLog:
+    """Read one log, without checking it.
+
+    Args:
+        path: of a log of any format that `read_recording` reads.
+        columns: as of `load_windows`.
+        polynomial: as of `load_windows`.
+        topics: as of `load_windows`.
+        motor_order: as of `load_windows`.
+        dt: interval [s] of a flight whose signals have times of their own, by default 0.01; of others it is not used.
+
+    Raises:
+        ValueError: the file, row, field and what to do, in one line.
+    """
+    return read_log(path, columns=columns, topics=topics, motor_order=motor_order).flight(dt, polynomial)
 
 
 def load_logs(
@@ -38,29 +90,38 @@ def load_logs(
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
     dt: float | None = None,
+    cleaning: Cleaning | None = None,
     vehicle: Vehicle | None = None,
     failed: Failed = "refuse",
 ) -> list[FlightLog]:
-    """Read all logs of a folder in the order of their names and run `check_recording`; arguments as of `load_windows`.
+    """Read all logs of a folder in the order of their names, check them with `check_recording` and clean them.
+
+    Args:
+        folder: as of `load_windows`.
+        columns: as of `load_windows`.
+        polynomial: as of `load_windows`.
+        topics: as of `load_windows`.
+        motor_order: as of `load_windows`.
+        dt: as of `load_windows`.
+        cleaning: changes to every log; by default none.
+        vehicle: constants that the logs are compared with; without it, motors are not.
+        failed: what a failed check does: "refuse" raises an error, "warn" is a warning.
 
     Raises:
         ValueError: the folder holds no logs, or the file, row, field and what to do, in one line.
     """
     if failed not in (known := get_args(Failed)):
         raise ValueError(f"failed must be one of {', '.join(known)}, got {failed!r}")
-    readings = read_folder(folder, columns=columns, topics=topics, motor_order=motor_order)[0]
-    found = [
-        (reading.recording.name, check)
-        for reading in readings
-        for check in check_recording(reading.recording, vehicle, asked_interval(reading, dt))
-    ]
-    report(found, failed)
-    return [reading.flight(dt, polynomial) for reading in readings]
+    cleaning = cleaning or Cleaning()
+    dt = cleaning.resample if dt is None else dt
+    raws = read_folder(folder, columns=columns, topics=topics, motor_order=motor_order)[0]
+    report([(raw.recording.name, check) for raw in raws for check in raw.checks(vehicle, dt)], failed)
 
+    def cleaned(log: FlightLog) -> FlightLog:
+        fits = dt is None or (log.dt == dt and not unevenness(log).any())
+        return clean(log, replace(cleaning, resample=None if fits else dt), vehicle)[0]
 
-def asked_interval(reading: Reading, dt: float | None) -> float | None:
-    """The interval [s] that a flight will have, if its samples do not stand at it already."""
-    return dt or (DT if reading.log is None else None)
+    return [cleaned(raw.flight(dt, polynomial)) for raw in raws]
 
 
 def report(found: Sequence[tuple[str, Check]], failed: Failed) -> None:
@@ -81,7 +142,7 @@ def read_folder(
     columns: ColumnMap | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
-) -> tuple[list[Reading], dict[Path, str]]:
+) -> tuple[list[RawLog], dict[Path, str]]:
     """Read all logs of a folder, in the order of their names; also its other files, each with why it is left.
 
     Raises:
@@ -92,43 +153,136 @@ def read_folder(
         others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
-    if isinstance(columns, str | Path):
-        columns = load_column_map(columns)
+    columns = _column_map(columns)
     return [read_log(path, columns=columns, topics=topics, motor_order=motor_order) for path in paths], left
 
 
 def read_log(
     path: str | Path,
     *,
-    columns: ColumnMap | None = None,
+    columns: ColumnMap | str | Path | None = None,
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
-) -> Reading:
+) -> RawLog:
     """Read one log of any format of `read_recording`; arguments and errors as of it."""
     if format_of(path) != CSV:
-        return Reading(read_recording(path, columns, topics, motor_order))
-    log = read_csv(path) if columns is None else read_mapped(path, columns)
+        return RawLog(read_recording(path, columns, topics, motor_order))
+    column_map = _column_map(columns)
+    log = read_csv(path) if column_map is None else read_mapped(path, column_map)
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
     recording = replace(recording_of(log), notes=notes_on_end(path))
     if len(motor_order):
         recording = reordered(recording, motor_order)
         log = FlightLog(log.t, log.x, recording.signals["rotor_speed"].values, log.name)
-    return Reading(recording, log)
+    return RawLog(recording, log)
 
 
-def load_log(
-    path: str | Path,
-    *,
-    columns: ColumnMap | None = None,
-    polynomial: tuple[float, ...] = (),
-    topics: Mapping[str, str] | None = None,
-    motor_order: Sequence[int] = (),
-    dt: float | None = None,
-) -> FlightLog:
-    """Read one log, without checking it. See `load_windows` for the arguments.
+def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
+    return load_column_map(columns) if isinstance(columns, str | Path) else columns
+
+
+def format_of(path: str | Path) -> str:
+    """The format of a file or folder, by its first bytes, else by its suffix; empty if it is none that is read."""
+    path = Path(path)
+    if path.is_dir():
+        return ROSBAG if (path / BAG).is_file() else ""
+    try:
+        with opened(path) as file:
+            head = file.read(32)
+    except (OSError, EOFError, zlib.error):
+        head = b""  # the reader that the suffix asks for says what is wrong
+    if is_crazyflie(head):
+        return CRAZYFLIE
+    found = [kind for magic, kind in MAGICS.items() if head.startswith(magic)]
+    named = [kind for suffix, kind in SUFFIXES.items() if path.name.lower().endswith(suffix)]
+    return (found or named or [""])[0]
+
+
+def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
+    """The logs of a folder in the order of their names, and its other files, each with why it is left.
+
+    Args:
+        folder: holds logs; hidden files are passed over. A ROS bag is one log.
 
     Raises:
-        ValueError: the file, row, field and what to do, in one line.
+        ValueError: there is no such folder.
     """
-    return read_log(path, columns=columns, topics=topics, motor_order=motor_order).flight(dt, polynomial)
+    folder, logs, left = Path(folder), [], {}
+    if not folder.is_dir():
+        raise ValueError(f"{folder}: no such folder")
+    if format_of(folder):
+        return [folder], {}
+    for path in sorted(folder.iterdir()):
+        if path.name.startswith("."):
+            continue
+        if format_of(path):
+            logs.append(path)
+        elif path.is_dir():
+            left[path] = "a folder; give it by itself"
+        else:
+            left[path] = "empty" if not path.stat().st_size else "no format that is read"
+    return logs, left
+
+
+def read_recording(
+    path: str | Path,
+    columns: ColumnMap | str | Path | None = None,
+    topics: Mapping[str, str] | None = None,
+    motor_order: Sequence[int] = (),
+) -> Recording:
+    """Read one log of any format of `format_of`.
+
+    Args:
+        path: of the log: a file, or the folder of a ROS bag.
+        columns: column map (or its TOML file) of CSV logs; by default they have the library's columns and units.
+        topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
+        motor_order: which motor of the log, from 0, each rotor of the vehicle is; by default they are in one order.
+
+    Raises:
+        ValueError: file, topic or column, time and what was expected, in one line.
+    """
+    kind = format_of(path)
+    if not Path(path).exists():
+        raise ValueError(f"{path}: no such file")
+    if kind == CSV:
+        column_map = _column_map(columns)
+        found = recording_of(read_csv(path)) if column_map is None else record_mapped(path, column_map)
+        found = replace(found, notes=(*found.notes, *notes_on_end(path)))
+    elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and is_packed(path):
+        raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
+    elif kind == ROSBAG:
+        found = read_rosbag(path, topics or {})
+    elif kind:
+        found = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](path)
+    else:
+        raise ValueError(f"{path}: is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}")
+    return reordered(found, motor_order) if len(motor_order) else found
+
+
+def recording_of(log: FlightLog) -> Recording:
+    """A flight as a recording of its columns."""
+    states = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
+    t, signals = log.t - log.t[0], {}
+    for name, part in states.items():
+        signals[name] = Signal(t, log.x[:, part], WXYZ if name == "attitude" else XYZ, f"columns of {name}")
+    axes = tuple(map(str, range(log.u.shape[1])))
+    signals["rotor_speed"] = Signal(t, log.u, axes, "columns of the motors")
+    return Recording(log.name, signals, facts={"format": CSV})
+
+
+def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
+    """The recording with its motors in the vehicle's order: rotor i is the log's motor `motor_order[i]`.
+
+    Raises:
+        ValueError: a motor is named twice, or the log has no such motor.
+    """
+    signals, order = dict(recording.signals), [*motor_order]
+    for name in ROTOR_UNITS.keys() & signals.keys():
+        signal = signals[name]
+        if len({*order}) < len(order) or not {*order} <= {*range(len(signal.axes))}:
+            wanted = ", ".join(signal.axes)
+            raise ValueError(f"{recording.name}: motor_order must be of {wanted}, each at most once, got {order}")
+        axes = tuple(map(str, range(len(order))))
+        signals[name] = replace(signal, values=np.asarray(signal.values)[:, order], axes=axes)
+    return replace(recording, signals=signals)

@@ -143,8 +143,7 @@ def even_segments(log: FlightLog) -> list[slice]:
         found = (
             f"the interval at {log.t[row]:.6g} s is {log.t[row + 1] - log.t[row]:.6g} s, the median is {log.dt:.6g} s"
         )
-        even = f"--cleaning.resample {log.dt:.6g}, dt={log.dt:.6g}"
-        raise ValueError(f"{log.name}: {found}; put the samples on even times first: {even}")
+        raise ValueError(f"{log.name}: {found}; put the samples on even times first: dt={log.dt:.6g}")
     return segments(log)
 
 

@@ -12,11 +12,11 @@ import jax
 import numpy as np
 
 from hybrid_jax import checks
-from hybrid_jax.flights.checks.cleaning import in_flight, lag_motors, resample
+from hybrid_jax.flights.checks.cleaning import Cleaning, lag_motors
 from hybrid_jax.flights.checks.consistency import check_log
 from hybrid_jax.flights.formats.column_map import ColumnMap
 from hybrid_jax.flights.load import Failed, load_logs, report
-from hybrid_jax.flights.log import FlightLog, even_segments, segments, unevenness
+from hybrid_jax.flights.log import FlightLog, even_segments, segments
 from hybrid_jax.trajectories import Trajectories, concatenate, windows_of
 from hybrid_jax.vehicle import Vehicle
 
@@ -49,7 +49,7 @@ def load_windows(
     topics: Mapping[str, str] | None = None,
     motor_order: Sequence[int] = (),
     motor_time_constant: float = 0.0,
-    cut_ground: bool = False,
+    cleaning: Cleaning | None = None,
     failed: Failed = "refuse",
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
@@ -68,7 +68,7 @@ def load_windows(
         topics: for ROS bags, the topics of some quantities: see `hybrid_jax.flights.formats.rosbag`.
         motor_order: which motor of the log, from 0, each rotor of the vehicle is.
         motor_time_constant: first-order lag [s] of the rotors, for logs that record commands and not rotor speeds.
-        cut_ground: cut out periods with hardly any thrust, on the ground.
+        cleaning: changes to every log, such as `Cleaning(in_flight=True)`; by default none.
         failed: what a failed check does: "refuse" raises an error, "warn" is a warning.
 
     Returns:
@@ -82,11 +82,7 @@ def load_windows(
     if dt is not None:
         checks.positive("dt", dt, "a positive number of seconds")
     given = {"columns": columns, "polynomial": polynomial, "topics": topics, "motor_order": motor_order}
-    logs = load_logs(folder, **given, dt=dt, vehicle=vehicle, failed=failed)
-    if dt is not None:
-        logs = [log if log.dt == dt and not unevenness(log).any() else resample(log, dt)[0] for log in logs]
-    if cut_ground:
-        logs = [in_flight(log)[0] for log in logs]
+    logs = load_logs(folder, **given, dt=dt, cleaning=cleaning, vehicle=vehicle, failed=failed)
     report([(log.name, check) for log in logs for check in check_log(log, vehicle)], failed)
     require_common_interval(logs)
     if motor_time_constant:
@@ -144,14 +140,14 @@ def folds(
     return [hold_out(logs, list(dealt[i::count]), of) for i in range(count)]
 
 
-def require_common_interval(logs: Sequence[FlightLog], option: str = "dt=") -> float:
-    """Return the interval [s] between samples, which all logs must share; `option` is how a user can resample them."""
+def require_common_interval(logs: Sequence[FlightLog]) -> float:
+    """Return the interval [s] between samples, which all logs must share."""
     for log in logs:
         even_segments(log)
         if log.dt != logs[0].dt:
             raise ValueError(
                 f"{log.name}: samples are {log.dt:g} s apart, those of {logs[0].name} {logs[0].dt:g} s; "
-                f"resample all logs with {option}{max(log.dt, logs[0].dt):g}"
+                f"resample all logs with dt={max(log.dt, logs[0].dt):g}"
             )
     return logs[0].dt
 

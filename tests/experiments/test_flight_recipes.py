@@ -10,7 +10,7 @@ from recorded import CONFIG, LOGS
 
 from experiments.real_flight import models
 from experiments.real_flight.config import LEARN
-from experiments.real_flight.logs import make_folds
+from experiments.real_flight.folds import make_folds
 from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import cut_windows

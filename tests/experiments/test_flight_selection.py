@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from recorded import CONFIG, LOGS, OTHERS, samples
 
-from experiments.real_flight.logs import Fold, leave_out, make_folds, motion_of_logs, require_windows
+from experiments.real_flight.folds import Fold, leave_out, make_folds, motion_of_logs, require_windows
 from experiments.real_flight.report import expected_table, warnings_of
 from experiments.real_flight.selection import BLEND, Selection, choose, expected, undecided
 from experiments.real_flight.study import candidates, recipe_of

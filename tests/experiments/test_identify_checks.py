@@ -13,7 +13,7 @@ from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.actuators import Actuator
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS
-from hybrid_jax.flights.reading import recording_of
+from hybrid_jax.flights.load import recording_of
 from hybrid_jax.vehicle import IRIS
 
 ACTUATOR = "[actuator]\ncurve = [100.0, 900.0]\n"

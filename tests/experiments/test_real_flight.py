@@ -17,7 +17,8 @@ import hybrid_jax
 from experiments.real_flight import study, train
 from experiments.real_flight.config import LEARN
 from experiments.real_flight.figures import errors_by_size
-from experiments.real_flight.logs import LogSet, load_logs, make_folds, non_overlapping, sampled_indices
+from experiments.real_flight.folds import make_folds, non_overlapping, sampled_indices
+from experiments.real_flight.logs import LogSet, load_logs
 from experiments.real_flight.models import RECIPES, thrust_baseline, untrained
 from experiments.real_flight.report import parameter_tables
 from experiments.real_flight.scoring import QUANTITIES, TAGS, parameters, pooled, scores, verdicts

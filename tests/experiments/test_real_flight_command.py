@@ -12,7 +12,7 @@ from smoke import command, experiments, refused, script
 
 from experiments.real_flight.__main__ import LISTS, load_vehicle_models, main, prepare
 from experiments.real_flight.config import PRESETS, RealFlightConfig
-from experiments.real_flight.logs import make_folds
+from experiments.real_flight.folds import make_folds
 from experiments.real_flight.scoring import QUANTITIES
 from experiments.real_flight.simulated import vehicle_toml
 from experiments.runner.command import FAILED_CHECKS, ChecksFailed, read, split_lists

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from recorded import CONFIG, DT, LOGS, SAMPLES, write
 
-from experiments.real_flight.config import Cleaning
-from experiments.real_flight.logs import clean, load_logs, require_distinct
+from experiments.real_flight.logs import load_logs, require_distinct
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.windows import require_common_interval
 from hybrid_jax.vehicle import IRIS
 
@@ -21,19 +21,19 @@ def test_logs_are_read_checked_and_cleaned(tmp_path):
         assert [line.split()[0] for line in record["done"]] == ["0", "resampled", "low-pass", "motors", "rotors"]
         assert record["samples"] == SAMPLES
         assert len(record["checks"]) == 8 + 12
-    assert require_common_interval(found.logs, "--cleaning.resample ") == 0.02
+    assert require_common_interval(found.logs) == 0.02
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"low_pass": 60.0}, r"low-pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
+        ({"low_pass": 60.0}, r"low_pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
         ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
         ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
     ],
 )
 def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
-    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: --cleaning.{message}"):
+    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: {message}"):
         clean(LOGS[0], Cleaning(**options), IRIS)
 
 
@@ -47,23 +47,23 @@ def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
     ],
 )
 def test_invalid_cleaning_options_are_refused(option, value, expected):
-    with pytest.raises(ValueError, match=f"^--cleaning.{option.replace('_', '-')} must be a {expected}.*{value}$"):
+    with pytest.raises(ValueError, match=f"^{option} must be a {expected}.*{value}$"):
         Cleaning(**{"resample": 0.01, option: value})
 
 
 @pytest.mark.parametrize(
     ("times", "message"),
     [
-        (lambda t: 2 * t, r"chirp_run2.*0.02 s apart.*--cleaning.resample 0.02"),
+        (lambda t: 2 * t, r"chirp_run2.*0.02 s apart.*dt=0.02"),
         (
             lambda t: t + DT / 3 * (np.arange(SAMPLES) == 10),
-            r"chirp_run2.*at 0.09 s is 0.0133\d+ s, the median is 0.01 s; .*--cleaning.resample 0.01, dt=0.01",
+            r"chirp_run2.*at 0.09 s is 0.0133\d+ s, the median is 0.01 s; .*dt=0.01",
         ),
     ],
 )
 def test_uneven_samples_and_different_intervals_are_refused(times, message):
     with pytest.raises(ValueError, match=message):
-        require_common_interval([LOGS[0], replace(LOGS[1], t=times(LOGS[1].t))], "--cleaning.resample ")
+        require_common_interval([LOGS[0], replace(LOGS[1], t=times(LOGS[1].t))])
 
 
 def test_hidden_files_and_folders_are_ignored(tmp_path):

@@ -8,7 +8,7 @@ import pytest
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
 from hybrid_jax.flights.checks.cleaning import delay_motors
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, NOTHING, OK, UNKNOWN, WARNS, check_log
-from hybrid_jax.flights.checks.readings import orders
+from hybrid_jax.flights.checks.motor_response import orders
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.vehicle import IRIS
 

@@ -10,9 +10,8 @@ from hypothesis import strategies as st
 from surface import outcome, refusal
 
 from hybrid_jax.flights.formats.csv import read_csv
-from hybrid_jax.flights.load import read_log
+from hybrid_jax.flights.load import read_log, read_recording
 from hybrid_jax.flights.log import COLUMNS, FlightLog
-from hybrid_jax.flights.reading import read_recording
 
 HEADER = ",".join(COLUMNS)
 FUZZ = settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])

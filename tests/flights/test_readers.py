@@ -14,8 +14,8 @@ from surface import outcome, refusal
 from hybrid_jax.flights import load_logs
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import COLUMNS
-from hybrid_jax.flights.reading import find_logs, read_recording
 from hybrid_jax.vehicle import IRIS
 
 STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
@@ -161,18 +161,18 @@ def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1], rtol=1e-6)
     assert not failures(check_recording(recording, IRIS, 0.01), "log")
     assert any("/rotors" in note for note in read_recording(path).notes)
-    refusal(lambda: to_flight(read_recording(path)), path, "no motors", "--topics motors=")
+    refusal(lambda: to_flight(read_recording(path)), path, "no motors", 'topics={"motors"')
     for topics, words in [
-        ({"motors": "/rotors"}, ("--topics", "TOPIC:FIELD:UNIT")),
+        ({"motors": "/rotors"}, ("topics: ", "TOPIC:FIELD:UNIT")),
         ({"motors": "/other:data:rpm"}, ("/other", "/odom")),
-        ({"wings": "/odom"}, ("--topics", "odometry")),
+        ({"wings": "/odom"}, ("topics: ", "odometry")),
     ]:
         refusal(lambda topics=topics: read_recording(path, topics=topics), *words)
 
 
 def test_of_two_topics_one_is_chosen(flight, tmp_path):
     path = bag(tmp_path / "run", flight[:20], "SQLITE3", second="/truth")
-    refusal(lambda: read_recording(path), path, "/odom and /truth hold odometry", "--topics odometry=/odom")
+    refusal(lambda: read_recording(path), path, "/odom and /truth hold odometry", 'topics={"odometry": "/odom"}')
     assert "position" in read_recording(path, topics={"odometry": "/truth"}).signals
 
 
@@ -258,7 +258,7 @@ def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
     ]
     german = "\n".join(rows).replace(",", ";").replace(".", ",")
     path.write_text(german)
-    refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "--columns")
+    refusal(lambda: read_recording(path), path, "row 1", "separated by ';'", "columns=")
     tables = 'frames = {world = "ENU", body = "FLU", velocity = "world"}\ntime = {columns = ["t"], unit = "s"}\n'
     tables += 'velocity = {columns = ["vx", "vy", "vz"], unit = "m/s"}\n'
     tables += 'motors = {columns = ["u0", "u1", "u2", "u3"], unit = "pwm"}\n'

@@ -9,7 +9,7 @@ import pytest
 from experiments.inspect_logs.estimates import estimate
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
-from hybrid_jax.flights.reading import CRAZYFLIE, ULOG, find_logs, format_of, read_recording
+from hybrid_jax.flights.load import CRAZYFLIE, ULOG, find_logs, format_of, read_recording
 
 FOLDER = Path(os.environ.get("HYBRID_JAX_LOGS", Path(__file__).parents[3] / "shared" / "logs"))
 pytestmark = pytest.mark.skipif(not FOLDER.is_dir(), reason="no real logs: set HYBRID_JAX_LOGS to their folder")

@@ -18,7 +18,7 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.ulog import read_ulog
-from hybrid_jax.flights.reading import reordered
+from hybrid_jax.flights.load import reordered
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 
@@ -126,8 +126,8 @@ def test_commands_are_shares_that_the_polynomial_converts(flight, topics, writte
     path = written(topics | {"actuator_motors": commands(flight.t - flight.t[0] + 0.003, flight.u)})
     log = to_flight(reordered(read_ulog(path), (2, 0, 3, 1)), polynomial=(100.0, 1000.0))
     np.testing.assert_allclose(log.u[:-1], flight.u[: len(log) - 1][:, [2, 0, 3, 1]], rtol=1e-5)
-    refusal(lambda: to_flight(read_ulog(path)), path, "actuator_motors", "--polynomial")
-    refusal(lambda: reordered(read_ulog(path), (0, 1, 2, 2)), path, "--motor-order")
+    refusal(lambda: to_flight(read_ulog(path)), path, "actuator_motors", "polynomial=")
+    refusal(lambda: reordered(read_ulog(path), (0, 1, 2, 2)), path, "motor_order must")
     refusal(lambda: to_flight(read_ulog(path), dt=0.0), "dt must be")
 
 
@@ -165,7 +165,7 @@ def test_a_moving_motor_is_never_dropped_and_another_airframe_is_refused(flight,
     assert read_ulog(path).rotors == 6
     (line,) = failures(check_recording(read_ulog(path), IRIS), "log")
     assert "6 motors are logged" in line
-    assert "--motor-order 0,1,2,3" in line
+    assert "motor_order=(0, 1, 2, 3)" in line
     assert not failures(check_recording(reordered(read_ulog(path), (0, 1, 2, 3)), IRIS), "log")
     path = written(ulog(topics | {"actuator_motors": rows}, parameters={"MAV_TYPE": 2, "SYS_AUTOSTART": 13014}))
     assert any("VTOL (SYS_AUTOSTART 13014)" in line for line in failures(check_recording(read_ulog(path)), "log"))
@@ -177,7 +177,7 @@ def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
     recording = read_ulog(written(topics | {"esc_status": escs(t[::25], flight.u[::25])}))
     (line,) = failures(check_recording(recording, IRIS, 0.03), "log")
     assert "motors 4 Hz" in line
-    assert "--cleaning.resample 0.25" in line
+    assert "dt=0.25" in line
     assert not failures(check_recording(recording, IRIS, 0.25), "log")
 
 
@@ -221,7 +221,7 @@ def test_a_log_that_was_cut_off_is_read_and_fails(flight, topics, written):
     whole = ulog(topics | {"esc_status": escs(flight.t - flight.t[0], flight.u)})
     (line,) = failures(check_recording(read_ulog(written(whole[:-500])), IRIS), "log")
     assert "ends in the middle of a message, after 11" in line
-    assert "--anyway" in line
+    assert 'failed="warn"' in line
 
 
 def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):

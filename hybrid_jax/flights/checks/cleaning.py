@@ -1,18 +1,86 @@
 """Changes to a log; each returns the new log and one line that describes the change."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import scipy  # not scipy.signal, which takes a second: it is imported where it is first used
 
+from hybrid_jax import checks
 from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_of_held
 from hybrid_jax.flights.checks.airborne import on_ground
-from hybrid_jax.flights.checks.readings import respond
+from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.log import GAP, FlightLog, even_segments, repeats, runs_of, segments
 from hybrid_jax.state import QUATERNION, STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
 TIME_CONSTANTS = (0.0, *np.geomspace(0.005, 0.2, 24).tolist())  # s
+
+
+@dataclass(frozen=True)
+class Cleaning:
+    """Changes to every log, in this order; by default none.
+
+    Attributes:
+        in_flight: cut out periods of half a second and more with hardly any thrust: the vehicle is on the ground.
+        resample: new interval between samples [s].
+        longest_gap: with resample, interpolate across gaps and repeated samples up to this long [s].
+        low_pass: cut-off frequency [Hz] of a zero-phase low-pass filter of states and motors.
+        align: shift the motors of each log by their lag to the gyro, found by cross-correlation.
+        delay: instead of align, delay of the motors [s].
+
+    Raises:
+        ValueError: a number out of its range, or arguments that exclude each other.
+    """
+
+    in_flight: bool = False
+    resample: float | None = None
+    longest_gap: float = 0.0
+    low_pass: float | None = None
+    align: bool = False
+    delay: float = 0.0
+
+    def __post_init__(self):
+        for name in ("resample", "low_pass"):
+            if (value := getattr(self, name)) is not None:
+                checks.positive(name, value)
+        checks.not_negative("longest_gap", self.longest_gap)
+        checks.number("delay", self.delay)
+        if self.align and self.delay:
+            raise ValueError("align must be left out where delay is given: it finds the delay itself")
+        if self.longest_gap and self.resample is None:
+            raise ValueError("longest_gap needs resample")
+
+
+def clean(log: FlightLog, cleaning: Cleaning, vehicle: Vehicle | None = None) -> tuple[FlightLog, list[str]]:
+    """Apply some changes to a log; also return one line per change.
+
+    Args:
+        log: the log.
+        cleaning: which changes.
+        vehicle: the vehicle, which `align` needs.
+
+    Raises:
+        ValueError: the log, the field of `cleaning` and why it is impossible, in one line.
+    """
+    steps: dict[str, tuple[Any, Callable[[FlightLog, Any], tuple[FlightLog, str]]]] = {
+        "in_flight": (cleaning.in_flight, lambda log, _: in_flight(log)),
+        "resample": (cleaning.resample, lambda log, dt: resample(log, dt, cleaning.longest_gap)),
+        "low_pass": (cleaning.low_pass, low_pass),
+        "align": (cleaning.align, lambda log, _: align_motors(log, vehicle)),
+        "delay": (cleaning.delay, delay_motors),
+    }
+    done: list[str] = []
+    for name, (value, change) in steps.items():
+        if not value:
+            continue
+        try:
+            log, line = change(log, value)
+        except ValueError as error:
+            raise ValueError(f"{log.name}: {name}: {str(error).removeprefix(f'{log.name}: ')}") from error
+        done.append(line)
+    return log, done
 
 
 def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[FlightLog, str]:
@@ -47,7 +115,7 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
 
 
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
-    """Cut out the time on the ground, where `flights.airborne` says that the vehicle is not in the air.
+    """Cut out the time on the ground, where `airborne` says that the vehicle is not in the air.
 
     Raises:
         ValueError: no samples remain.
@@ -128,12 +196,14 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
     return FlightLog(log.t, log.x, u, log.name), done
 
 
-def align_motors(log: FlightLog, vehicle: Vehicle) -> tuple[FlightLog, str]:
+def align_motors(log: FlightLog, vehicle: Vehicle | None) -> tuple[FlightLog, str]:
     """Apply `delay_motors` with the lag of the best cross-correlation with the angular acceleration.
 
     Raises:
-        ValueError: the log has too little motion to estimate the lag.
+        ValueError: there is no vehicle, or the log has too little motion to estimate the lag.
     """
+    if vehicle is None:
+        raise ValueError(f"{log.name}: needs a vehicle, for the places of its rotors")
     found = respond(log, vehicle)
     if found is None or sum(found.correlations[:2]) < 0.2:
         raise ValueError(f"{log.name}: roll and pitch do not follow the motors, so their lag cannot be estimated")

@@ -11,15 +11,16 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import rotation_of
-from hybrid_jax.flights.checks import readings
+from hybrid_jax.flights.checks import mistakes
 from hybrid_jax.flights.checks.airborne import flying_intervals, on_ground
-from hybrid_jax.flights.checks.readings import NOTHING, UP, Readings, Vectors, middle, moving_mean, respond
+from hybrid_jax.flights.checks.mistakes import NOTHING, UP, Pairs, Vectors, middle, moving_mean
+from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.log import FlightLog, gaps, repeats
 from hybrid_jax.state import QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import Vehicle
 
 OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
-GROUND = "cut it out: --cleaning.in-flight, cut_ground=True"
+GROUND = "cut it out: in_flight=True"
 MORE_FLIGHT = "check on a flight with more motion"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
 THRUST = "v̇ against thrust along body z"
@@ -40,7 +41,7 @@ THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
 YAW_LIMIT = 0.3  # correlation: rotor torque about z is small, and two wrong signs of four leave half of it
 OPPOSED = -0.1  # correlation
-NOISE = 0.2  # share of the least motion below which two readings count as equal
+NOISE = 0.2  # share of the least motion below which two records count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
 FATAL_LAG = 40.0  # ms
 LAG = "motor_time_constant"  # its name in the vehicle file
@@ -67,19 +68,19 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     """
     if vehicle is not None and log.u.shape[1] != vehicle.rotors:
         found = f"{log.name}: has {log.u.shape[1]} motors, {vehicle.name} has {vehicle.rotors}"
-        raise ValueError(f"{found}; log all of them, or name those of its rotors: --motor-order, motor_order=")
+        raise ValueError(f"{found}; log all of them, or name those of its rotors: motor_order=…")
     skip = max(0, (len(log) - MAX_SAMPLES) // 2)
     log = log[skip : skip + MAX_SAMPLES]
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
     clock = "the time is in ms or µs: declare its unit"
-    split = "windows stop at each; --cleaning.resample with --cleaning.longest-gap bridges short ones"
+    split = "windows stop at each; resample=… with longest_gap=… bridges short ones"
     return [
         _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
         _at_most("gaps", lost, "share of intervals", 0.01, split),
         _at_most("repeated samples", stale, "share of samples", 0.01, split),
-        _compare(log, "dp/dt against v", readings.velocities(log), LEAST_MOTION["velocity"]),
-        _compare(log, "q̇ against ω", readings.rates(log), LEAST_MOTION["rates"]),
-        _compare(log, THRUST, readings.accelerations(log), LEAST_MOTION["acceleration"]),
+        _compare(log, "dp/dt against v", mistakes.velocities(log), LEAST_MOTION["velocity"]),
+        _compare(log, "q̇ against ω", mistakes.rates(log), LEAST_MOTION["rates"]),
+        _compare(log, THRUST, mistakes.accelerations(log), LEAST_MOTION["acceleration"]),
         _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
         _columns(log),
         *([_thrust(log, vehicle), *_motors(log, vehicle)] if vehicle is not None else []),
@@ -140,11 +141,11 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
         correlated = (ORDER, value, "correlation", ORDER_LIMIT), (SPIN, math.nan, "correlation", 0.0)
         return [Check(*each, UNKNOWN, MORE_FLIGHT) for each in (*correlated, (GYRO, math.nan, "ms", limit))]
     columns = " ".join(f"u{motor}" for motor in found.order)
-    rotors, numbers = " ".join(map(str, range(vehicle.rotors))), ",".join(map(str, found.order))
+    rotors = " ".join(map(str, range(vehicle.rotors)))
     ordered = found.order == tuple(range(vehicle.rotors))
-    advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}: --motor-order {numbers}"
+    advice = f"reorder the motors: the vehicle's rotors {rotors} are {columns}: motor_order={found.order}"
     lag, late = 1000 * found.lag, found.lag > 0
-    shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: --cleaning.delay {found.lag:.4f}"
+    shift = f"shift the motors {abs(lag):.1f} ms {'later' if late else 'earlier'}: delay={found.lag:.4f}"
     shift += f', or learn "{LAG}" if they are commands' if late else ""
     lagging = _at_most(GYRO, abs(lag), "ms", limit, shift)
     # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
@@ -171,8 +172,8 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
     return Check(SPIN, yaw, "correlation", YAW_LIMIT, *turning)
 
 
-def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
-    """Compare two records in flight under every reading; kinematics hold for each axis, wind and drag move v̇, too."""
+def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
+    """Compare two records in flight with each mistake undone; kinematics hold on each axis, v̇ has wind and drag."""
     sound, limit = flying_intervals(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
     width = min(max(1, round(SPAN / log.dt)), len(sound))
     whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
@@ -187,13 +188,13 @@ def _compare(log: FlightLog, name: str, pairs: Readings, least: float) -> Check:
     return _check(name, value, "relative error", limit, advice)
 
 
-def _nearer(pairs: Readings, limit: float, least: float) -> str:
-    """The reading under which the records agree best; empty if that is the unchanged log."""
-    left = {reading: a - b for reading, (a, b) in pairs.items()}
+def _nearer(pairs: Pairs, limit: float, least: float) -> str:
+    """The mistake that, undone, lets the records agree best; empty if none does."""
+    left = {mistake: a - b for mistake, (a, b) in pairs.items()}
     own = left[NOTHING]
-    # Any improvement counts if two readings differ by more than noise: an axis with little motion contributes little.
-    nearer = [r for r, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
-    best = min(nearer, key=lambda reading: _size(left[reading]), default=NOTHING)
+    # Any improvement counts if two differ by more than noise: an axis with little motion contributes little.
+    nearer = [name for name, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
+    best = min(nearer, key=lambda name: _size(left[name]), default=NOTHING)
     return best if nearer and _relative_error(*pairs[best]) <= limit else ""
 
 

@@ -52,7 +52,7 @@ def _check(name: str, advice: str, value: float = 0.0, unit: str = "", limit: fl
 def _whole(recording: Recording) -> Check:
     damage = recording.facts.get("damage", "")
     return _check(
-        "whole file", f"{damage}; copy it again, or use what is whole: --anyway" if damage else "", bool(damage)
+        "whole file", f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else "", bool(damage)
     )
 
 
@@ -78,8 +78,7 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     if not found:
         return Check("number of motors", 0.0, "motors", expected, UNKNOWN, "no motors")
     who = "the vehicle file has" if vehicle is not None else "the airframe has"
-    chosen = ",".join(map(str, range(expected)))
-    mend = f"name those of the rotors (--motor-order {chosen})" if found > expected else "log all motors"
+    mend = f"name those of the rotors (motor_order={tuple(range(expected))})" if found > expected else "log all motors"
     advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
     return _check("number of motors", "" if found == expected else advice, found, "motors", expected)
 
@@ -95,7 +94,7 @@ def _rates(recording: Recording, dt: float) -> Check:
     slow = {name: interval for name, interval in intervals.items() if interval > SLOWER * dt * (1 + 1e-6)}
     worst = max(intervals.values(), default=np.nan)
     listed = ", ".join(f"{name} {_hertz(each)}" for name, each in slow.items())
-    coarser = f"--cleaning.resample {float(f'{max(slow.values(), default=0.0):.2g}'):g}"
+    coarser = f"dt={float(f'{max(slow.values(), default=0.0):.2g}'):g}"
     kind = recording.facts.get("format", "")
     advice = f"slower than {_hertz(dt)}: {listed}; {ADVICE.get(kind, 'log faster')}; or take {coarser}"
     return _check("slowest signal", advice if slow else "", worst, "s", SLOWER * dt)

@@ -121,7 +121,7 @@ def _header_complaint(path, name: str, names: list[str], header: str, delimiter:
         return f"{path}: row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
     for other in (";", "\t", ","):
         if len(names) == 1 and other != delimiter and header.count(other) > 2:
-            advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map (--columns)"
+            advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map, columns=…"
             return f"{path}: row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
     named = [each for each in names if each]  # a table's index has no name
     found = ", ".join(named[:20])[:200].encode("unicode_escape").decode()
@@ -151,7 +151,7 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
                 if np.isfinite(np.loadtxt([cell or "-"], delimiter=delimiter, comments=None)).all():
                     continue
             if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
-                advice = 'set format = {delimiter = ";", decimal = ","} in a column map (--columns)'
+                advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'
                 return f"row {row + at}, field {names[column]}: {cell[:40]!r} has a decimal comma; {advice}"
             found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
             return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"

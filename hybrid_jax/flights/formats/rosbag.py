@@ -61,7 +61,7 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
     """
     topics = topics or {}
     if unknown := topics.keys() - set(ROLES):
-        raise ValueError(f"--topics: must name {', '.join(ROLES)}, got {', '.join(sorted(unknown))}")
+        raise ValueError(f"topics: must name {', '.join(ROLES)}, got {', '.join(sorted(unknown))}")
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -102,8 +102,9 @@ def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[s
             _require(path, topics[role], types)
             fitting = [topics[role]]
         if len(fitting) > 1:
-            names = " and ".join(sorted(fitting))
-            raise ValueError(f"{path}: topics {names} hold {role}; choose one: --topics {role}={sorted(fitting)[0]}")
+            first, *_ = names = sorted(fitting)
+            choose = f'choose one: topics={{"{role}": "{first}"}}'
+            raise ValueError(f"{path}: topics {' and '.join(names)} hold {role}; {choose}")
         if fitting:
             found[role] = (fitting[0], "", "")
     if "motors" in topics:
@@ -112,7 +113,7 @@ def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[s
         if len(given) != 2 or given[1] not in SCALES["motors"] or given[1] == "command":
             units = ", ".join(unit for unit in SCALES["motors"] if unit != "command")
             raise ValueError(
-                f"--topics: motors must be TOPIC:FIELD:UNIT, the unit one of {units}; got {topics['motors']}"
+                f"topics: motors must be TOPIC:FIELD:UNIT, the unit one of {units}; got {topics['motors']}"
             )
         found["motors"] = (topic, *given)
     elif fitting := [topic for topic, kind in types.items() if kind.split("/")[-1] == "Actuators"]:

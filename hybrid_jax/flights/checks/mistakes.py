@@ -1,0 +1,111 @@
+"""Mistakes of logs: pairs of records that should be equal, such as dp/dt and v, each with one mistake undone."""
+
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rates_between, rotation_of
+from hybrid_jax.flights.checks.airborne import flying_intervals
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+
+NOTHING = "nothing to correct"  # the log as it is
+LATE = 0.1  # delay or advance of a velocity that is tried [s]
+UP = np.array([0.0, 0.0, 1.0])
+GRAVITY = 9.81 * UP
+FLIPS = dict(zip("xyz", 1 - 2 * np.eye(3), strict=True))
+
+Vectors = Float[np.ndarray, "n 3"]
+Pairs = dict[str, tuple[Vectors, Vectors]]
+
+
+def velocities(log: FlightLog) -> Pairs:
+    """dp/dt and v [m/s]."""
+    p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
+    slope, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], BODIES["FRD"]
+    now, late = np.arange(len(v)), round(LATE / log.dt)
+    stated = {
+        NOTHING: v,
+        'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
+        'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(v @ frd),
+        "x and y of velocity or position are exchanged: name their columns the other way round": v[:, [1, 0, 2]],
+        'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
+        "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
+        "velocity is in mm/s or position in km: set the units": v * 1e-3,
+        "velocity is in cm/s: set its unit": v * 1e-2,
+        "position is in mm: set its unit": v * 1e3,
+        "position is in cm: set its unit": v * 1e2,
+        f"velocity is about {LATE:g} s late: shift it": v[np.minimum(now + late, now[-1])],
+        f"velocity is about {LATE:g} s early: shift it": v[np.maximum(now - late, 0)],
+    }
+    for axis, signs in FLIPS.items():
+        stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
+    return {mistake: (slope, middle(values)) for mistake, values in stated.items()}
+
+
+def rates(log: FlightLog) -> Pairs:
+    """Body rates that turn each attitude into the next, and ω [rad/s]."""
+    q, omega = log.x[:, QUATERNION], middle(log.x[:, BODY_RATES])
+    turned, back = rates_between(log.t, q), rotation_of(q[:-1]).inv()
+    found = {
+        NOTHING: (turned, omega),
+        "body rates are in degrees per second: declare deg/s": (turned, omega * np.pi / 180),
+        "body rates are in rad/s, declared deg/s: declare rad/s": (turned, omega * 180 / np.pi),
+        "body rates are in the world frame: rotate them into the body": (turned, back.apply(omega)),
+        "body rates and attitude differ in body frame: convert the one that is FRD": (turned, omega @ BODIES["FRD"]),
+        "body rates have the opposite sign": (turned, -omega),
+    }
+    for mistake, attitude in _attitudes(q).items():
+        found[mistake] = rates_between(log.t, attitude), omega
+    for axis, signs in FLIPS.items():
+        found[f"w{axis} has the wrong sign: flip it"] = turned, omega * signs
+        found[f"q{axis} has the wrong sign: flip it"] = rates_between(log.t, q * [1, *signs]), omega
+    return found
+
+
+def accelerations(log: FlightLog) -> Pairs:
+    """v̇, and Σu² along body z less gravity at the best thrust coefficient [m/s²]."""
+    q, v = log.x[:, QUATERNION], log.x[:, VELOCITY]
+    attitude, thrust = rotation_of(q), (log.u[:-1] ** 2).sum(axis=1, keepdims=True)
+    frd = attitude.as_matrix() @ BODIES["FRD"].T
+    ned = quaternion_from_matrix(WORLDS["NED"] @ frd)
+    stated = {
+        NOTHING: (q, v),
+        'the log is NED and FRD: set world = "NED" and body = "FRD"': (ned, v @ WORLDS["NED"].T),
+        "attitude alone is NED and FRD: convert it": (ned, v),
+        'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
+        "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
+        'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
+        'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
+    }
+    # Other mistakes of attitudes rotate thrust about z only, which wind or a load may do as well.
+    stated |= {mistake: (other, v) for mistake, other in list(_attitudes(q).items())[:2]}
+    return {mistake: _by_thrust(log, q, v, thrust) for mistake, (q, v) in stated.items()}
+
+
+def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"]]:
+    last_first, inverse = np.roll(q, 1, axis=1), np.array([1, -1, -1, -1])
+    return {
+        "the quaternion is (x, y, z, w), read as (w, x, y, z): declare xyzw": last_first,
+        "the quaternion is world → body: conjugate it": q * inverse,
+        "the quaternion is (w, x, y, z), declared xyzw: declare wxyz": np.roll(q, -1, axis=1),
+        "the quaternion is (x, y, z, w) and world → body: declare xyzw and conjugate it": last_first * inverse,
+    }
+
+
+def _by_thrust(log: FlightLog, q, v, thrust) -> tuple[Vectors, Vectors]:
+    slope, sound = np.diff(v, axis=0) / np.diff(log.t)[:, None], flying_intervals(log)[:, None]
+    predicted = middle(rotation_of(q).apply(UP)) * thrust
+    power = (predicted**2 * sound).sum()
+    scale = max(0.0, (predicted * (slope + GRAVITY) * sound).sum() / power) if power > 0 else 0.0
+    return slope, scale * predicted - GRAVITY
+
+
+def middle(values: Float[np.ndarray, "n d"]) -> Float[np.ndarray, "n-1 d"]:
+    """Means of adjacent samples."""
+    return 0.5 * (values[1:] + values[:-1])
+
+
+def moving_mean(values: Float[np.ndarray, "n d"], width: int) -> Float[np.ndarray, "m d"]:
+    """The mean of each `width` consecutive rows."""
+    total = np.cumsum(np.concatenate([np.zeros((1, values.shape[1])), values]), axis=0)
+    return (total[width:] - total[:-width]) / width

@@ -1,0 +1,106 @@
+"""How the body turns as its motors change: their order, their direction of spin and their lag, by correlation."""
+
+from functools import cache
+from itertools import combinations, permutations
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hybrid_jax.flights.checks.mistakes import middle, moving_mean
+from hybrid_jax.flights.log import FlightLog, sound_intervals
+from hybrid_jax.state import BODY_RATES
+from hybrid_jax.vehicle import Vehicle
+
+LONGEST_LAG = 0.1  # s, either way
+# Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
+# and offsets of the centre of mass, which motors counteract and would appear to cause.
+FAST, SLOW = 0.03, 0.2  # s
+YAW_LEAD = 0.02  # s by which yaw may precede or follow roll and pitch
+# Of more than four motors the pilot mixes four numbers: several orders explain roll and pitch. One that does is kept.
+AMBIGUOUS = 0.1  # of the sum of two correlations
+PERMUTED = 6  # rotors at most of which all orders are tried: 720; of more, those with two exchanged
+
+
+class Response(NamedTuple):
+    """The order of motors and the lag that explain roll and pitch best, and their correlation with yaw."""
+
+    order: tuple[int, ...]  # u[:, order] is in the order of the vehicle's rotors
+    yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
+    lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
+    correlations: list[float]  # of roll and pitch at that order and lag, of yaw (its size) at its best lag near it
+    as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
+
+
+def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
+    """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
+    reach = round(LONGEST_LAG / log.dt)
+    torque, squares = _quick(log, vehicle)
+    if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
+        return None
+    arms = np.asarray(vehicle.rotor_positions)
+    # Roll, pitch and yaw torque per u² of each rotor, up to a positive factor per row.
+    mix = np.stack([arms[:, 1], -arms[:, 0], np.asarray(vehicle.spin)])
+    table = np.stack([correlations(torque, squares, mix, lag) for lag in range(-reach, reach + 1)])
+    # Yaw does not count: an accelerating rotor turns the body at once, so yaw precedes the motors.
+    score = table[..., 0] + table[..., 1]
+    if len(arms) > 4 and score[:, 0].max() > score.max() - AMBIGUOUS:
+        score = score[:, :1]
+    at, best = np.unravel_index(score.argmax(), score.shape)
+    near = round(YAW_LEAD / log.dt)
+    around = table[max(0, at - near) : at + near + 1, best, 2]
+    yaw = around[np.abs(around).argmax()]
+    sign = -1 if yaw < 0 else 1
+    found = [*table[at, best, :2].tolist(), float(abs(yaw))]
+    lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
+    return Response(tuple(orders(len(arms))[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+
+
+@cache
+def orders(rotors: int) -> Int[np.ndarray, "orders rotors"]:
+    """The orders of the motors that are tried, first the one that they have."""
+    if rotors <= PERMUTED:
+        return np.array(list(permutations(range(rotors))))
+    found = np.tile(np.arange(rotors), (1 + rotors * (rotors - 1) // 2, 1))
+    for row, (i, j) in zip(found[1:], combinations(range(rotors), 2), strict=True):
+        row[[i, j]] = j, i
+    return found
+
+
+def correlations(
+    torque: Float[np.ndarray, "n 3"], squares: Float[np.ndarray, "n rotors"], mix: Float[np.ndarray, "3 rotors"], lag
+) -> Float[np.ndarray, "orders 3"]:
+    """Correlation of torque with the prediction of each order of the motors `lag` samples before."""
+    ahead, behind = (torque[lag:], squares[: len(squares) - lag]) if lag >= 0 else (torque[:lag], squares[-lag:])
+    cross, spread = ahead.T @ behind, behind.T @ behind
+    order = orders(mix.shape[1])
+    shared = np.einsum("aj,aoj->oa", mix, cross[:, order])
+    variance = np.einsum("ai,oij,aj->oa", mix, spread[order[:, :, None], order[:, None, :]], mix)
+    least = 1e-9 * variance.max(axis=0)  # some orders of six rotors predict nothing
+    return np.where(variance > least, shared / np.sqrt(np.maximum(variance * (ahead**2).sum(axis=0), 1e-300)), 0.0)
+
+
+def _quick(log: FlightLog, vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 3"], Float[np.ndarray, "n rotors"]]:
+    """J ω̇ + ω × J ω and u² of each interval, band-passed from `FAST` to `SLOW`; zero near gaps."""
+    fast, slow = (max(1, round(span / log.dt)) for span in (FAST, SLOW))
+    sound, omega, inertia = sound_intervals(log), log.x[:, BODY_RATES], np.asarray(vehicle.inertia)
+    if len(sound) < fast + slow:
+        return np.zeros((0, 3)), np.zeros((0, log.u.shape[1]))
+    mean = middle(omega)
+    torque = inertia * np.diff(omega, axis=0) / np.diff(log.t)[:, None] + np.cross(mean, inertia * mean)
+    bands = []
+    for values in (torque, log.u[:-1] ** 2):
+        smooth = moving_mean(values, fast)
+        trend = moving_mean(smooth, slow)
+        bands.append(smooth[slow // 2 :][: len(trend)] - trend)
+    whole = moving_mean(sound[:, None].astype(float), fast + slow - 1) > 1 - 1e-9
+    return np.where(whole, bands[0], 0.0), np.where(whole, bands[1], 0.0)
+
+
+def _vertex(score: Float[np.ndarray, " l"], at: int) -> float:
+    """Sub-sample position of the peak, −0.5 … 0.5, by a parabola through the maximum and its neighbours."""
+    if not 0 < at < len(score) - 1:
+        return 0.0
+    left, top, right = score[at - 1 : at + 2]
+    curve = left - 2 * top + right
+    return float(0.5 * (left - right) / curve) if curve < 0 else 0.0
