@@ -33,7 +33,7 @@ def log_tables(records: Sequence[Mapping[str, Any]]) -> list[Table]:
     failed = [(flight, c["name"], _value(c), c["suggestion"]) for flight, c in failed_checks(records)]
     header = ("flight", "samples", "s", "dt [s]", "gaps", "repeated", "used samples", "changes")
     names = [str(SHORT.get(check["name"], check["name"])) for check in records[0]["checks"]]
-    tables = [Table("Logs", header, lines), Table(CHECKED, ("flight", *names), verdicts)]
+    tables = [Table("Logs", header, lines, folded=True), Table(CHECKED, ("flight", *names), verdicts, folded=True)]
     advice = Table("Checks that failed or warn, and what to do", ("flight", "check", "value", "suggestion"), failed)
     return [*([advice] if failed else []), *tables]
 

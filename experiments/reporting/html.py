@@ -12,10 +12,9 @@ from experiments.reporting.results import leaves
 from experiments.reporting.tables import Table, best_cells, number_in
 from hybrid_jax.io.files import json_text
 
-LARGEST_SVG = 1_000_000  # bytes; a larger drawing is shown as its PNG
 VERDICTS = {"✓": "holds", "✗": "fails", "– undecided": "undecided"}
 UNBROKEN = 28  # characters of a number with its deviation; a longer cell may take several lines
-TYPES = {".svg": "image/svg+xml", ".png": "image/png", ".gif": "image/gif"}
+TYPES = {".png": "image/png", ".gif": "image/gif"}
 STYLE = """
 :root { color-scheme: light dark; --line: #8884; --soft: #8881; --link: #0072b2; --good: #009e73; --bad: #d55e00 }
 body { font: 16px/1.5 system-ui, sans-serif; max-width: 72rem; margin: 0 auto; padding: 1rem }
@@ -56,7 +55,7 @@ document.addEventListener("keydown", event => {
 
 
 def document(report: Report, out: Path) -> str:
-    """The page; figures are read from `out`, and shown as an SVG where there is one."""
+    """The page; figures are read from `out`."""
     title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
     name = html.escape(title.lstrip("# "))
     parts = [f"<h1>{name}</h1>"]
@@ -64,7 +63,9 @@ def document(report: Report, out: Path) -> str:
         parts.append(f'<div class="conclusion">{" ".join(map(html.escape, sentences))}</div>')
     parts += [f'<p class="warning">{html.escape(line)}</p>' for line in report.warnings]
     parts.append(_folded("The question, the models and the measures", _prose(introduction)))
-    parts += [_table(table) for table in report.shown()]
+    for table in report.shown():
+        shown = _folded(html.escape(table.title), _table(table._replace(title=""))) if table.folded else _table(table)
+        parts.append(shown)
     if report.figures:
         parts.append("<h2>Figures</h2>")
         parts += [_figure(out / path, caption) for path, caption in report.figures.items()]
@@ -101,8 +102,6 @@ def _cell(text: str, best: bool) -> str:
 
 
 def _figure(path: Path, caption: str) -> str:
-    drawn = path.with_suffix(".svg")
-    path = drawn if drawn.exists() and drawn.stat().st_size <= LARGEST_SVG else path
     if not path.exists():
         return f'<p class="warning">{html.escape(path.name)} is missing.</p>'
     data = base64.b64encode(path.read_bytes()).decode()

@@ -1,5 +1,6 @@
 """What an experiment leaves in its folder, report.html, report.md, report.json and rows.csv, and in a terminal."""
 
+import json
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +23,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
 
     The tables, the notes and where the report is are printed to the console, if any. `paper`: also LaTeX tables.
     """
-    out, record = Path(out), json_text(to_json(report))
+    out, record = Path(out), lines_of(to_json(report))
     tables = {f"{PAPER}/{latex.file_name(table)}.tex": latex.latex(table) for table in report.shown() if paper}
     contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report)} | tables
     contents |= {HTML_NAME: html.document(report, out), JSON_NAME: record}
@@ -44,13 +45,38 @@ def to_json(report: Report) -> dict[str, Any]:
     return json_value(own | dict(report.extra))
 
 
+def rounded(value: Any) -> Any:
+    """A JSON value with its numbers to seven digits."""
+    match value:
+        case float():
+            return float(f"{value:.7g}")
+        case dict():
+            return {name: rounded(item) for name, item in value.items()}
+        case list():
+            return [rounded(item) for item in value]
+    return value
+
+
+def lines_of(record: dict[str, Any]) -> str:
+    """JSON with a line for each row, and numbers to seven digits, as single precision has."""
+
+    def text(value: Any) -> str:
+        return json.dumps(rounded(value), separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+
+    def entry(value: Any) -> str:
+        return "[\n" + ",\n".join(map(text, value)) + "\n]" if isinstance(value, list) and value else text(value)
+
+    return "{\n" + ",\n".join(f"{text(name)}: {entry(value)}" for name, value in record.items()) + "\n}\n"
+
+
 def page(report: Report) -> str:
     """report.md: head, tables, figures, notes, environment and configuration."""
     title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
     said = [" ".join(map(plain, report.conclusions())), *map(plain, report.warnings), introduction.strip()]
     parts = [title, *(text for text in said if text)]
     for table in report.shown():
-        parts += [f"## {plain(table.title)}", markdown(table)]
+        title, lines = plain(table.title), markdown(table)
+        parts += [folded(title, lines)] if table.folded else [f"## {title}", lines]
     if report.figures:
         captions = {path: plain(caption) for path, caption in report.figures.items()}
         parts += ["## Figures", *(f"![{caption}]({path})\n\n*{caption}*" for path, caption in captions.items())]
@@ -60,5 +86,10 @@ def page(report: Report) -> str:
         shown = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
         lines.append((name + (" [s]" if name.startswith("seconds, ") else ""), shown))
     config = f"```json\n{json_text(report.config)}```"
-    parts += ["## Environment", markdown(Table("", ("", ""), lines)), "## Configuration", config]
+    parts += [folded("Environment", markdown(Table("", ("", ""), lines))), folded("Configuration", config)]
     return "\n\n".join(parts) + "\n"
+
+
+def folded(title: str, content: str) -> str:
+    """Markdown that opens on a click, in a site and in a forge."""
+    return f'<details markdown="1"><summary>{title}</summary>\n\n{content}\n\n</details>'

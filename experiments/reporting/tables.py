@@ -36,6 +36,7 @@ class Table(NamedTuple):
     best: Literal["", "line", "column"] = ""  # the smallest number of each line or column is the best
     labels: int = 1  # columns that say what a line is of
     verdicts: bool = False  # whether these are verdicts, which a smoke run must not show
+    folded: bool = False  # whether a page shows it on a click alone
 
 
 def tabulate(
