@@ -8,7 +8,7 @@ See docs/howto/export.md for an example.
 """
 
 from hybrid_jax.export.c.adaptation import export_adaptation_c
-from hybrid_jax.export.c.code import export_c
+from hybrid_jax.export.c.fields import export_c
 from hybrid_jax.export.casadi_functions import acados_model, casadi_function, casadi_step
 from hybrid_jax.export.stablehlo import Program, export_field, export_step, load_program
 

@@ -2,6 +2,7 @@
 
 import ctypes
 from functools import cache
+from types import SimpleNamespace
 
 import equinox as eqx
 import jax
@@ -15,6 +16,7 @@ from jax.flatten_util import ravel_pytree
 import hybrid_jax as hj
 from hybrid_jax.control import advance
 from hybrid_jax.export import export_adaptation_c
+from hybrid_jax.export.c.adaptation import _parts
 from hybrid_jax.online.estimator import OnlineAdaptation
 
 pytestmark = needs_compiler
@@ -119,3 +121,11 @@ def test_c_hardly_grows_with_causes(tmp_path):
         return export_adaptation_c(tmp_path, adaptation, name=name)[1].stat().st_size
 
     assert size("six", CAUSES + more) < 1.2 * size("three", CAUSES)
+
+
+def test_names_of_a_model_cannot_leave_their_comment():
+    hostile = {"names": ("k*/ int main(void) {} /*", "disturbance[vx]", "β\n#error"), "dt": DT}
+    state = {"trusted": jnp.zeros(1), "*/\\\n": jnp.zeros(2)}
+    parts = _parts(SimpleNamespace(**hostile), state)
+    assert parts["names"] == "k___int_main_void_______, disturbance[vx], ___error"
+    assert parts["layout"] == "____ at 0 (2),\n   trusted at 2 (1)"

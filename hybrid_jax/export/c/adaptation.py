@@ -3,7 +3,6 @@
 import re
 from collections.abc import Callable
 from pathlib import Path
-from string import Template
 from typing import Any
 
 import equinox as eqx
@@ -11,11 +10,10 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
-from hybrid_jax import checks
-from hybrid_jax.export.c.code import body_of, shared_by
-from hybrid_jax.export.c.loops import Tables
+from hybrid_jax.export.c.fields import body_of, check_name, written
+from hybrid_jax.export.c.printer import CPrinter
+from hybrid_jax.export.c.tables import Tables
 from hybrid_jax.export.program import Size, sizes_of
-from hybrid_jax.io.files import write_atomic
 
 HEADER = """\
 /* A filter that adapts a model while it runs, written by hybrid_jax.
@@ -84,15 +82,22 @@ def export_adaptation_c(
 ) -> tuple[Path, Path]:
     """Write NAME.h and NAME.c: NAME_begin and NAME_update of an `OnlineAdaptation`, as its methods.
 
-    Arguments and errors as of `export_c`.
+    Errors as of `export_c`.
+
+    Args:
+        folder: where the files are written; it is made if there is none.
+        adaptation: an `OnlineAdaptation`.
+        name: as of `export_c`, like `double`, `state_size` and `input_size`.
+        double: compute in double precision, else in single.
+        state_size: d; by default what the filter's field knows.
+        input_size: m; likewise.
 
     Returns:
         The paths of the header and of the source.
     """
-    if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
-        raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
+    check_name(name)
     d, m = sizes_of(adaptation.field, state_size, input_size)
-    tables = Tables(double)
+    tables, printer = Tables(double), CPrinter(double)
     with jax.enable_x64(True):
         exact = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, adaptation)
         first = exact.begin(jnp.zeros(d))
@@ -109,24 +114,19 @@ def export_adaptation_c(
         stepped = body_of(update, list(likes.values()), tables, ("next",), tuple(likes))
         begun = body_of(begin, [likes["x"]], tables, ("state",), ("x",))
     parts = (
-        _parts(exact, first, tables)
-        | shared_by(tables, stepped, begun)
+        _parts(exact, first)
+        | printer.shared(tables, stepped, begun)
         | {
-            "name": name,
-            "NAME": name.upper(),
-            "type": "double" if double else "float",
             "d": d,
             "m": m,
+            "dt": printer.number(float(adaptation.dt)),
             "size": flat.size,
-            "begin": begun,
-            "update": stepped,
+            "begin": printer.body(begun),
+            "update": printer.body(stepped),
             "elapsed": f"periods of {name.upper()}_DT ago",
         }
     )
-    written = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
-    for path, template in zip(written, (HEADER, SOURCE), strict=True):
-        write_atomic(path, Template(template).substitute(parts))
-    return written
+    return written(folder, name, HEADER, SOURCE, parts)
 
 
 def _in_turn(one: Callable) -> Callable:
@@ -134,18 +134,20 @@ def _in_turn(one: Callable) -> Callable:
     return lambda *stacked: jax.lax.map(lambda row: one(*row), stacked)
 
 
-def _parts(adaptation: Any, state: Any, tables: Tables) -> dict[str, Any]:
+def _parts(adaptation: Any, state: Any) -> dict[str, Any]:
     """Where what lies in the state, in words."""
     places, at = [], 0
     for path, value in jax.tree_util.tree_leaves_with_path(state):
         places.append((jax.tree_util.keystr(path, simple=True, separator="."), at, value.size))
         at += value.size
-    layout = ",\n   ".join(f"{key} at {start} ({size})" for key, start, size in places)
-    names: Callable = ", ".join
     return {
-        "layout": layout,
-        "names": names(adaptation.names),
+        "layout": ",\n   ".join(f"{_plain(key)} at {start} ({size})" for key, start, size in places),
+        "names": ", ".join(map(_plain, adaptation.names)),
         "p": len(adaptation.names),
         "trusted": next(start for key, start, _ in places if key == "trusted"),
-        "dt": tables.text(adaptation.dt),
     }
+
+
+def _plain(name: str) -> str:
+    """A name of a model file as it may stand in a comment, which it cannot end."""
+    return re.sub(r"[^A-Za-z0-9_.\[\]]", "_", name)

@@ -4,54 +4,45 @@ A column is a NumPy array of objects: numbers (floats, or bools), and `Entry` fo
 physics thus become straight code, and layers of a network loops over tables and arrays.
 """
 
-import re
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import reduce
 from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
 from hybrid_jax.export.c import loops
-from hybrid_jax.export.c.loops import Entry
+from hybrid_jax.export.c.nodes import (
+    Address,
+    Array,
+    Call,
+    Entry,
+    Expression,
+    Operation,
+    Parameter,
+    Statement,
+    Step,
+    Variable,
+    arranged,
+    names,
+    nested,
+)
+from hybrid_jax.export.c.printer import OPERATIONS
+from hybrid_jax.export.c.tables import Tables
 from hybrid_jax.export.translation import Entries, Translation, Value
 
 EXPANDED = 24  # operations on at most so many entries are written out; more become a loop if they can
 COPIED = 200  # and on at most so many if they cannot
 PRODUCTS = 160  # multiplications of a matrix product that are written out
 
-# Name → C of operands in braces. {f} is the suffix of a function of math.h, {r} the type.
-_FUNCTIONS = (
-    *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt"),
-    *("sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh", "asinh", "acosh", "atanh"),
-)
-CODE: dict[str, str] = {
-    **{name: f"{name}{{f}}({{0}})" for name in _FUNCTIONS},
-    **{name: f"{{0}} {sign} {{1}}" for name, sign in zip(("add", "sub", "mul", "div"), "+-*/", strict=True)},
-    **{
-        name: f"{{0}} {sign} {{1}}" for name, sign in zip(("lt", "le", "gt", "ge"), ("<", "<=", ">", ">="), strict=True)
-    },
-    "eq": "{0} == {1}",
-    "ne": "{0} != {1}",
-    "and": "{0} && {1}",
-    "or": "{0} || {1}",
-    "not": "!{0}",
-    "neg": "-{0}",
-    "abs": "fabs{f}({0})",
-    "atan2": "atan2{f}({0}, {1})",
-    "pow": "pow{f}({0}, {1})",
-    "rem": "fmod{f}({0}, {1})",
-    "sign": "({r})(({0} > 0) - ({0} < 0))",
-    "max": "larger({0}, {1})",
-    "min": "smaller({0}, {1})",
-    "square": "{0} * {0}",
-    "rsqrt": "1 / sqrt{f}({0})",
-    "logistic": "1 / (1 + exp{f}(-{0}))",
-    "select_n": "{0} ? {2} : {1}",
-    "convert_element_type": "({r}){0}",
-}
 LOGICAL = ("lt", "le", "gt", "ge", "eq", "ne", "and", "or", "not")
 IDENTITY = ("copy", "copy_p", "stop_gradient")
+COMPOSED: dict[str, Callable[..., Operation]] = {
+    "square": lambda a: Operation("mul", (a, a)),
+    "rsqrt": lambda a: Operation("div", (1, Operation("sqrt", (a,)))),
+    "logistic": lambda a: Operation("div", (1, Operation("add", (1, Operation("exp", (Operation("neg", (a,)),)))))),
+    "sign": lambda a: _real(Operation("sub", (Operation("gt", (a, 0)), Operation("lt", (a, 0))))),
+}
 _NUMBERS: dict[str, Callable] = {
     "add": lambda a, b: a + b,
     "sub": lambda a, b: a - b,
@@ -67,10 +58,10 @@ class CTranslation(Translation[np.ndarray]):
 
     language: ClassVar[str] = "C"
     operations: ClassVar[dict[str, Callable]] = dict.fromkeys(
-        (*CODE, *IDENTITY, "add_any", "integer_pow", "clamp"), lambda *_: None
+        (*OPERATIONS, *COMPOSED, *IDENTITY, "add_any", "integer_pow", "clamp"), lambda *_: None
     )
-    tables: loops.Tables
-    statements: list[loops.Statement] = field(default_factory=list)
+    tables: Tables
+    steps: list[Step] = field(default_factory=list)
     _written: dict[Any, Entry] = field(default_factory=dict)  # (operation, operands) → what holds its result
 
     def known(self, array):
@@ -118,15 +109,19 @@ class CTranslation(Translation[np.ndarray]):
         found = called._run(inner.jaxpr, inner.consts, [one.inside for one in passed])
         results, outs = [called._column(one) for one in found], [self.tables.name("r") for _ in found]
         body = called.body(results, outs)
-        words = set(re.findall(r"\w+", body))
-        taken = [one for one in passed if one.name in words]
-        name = self.tables.function([*(one.parameter for one in taken), *(f"real *{out}" for out in outs)], body)
+        read = names(body)
+        taken = [(one.parameter, one.given) for one in passed if one.parameter and one.parameter.name in read]
+        written = [Parameter(out, array=True, written=True) for out in outs]
+        name = self.tables.function([*(parameter for parameter, _ in taken), *written], body)
 
         starts = count * np.cumsum([0, *map(len, results)])
-        places = [f"{{{i}}}" for i in range(len(taken))]
-        places += [f"{{out}} + {start} + {len(one)} * i0" for start, one in zip(starts, results, strict=False)]
-        call = loops.nest((count,), f"{name}({', '.join(places)});")
-        whole = self._define(int(starts[-1]), loops.Code(call, [one.given for one in taken]))
+
+        def fill(out: str) -> Statement:
+            pairs = zip(starts, results, strict=False)
+            filled = (Address(out, int(start), (len(one),)) for start, one in pairs)
+            return nested((count,), Call(name, (*(given for _, given in taken), *filled)))
+
+        whole = self._filled(int(starts[-1]), fill)
         parts = zip(np.split(whole, starts[1:-1]), found, strict=True)
         return [Entries(part, (count, *one.shape)) for part, one in parts]
 
@@ -136,30 +131,25 @@ class CTranslation(Translation[np.ndarray]):
             return _Passed(value)  # a constant, which the function may as well have
         entries, size = self._column(value), int(np.prod(shape))
         name, logical = self.tables.name("p"), any(self._is_logical(one) for one in entries)
-        kind = "int" if logical else "real"
         if not stride and size == 1:
             inside = column([Entry(name, None, logical)])
-            given = loops.Code(self.tables.text(entries[0]), (), loops.used(entries))
-            return _Passed(Entries(inside, shape), name, f"{kind} {name}", given)
+            return _Passed(Entries(inside, shape), Parameter(name, logical), entries[0])
         inside = column(Entry(name, i, logical) for i in range(size))
-        given = loops.address(self.tables, self._gathered(entries))
-        given = replace(given, text=f"{given.text} + {size} * i0") if stride else given
-        return _Passed(Entries(inside, shape), name, f"const {kind} *{name}", given)
+        given = loops.address(self.tables, self._gathered(entries), stride * size)
+        return _Passed(Entries(inside, shape), Parameter(name, logical, array=True), given)
 
-    def body(self, results: Sequence[np.ndarray], outs: Sequence[str]) -> str:
-        """The lines of a function that fills some arrays with these results."""
-        read = frozenset().union(*map(loops.used, results))
-        pairs = zip(outs, results, strict=True)
-        end = [self.tables.filled(loops.stores(out, one, self.tables), []) for out, one in pairs]
-        code = loops.declared(loops.needed(self.statements, read), read, end)
-        return "\n".join(f"    {line}" for line in code.splitlines())
+    def body(self, results: Sequence[np.ndarray], outs: Sequence[str]) -> tuple[Statement, ...]:
+        """The statements of a function that fills some arrays with these results."""
+        end = [one for out, result in zip(outs, results, strict=True) for one in loops.stores(out, result)]
+        return arranged(self.steps, frozenset().union(*(names(tuple(one)) for one in results)), end)
 
     def fold(self, name, rows):
         if len(rows) * len(rows[0]) > EXPANDED:
             shape = (len(rows[0]), len(rows))
             whole = self._compact(np.stack(rows, axis=1).ravel(), shape)
             operand = loops.indexed(self.tables, whole, shape)
-            return self._define(len(rows[0]), loops.folding(CODE[name], operand, shape))
+            assert operand is not None  # contiguous
+            return self._filled(len(rows[0]), lambda out: loops.folding(out, name, operand, shape))
         return reduce(lambda a, b: self.entrywise(name, (a, b), (len(a),), ()), rows)
 
     def matrix_product(self, left, right, sizes):
@@ -182,9 +172,9 @@ class CTranslation(Translation[np.ndarray]):
         (m, k), n = a.shape, b.shape[1]
         if m == 1 and n > 1 and loops.is_contiguous(b.T.ravel()):
             return self._loops(b.T, a.T).T
-        operands = [loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
-        call = f"dense({{0}}, {{1}}, {{out}}, {m}, {k}" if n == 1 else f"product({{0}}, {{1}}, {{out}}, {m}, {k}, {n}"
-        return self._define(m * n, loops.Code(f"{call});", operands)).reshape(m, n)
+        given = [loops.address(self.tables, self._gathered(one.ravel(), one.shape)) for one in (a, b)]
+        function, sizes = ("dense", (m, k)) if n == 1 else ("product", (m, k, n))
+        return self._filled(m * n, lambda out: Call(function, (*given, Address(out), *sizes))).reshape(m, n)
 
     def _dot(self, row: Iterable, other: Iterable):
         terms = [self._one("mul", pair) for pair in zip(row, other, strict=True)]
@@ -221,12 +211,10 @@ class CTranslation(Translation[np.ndarray]):
 
     def _scalar(self, name: str, operands: Sequence) -> Entry:
         if (found := self._written.get((name, *operands))) is None:
-            texts = [self.tables.text(one) for one in operands]
-            kind = "int" if name in LOGICAL else "real"
-            found = Entry(self.tables.name("t"), None, kind == "int")
-            uses = frozenset(one.name for one in operands if isinstance(one, Entry))
-            code = self.tables.filled(CODE[name], texts)
-            self.statements.append(loops.Statement(found.name, uses, f"const {kind} {found.name} = {code};"))
+            logical = name in LOGICAL
+            found = Entry(self.tables.name("t"), None, logical)
+            defined = Variable(found.name, _operation(name, operands), logical)
+            self.steps.append(Step(found.name, (defined,)))
             self._written[(name, *operands)] = found
         return found
 
@@ -236,7 +224,8 @@ class CTranslation(Translation[np.ndarray]):
         known = [one for one in operands if one is not None]
         if len(known) < len(operands):
             return None
-        return self._define(int(np.prod(shape)), loops.mapping(CODE[name], known, shape), name in LOGICAL)
+        value = _operation(name, known)
+        return self._filled(int(np.prod(shape)), lambda out: loops.mapping(out, value, shape), name in LOGICAL)
 
     def _gathered(self, entries: np.ndarray, shape: tuple[int, ...] | None = None) -> np.ndarray:
         """The entries, of an array of this shape, one after the other in one array, copied there unless they are."""
@@ -244,9 +233,8 @@ class CTranslation(Translation[np.ndarray]):
             return entries
         logical = any(self._is_logical(one) for one in entries)
         if shape is not None and (found := loops.indexed(self.tables, entries, shape)) is not None:
-            return self._define(len(entries), loops.mapping("{0}", [found], shape), logical)
-        lines = loops.stores("{out}", entries, self.tables)
-        return self._define(len(entries), loops.Code(lines, (), loops.used(entries)), logical)
+            return self._filled(len(entries), lambda out: loops.mapping(out, found, shape), logical)
+        return self._filled(len(entries), lambda out: loops.stores(out, entries), logical)
 
     def _compact(self, entries: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
         """Entries of an array of this shape, of which each that is there along a whole axis is copied once."""
@@ -258,12 +246,13 @@ class CTranslation(Translation[np.ndarray]):
             grid = first if (grid == first).all() else grid
         return np.broadcast_to(self._gathered(grid.ravel(), grid.shape).reshape(grid.shape), shape).ravel()
 
-    def _define(self, size: int, code: loops.Code, logical: bool = False) -> np.ndarray:
-        """A new array that the code fills."""
-        name, kind = self.tables.name("a"), "int" if logical else "real"
-        text = self.tables.filled(code.text, [one.text for one in code.operands], out=name)
-        uses = code.uses.union(*(one.uses for one in code.operands))
-        self.statements.append(loops.Statement(name, uses, text, (kind, size)))
+    def _filled(
+        self, size: int, fill: Callable[[str], Statement | tuple[Statement, ...]], logical: bool = False
+    ) -> np.ndarray:
+        """A new array; `fill` gives the statements that fill that of a name."""
+        name = self.tables.name("a")
+        code = fill(name)
+        self.steps.append(Step(name, code if isinstance(code, tuple) else (code,), Array(name, size, logical)))
         return column(Entry(name, i, logical) for i in range(size))
 
     @staticmethod
@@ -275,9 +264,16 @@ class _Passed(NamedTuple):
     """A value as a function has it, and how it comes in; a constant does not."""
 
     inside: Value
-    name: str = ""
-    parameter: str = ""
-    given: loops.Code = loops.Code("")
+    parameter: Parameter | None = None
+    given: Expression = 0.0
+
+
+def _operation(name: str, operands: Sequence[Expression]) -> Operation:
+    return COMPOSED[name](*operands) if name in COMPOSED else Operation(name, tuple(operands))
+
+
+def _real(logical: Expression) -> Operation:
+    return Operation("convert_element_type", (logical,))
 
 
 def column(entries: Iterable[Any]) -> np.ndarray:

@@ -1,18 +1,21 @@
 """Fields and steps as C99 for a flight controller: one header, one source, no dependency but math.h, no allocation."""
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from string import Template
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, linearize
-from hybrid_jax.export.c.loops import Entry, Tables
+from hybrid_jax.export.c.nodes import Entry, Statement
 from hybrid_jax.export.c.operations import CTranslation, column
-from hybrid_jax.export.c.templates import HEADER, HELPERS, SOURCE
+from hybrid_jax.export.c.printer import CPrinter
+from hybrid_jax.export.c.tables import Tables
+from hybrid_jax.export.c.templates import HEADER, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.state import STATE_NAMES
@@ -35,10 +38,13 @@ def export_c(
     they take. They are C99, use the stack alone, and may be called from several threads.
 
     Args:
+        folder: where the files are written; it is made if there is none.
+        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        dt: length of a step [s].
         name: of the files and, as a prefix, of all that the header defines; a lower-case C identifier.
         double: compute in double precision, else in single.
         smooth: as of `casadi_function`.
-        state_size: d; by default what the field knows (see `sizes_of`).
+        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
         input_size: m; likewise.
 
     Returns:
@@ -50,33 +56,39 @@ def export_c(
         OSError: the folder cannot be written.
     """
     checks.positive("dt", dt, "a positive number of seconds")
-    if (
-        not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math"
-    ):  # math.h is the one header that it includes
-        raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
+    check_name(name)
     d, m = sizes_of(field, state_size, input_size)
-    tables = Tables(double)
+    tables, printer = Tables(double), CPrinter(double)
     # In double precision, so that constants are rounded once, when they are written.
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in (d, m)]
         fused = fuse_for_inference(prepared(field, likes, smooth))
         values = body_of(fused, likes, tables, ("xdot",))
         slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
-    parts = {
-        "name": name,
-        "NAME": name.upper(),
-        "type": "double" if double else "float",
+    parts = printer.shared(tables, values, slopes) | {
         "d": d,
         "m": m,
-        "dt": tables.text(float(dt)),
+        "dt": printer.number(float(dt)),
         "about": _about(vehicle_in(field) is not None, smooth),
-        "values": values,
-        "slopes": slopes,
-    } | shared_by(tables, values, slopes)
-    written = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
-    for path, template in zip(written, (HEADER, SOURCE), strict=True):
-        write_atomic(path, Template(template).substitute(parts))
-    return written
+        "values": printer.body(values),
+        "slopes": printer.body(slopes),
+    }
+    return written(folder, name, HEADER, SOURCE, parts)
+
+
+def check_name(name: str) -> None:
+    """ValueError if files and functions of C cannot have this name."""
+    # math.h is the one header that a source includes.
+    if not isinstance(name, str) or not re.fullmatch("[a-z][a-z0-9_]*", name) or name == "math":
+        raise ValueError(f"name must be a lower-case C identifier, got {checks.short_repr(name)}")
+
+
+def written(folder: str | Path, name: str, header: str, source: str, parts: Mapping[str, Any]) -> tuple[Path, Path]:
+    """Write NAME.h and NAME.c, from templates and their parts, and return their paths."""
+    paths = Path(folder) / f"{name}.h", Path(folder) / f"{name}.c"
+    for path, template in zip(paths, (header, source), strict=True):
+        write_atomic(path, Template(template).substitute(parts, name=name, NAME=name.upper()))
+    return paths
 
 
 def _with_slopes(field: AbstractVectorField, x, u):
@@ -87,22 +99,13 @@ def _with_slopes(field: AbstractVectorField, x, u):
 
 def body_of(
     function: Callable, likes, tables: Tables, outputs: tuple[str, ...], inputs: tuple[str, ...] = ("x", "u")
-) -> str:
+) -> tuple[Statement, ...]:
     """The statements of a C function of some arrays, x and u by default, that fills others."""
     translation = CTranslation(tables)
     sizes = [like.shape[0] for like in likes]
     arguments = [column(Entry(name, i) for i in range(size)) for name, size in zip(inputs, sizes, strict=True)]
     results = translation.run(jax.make_jaxpr(function)(*likes), arguments, sizes)
     return translation.body(results, outputs)
-
-
-def shared_by(tables: Tables, *bodies: str) -> dict[str, str]:
-    """The tables and functions that bodies of functions use."""
-    words = set(re.findall(r"\w+", "\n".join([*tables.functions, *bodies])))
-    return {
-        "tables": "\n".join(text for key, text in tables.definitions.items() if key in words),
-        "helpers": "\n".join([*(text for key, text in HELPERS.items() if key in words), *tables.functions]),
-    }
 
 
 def _about(is_multirotor: bool, smooth: float | None) -> str:

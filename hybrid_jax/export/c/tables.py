@@ -1,0 +1,42 @@
+"""What the functions of one file share."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hybrid_jax.export.c.nodes import Function, Parameter, Statement
+
+
+@dataclass
+class Tables:
+    """Tables of numbers, functions that others call, and names that are not taken.
+
+    Attributes:
+        double: whether numbers are kept in double precision, else in single.
+        numbers: tables by name.
+        functions: each after those that it calls.
+    """
+
+    double: bool
+    numbers: dict[str, np.ndarray] = field(default_factory=dict)
+    functions: list[Function] = field(default_factory=list)
+    _known: dict[bytes, str] = field(default_factory=dict)  # bytes of the numbers → name
+    _count: int = 0
+
+    def name(self, letter: str) -> str:
+        """A new name."""
+        self._count += 1
+        return f"{letter}{self._count}"
+
+    def function(self, parameters: Sequence[Parameter], body: tuple[Statement, ...]) -> str:
+        """The name of a new function."""
+        self.functions.append(Function(self.name("f"), tuple(parameters), body))
+        return self.functions[-1].name
+
+    def table(self, numbers: np.ndarray) -> str:
+        """The name of a table of these numbers."""
+        numbers = np.asarray(numbers, float if self.double else np.float32)
+        name = self._known.setdefault(numbers.tobytes(), f"c{len(self._known)}")
+        self.numbers[name] = numbers
+        return name
