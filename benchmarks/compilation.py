@@ -1,4 +1,4 @@
-"""How long does a process wait for its programs: from nothing, and with the programs that the last one kept?
+"""How long does a process wait for its programs: from nothing, and with those that JAX's cache has?
 
 An experiment in its smoke preset, which runs every program of the whole one on little data, in a process of its own and
 with an empty cache; then once more with the cache of programs that the first one left, and nothing else of it. Counted

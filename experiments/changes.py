@@ -32,8 +32,7 @@ from hybrid_jax.adaptation.selection import BLOCKS, blocks_of, geometric_mean, p
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
@@ -175,7 +174,7 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     return rows
 
 
-@partial(kept_jit, compiler_options=FAST_COMPILE)
+@jit_with(FAST_COMPILE)
 def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings):
     """The candidates' names and, by seed, their left-out and test errors, and which was taken.
 

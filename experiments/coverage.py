@@ -29,8 +29,7 @@ from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.estimation.uncertainty import covariance_of
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sweep import hosts
@@ -142,7 +141,7 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: CoverageConfig,
     return rows_of(stages.kept(name, jobs, identity_of(config.described(), fields, flights)))
 
 
-@partial(kept_jit, compiler_options=FAST_COMPILE)
+@jit_with(FAST_COMPILE)
 def _fits(fields: Any, windows: Trajectories, shared: Settings):
     """θ_p of each source as the physics holds them, logarithms, and their standard errors; NaN where not fitted."""
     cluster = blocks_of(windows.x0.shape[1], CLUSTERS)[0].shape[1]  # windows of one flight are correlated

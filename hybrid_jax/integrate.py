@@ -19,7 +19,6 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, features_first, infer_batch
-from hybrid_jax.programs import kept_jit
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
@@ -183,7 +182,7 @@ def rollout(
     return _integrate(field, *checked(field, x0, u, dt, solver, substeps), dt, substeps)
 
 
-@kept_jit
+@eqx.filter_jit
 def _integrate(field, x0, u, solver, dt, substeps):
     return integrate(field, x0, u, dt, solver, substeps)
 
@@ -200,7 +199,7 @@ def rollout_batch(
     return _integrate_batch(field, *checked(field, x0, u, dt, solver, substeps, windows=True), dt, substeps)
 
 
-@kept_jit
+@eqx.filter_jit
 def _integrate_batch(field, x0, u, solver, dt, substeps):
     if isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field):
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)

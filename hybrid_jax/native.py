@@ -36,7 +36,6 @@ OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trappi
 LONGEST = 300  # s to compile
 
 Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
-_REGISTERED: list[str] = []  # with XLA, which takes a name once
 _LOCK = threading.Lock()  # programs are traced in several threads
 
 
@@ -45,22 +44,10 @@ def status() -> str:
     return _obstacle() or ("used" if prefix() else "not used: they could not be compiled, or not be kept")
 
 
-def identity() -> str | None:
-    """A digest of the kernels, the compiler and the processor; None where there can be none. Compiles nothing."""
-    return None if _obstacle() else _digest()
-
-
 def prefix() -> str | None:
     """What the targets' names begin with, once compiled and registered with XLA; None where there are no kernels."""
     with _LOCK:
         return _compiled()
-
-
-def register() -> None:
-    """Register kernels that were compiled before, if there are any: a kept program needs them when it is loaded."""
-    with _LOCK:
-        if identity() and _library().exists():
-            _register()
 
 
 def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
@@ -81,7 +68,7 @@ def with_derivative(kernel: Callable, plain: Callable) -> Callable:
 
 @cache
 def _compiled() -> str | None:
-    if not identity():
+    if _obstacle():
         return None
     try:
         if not _library().exists():
@@ -93,13 +80,11 @@ def _compiled() -> str | None:
 
 def _register() -> str:
     begin = f"hybrid_jax_{_digest()}_"
-    if begin not in _REGISTERED:
-        library = ctypes.CDLL(str(_library()))
-        with contextlib.suppress(OSError):
-            _library().touch()  # it was used
-        for handler in HANDLERS:
-            jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
-        _REGISTERED.append(begin)
+    library = ctypes.CDLL(str(_library()))
+    with contextlib.suppress(OSError):
+        _library().touch()  # it was used
+    for handler in HANDLERS:
+        jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
     return begin
 
 

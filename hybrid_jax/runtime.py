@@ -3,14 +3,17 @@
 import contextlib
 import os
 import platform
+import tempfile
 import time
 import zlib
 from collections import Counter
-from functools import cache
+from collections.abc import Callable
+from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, ParamSpec, TypeVar
 
+import equinox as eqx
 import jax
 import numpy as np
 import platformdirs
@@ -31,19 +34,20 @@ if version("jaxlib").split(".")[:2] == ["0", "10"]:
 # At optimisation level 1 the simulator compiles in two thirds of the time of level 3, and flights are 3 % slower. At
 # level 0, which XLA_FLAGS can set, they are five times slower.
 FASTEST_COMPILE = FAST_COMPILE | {"xla_backend_optimization_level": 1}
-EXECUTABLE = ".executable"  # the suffix of a kept program, see programs.py
 UNUSED = 30 * 24 * 3600  # s after which a program that nobody used is deleted: its source has changed
 MOST = 2**30  # bytes of programs; beyond, those used longest ago are deleted
 THREADS = "OPENBLAS_NUM_THREADS"
-_kept: list[Path] = []  # the folder that `configure` was given last
+
+P = ParamSpec("P")
+R = TypeVar("R")
 
 
 def configure(folder: Path | None = None) -> None:
     """Configure JAX. Call it before the first array is made, which fixes JAX's devices.
 
     Args:
-        folder: compiled programs are kept in it, by default in `programs` of the user's cache folder for hybrid_jax.
-            JAX_COMPILATION_CACHE_DIR goes first.
+        folder: JAX keeps compiled programs in it, by default in `programs` of the user's cache folder for hybrid_jax.
+            JAX_COMPILATION_CACHE_DIR goes first. Old programs are deleted in the default folder alone.
 
     Raises:
         ValueError: the folder cannot be written.
@@ -52,8 +56,10 @@ def configure(folder: Path | None = None) -> None:
     programs = Path(os.environ.get(PROGRAMS) or folder or default)
     try:
         programs.mkdir(parents=True, exist_ok=True)
-        _delete_truncated(programs)
-        _delete_unused(programs)
+        with tempfile.TemporaryFile(dir=programs):
+            pass
+        if programs == default:
+            _delete_stale(programs)
     except OSError as error:
         raise ValueError(f"{programs}: cannot be written: {error.strerror}; set {PROGRAMS}") from error
     if EXTRA not in (flags := os.environ.get(FLAGS, "")):
@@ -67,7 +73,6 @@ def configure(folder: Path | None = None) -> None:
     # A GPU's default rounds the factors of a product to 10 bits, an error of 0.6 % in a gradient. No effect on a CPU.
     jax.config.update("jax_default_matmul_precision", "float32")
     load_lapack()
-    _kept[:] = [programs]
 
 
 @cache
@@ -84,9 +89,9 @@ def load_lapack() -> None:
         del os.environ[THREADS]  # it is for no other library and no child process
 
 
-def kept_programs() -> Path | None:
-    """The folder in which compiled programs are kept (see programs.py); None before `configure`."""
-    return _kept[0] if _kept else None
+def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]], Callable[P, R]]:
+    """`equinox.filter_jit` with compiler options, of which its own type does not know."""
+    return partial(eqx.filter_jit, compiler_options=options)  # pyright: ignore[reportCallIssue, reportReturnType]
 
 
 def machine() -> tuple[str, ...]:
@@ -125,26 +130,26 @@ def _memory() -> float | None:
         return None
 
 
-def _delete_truncated(programs: Path) -> None:
-    """Delete what a kill left half written, since JAX would warn of it in every run and never replace it."""
-    verified = programs / ".verified"
-    since = verified.stat().st_mtime_ns if verified.exists() else 0
-    verified.touch()  # first, so that programs written meanwhile are verified next time
-    for path in programs.glob("*-cache"):
-        with contextlib.suppress(FileNotFoundError):  # deleted by another process
-            if path.stat().st_mtime_ns >= since and _is_truncated(path.read_bytes()):
-                path.unlink()
+def _delete_stale(programs: Path) -> None:
+    """Delete what nobody used for `UNUSED`, what exceeds `MOST`, and what a kill left half written.
 
-
-def _delete_unused(programs: Path) -> None:
-    """Delete programs of other sources or versions, which nothing will ask for again, and what exceeds `MOST`."""
+    JAX would warn of a half-written program in every run and never replace it.
+    """
+    looked = programs / ".verified"
+    since = looked.stat().st_mtime if looked.exists() else 0.0
+    looked.touch()  # first, so that programs written meanwhile are verified next time
+    size = 0
     with contextlib.suppress(FileNotFoundError):  # deleted by another process
-        used = {path: path.stat() for name in (f"*{EXECUTABLE}*", "*-cache") for path in programs.glob(name)}
-        size = 0
-        for path, found in sorted(used.items(), key=lambda each: each[1].st_mtime, reverse=True):
-            size += found.st_size
-            if size > MOST or time.time() - found.st_mtime > UNUSED:
+        found = [(path, path.stat()) for path in programs.glob("*-cache") if path.is_file()]
+        for path, about in sorted(found, key=lambda each: _used(each[1]), reverse=True):
+            size += about.st_size
+            begun = about.st_mtime >= since and _is_truncated(path.read_bytes())
+            if begun or size > MOST or time.time() - _used(about) > UNUSED:
                 path.unlink()
+
+
+def _used(about: os.stat_result) -> float:
+    return max(about.st_atime, about.st_mtime)
 
 
 def _is_truncated(program: bytes) -> bool:

@@ -9,7 +9,6 @@ import gc
 import os
 import signal
 from importlib.metadata import version
-from pathlib import Path
 
 import platformdirs
 import pytest
@@ -60,17 +59,6 @@ def all_cores():
     yield
     if CORES:
         os.sched_setaffinity(0, own)
-
-
-@pytest.fixture(scope="module")
-def kept_programs():
-    """Programs are kept for the next run, as those of a user are who called `runtime.configure`."""
-    from hybrid_jax import runtime
-
-    runtime.load_lapack()
-    before, runtime._kept[:] = list(runtime._kept), [Path(os.environ[runtime.PROGRAMS])]
-    yield
-    runtime._kept[:] = before
 
 
 @pytest.fixture

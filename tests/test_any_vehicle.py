@@ -8,5 +8,5 @@ pytestmark = pytest.mark.slow
 
 
 @pytest.fixture(scope="module", params=["car", "iris", "multirotor"])
-def adapted(request, kept_programs):
+def adapted(request):
     return adapted_by_all(request.param)

@@ -24,7 +24,7 @@ def written(folder="."):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", [page for page in written() if blocks(page)], ids=lambda page: page.stem)
-def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch, kept_programs):
+def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
     """As one module, as a user would write it, since a saved model names the module of its classes."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", str(tmp_path))

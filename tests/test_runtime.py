@@ -1,10 +1,12 @@
 """How a process is set up."""
 
 import os
+import time
 
 import pytest
 from smoke import script
 
+from hybrid_jax import runtime
 from hybrid_jax.runtime import EXTRA, FLAGS, PROGRAMS
 
 pytestmark = pytest.mark.slow  # each test starts processes
@@ -78,9 +80,32 @@ def test_programs_are_found_again_wherever_their_cache_was_moved(tmp_path):
 
 
 def test_programs_that_a_kill_left_half_written_are_replaced(tmp_path):
-    _, compiled = printed(PROGRAM, tmp_path)
-    whole, empty = sorted(tmp_path.glob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
+    user = {"HOME": str(tmp_path), "XDG_CACHE_HOME": str(tmp_path)}
+    _, compiled = printed(PROGRAM, **user)
+    whole, empty = sorted(tmp_path.rglob("*-cache"), key=lambda path: path.stat().st_size)[-2:]
     os.truncate(whole, whole.stat().st_size - 1)
     os.truncate(empty, 0)
-    assert printed(PROGRAM, tmp_path) == [compiled - 2, 2]
-    assert printed(PROGRAM, tmp_path) == [compiled, 0]
+    assert printed(PROGRAM, **user) == [compiled - 2, 2]
+    assert printed(PROGRAM, **user) == [compiled, 0]
+
+
+def test_programs_used_longest_ago_make_room(tmp_path, monkeypatch):
+    monkeypatch.setattr(runtime, "MOST", 4)
+    for age, name in enumerate(("new-cache", "used-cache", "old-cache")):
+        (tmp_path / name).write_bytes(b"--")
+        os.utime(tmp_path / name, (time.time() - 60 * age, 0))
+    os.utime(tmp_path / "used-cache", (time.time(), time.time() - runtime.UNUSED - 60))
+    runtime._delete_stale(tmp_path)
+    assert {path.name for path in tmp_path.glob("*-cache")} == {"new-cache", "used-cache"}
+    monkeypatch.setattr(runtime, "UNUSED", -1)
+    runtime._delete_stale(tmp_path)
+    assert not list(tmp_path.glob("*-cache"))
+
+
+def test_nothing_is_deleted_in_a_folder_that_the_user_named(tmp_path):
+    for name in ("theirs-cache", "notes.txt"):
+        (tmp_path / name).write_bytes(b"")
+        os.utime(tmp_path / name, (0, 0))
+    (tmp_path / "folder-cache").mkdir()
+    printed(PROGRAM, tmp_path)
+    assert {"theirs-cache", "notes.txt", "folder-cache"} <= {path.name for path in tmp_path.iterdir()}

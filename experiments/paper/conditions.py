@@ -3,7 +3,6 @@
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -22,8 +21,7 @@ from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
@@ -61,7 +59,7 @@ def fresh_fields(model: str, vehicle: Vehicle, config: Config) -> AbstractVector
     return jax.device_get(_fresh_fields(model, vehicle, guess, forced, network, np.arange(config.seeds)))
 
 
-@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+@jit_with(FASTEST_COMPILE)
 def _fresh_fields(
     model: str,
     vehicle: Vehicle,
@@ -186,7 +184,7 @@ def _starts(fields: AbstractVectorField, seeds: np.ndarray, purpose: int) -> Fit
     return jax.device_get(_begun(fields, seeds, purpose))
 
 
-@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+@jit_with(FASTEST_COMPILE)
 def _begun(fields: AbstractVectorField, seeds: Int[np.ndarray, " n"], purpose: int) -> FitState:
     return eqx.filter_vmap(lambda field, seed: fitting.start(field, _key(seed, purpose)))(fields, seeds)
 

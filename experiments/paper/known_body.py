@@ -2,7 +2,6 @@
 
 import itertools
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Literal
 
 import jax
@@ -22,8 +21,7 @@ from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, nominal, rigid_bo
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import Kind, covariance_of, intervals
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.state import VELOCITY
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -168,7 +166,7 @@ def _parts(config: KnownBody) -> list[PRNGKeyArray]:
     return [keys[np.arange(begin, begin + size) % config.repeats] for begin in range(0, config.repeats, size)]
 
 
-@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+@jit_with(FASTEST_COMPILE)
 def _repeats(
     config: KnownBody, start_is_measured: Bool[Array, ""], drag: Float[Array, ""], keys: PRNGKeyArray
 ) -> dict[str, Array]:

@@ -25,9 +25,8 @@ from experiments.reporting.tables import over_seeds
 from experiments.runner.run_record import environment
 from hybrid_jax.dynamics.rigid_body import nominal
 from hybrid_jax.integrate import compact
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.rollouts import predict
-from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import DT, fly
 from hybrid_jax.sweep import hosts
@@ -166,7 +165,7 @@ def paths(title: str, found: Study) -> Figure:
     sizes = {row["n_train"] for row in tuned[0].rows}
     shown = {100, 500, 1000} & sizes or set(sorted(sizes)[:3])
     # Not `Model.predict`, which raises if a prediction diverges.
-    predicting = kept_jit(predict, compiler_options=FASTEST_COMPILE)
+    predicting = jit_with(FASTEST_COMPILE)(predict)
     start = np.asarray(test.x0)[:, None]
     predicted: dict[int, dict[str, np.ndarray]] = {n: {} for n in sorted(shown)}
     for lanes in tuned:

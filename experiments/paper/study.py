@@ -27,8 +27,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.programs import kept_jit, prepare
-from hybrid_jax.runtime import FAST_COMPILE, cores
+from hybrid_jax.runtime import FAST_COMPILE, cores, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
@@ -150,7 +149,7 @@ def solving(method: Method, fields: AbstractVectorField, size: int, config: Conf
 
 
 # A LaneMap would use all devices, but lineax does not compile under its shard_map, and this does not take long.
-@partial(kept_jit, compiler_options=FAST_COMPILE)
+@jit_with(FAST_COMPILE)
 def _solved(method: Method, shared: Settings, lanes: Any, splits: Mapping[str, Trajectories]) -> Fit:
     def one(run) -> Fit:
         field, subset, own = run
@@ -254,7 +253,8 @@ def _compile_solved(model: str, vehicle: Vehicle, config: Config) -> None:
     fields = pretraining(source_of(model), fresh_fields(source_of(model), vehicle, config), config)[0].best
     target = {name: placeholder(spec) for name, spec in target_splits(config).items()}
     for size in config.sizes:
-        prepare(_solved, *solving(SOLVED[model], fields, size, config), target)
+        lowered = _solved.lower(*solving(SOLVED[model], fields, size, config), target)  # pyright: ignore
+        lowered.compile()
 
 
 def placeholder(spec: SplitSpec) -> Trajectories:

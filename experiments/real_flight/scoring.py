@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from itertools import groupby, product
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -27,7 +28,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
@@ -125,7 +125,7 @@ def parameters(trained: TrainedModel, data: TrainingData) -> list[dict[str, Any]
     return found
 
 
-@kept_jit
+@eqx.filter_jit
 def _intervals(fields: Any, picked: Int[np.ndarray, "runs n"], windows: Trajectories, objective: ChannelLoss):
     """θ_p of each run and its intervals, of no width without windows."""
 
@@ -144,7 +144,7 @@ def linear_residuals(base: Any, data: TrainingData, subsets: Sequence[np.ndarray
     return [Hybrid(test_base, lane(fitted, run).residual) for run in range(len(subsets))]
 
 
-@kept_jit
+@eqx.filter_jit
 def _linear_residuals(base, windows: Trajectories, subsets: Int[np.ndarray, "runs n"], validation: Trajectories):
     return jax.lax.map(lambda subset: fit_ridge(linear_residual, base, windows[subset], validation).field, subsets)
 

@@ -19,7 +19,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.windows import LogWindows, cut_windows
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.channels import ChannelLoss
@@ -183,7 +182,7 @@ def _run_configs(start: TrainedModel, fields: Any, step: Step, listed: int, fact
     return stack([configure(run) for run in range(len(start))])
 
 
-@kept_jit
+@eqx.filter_jit
 def _start_states(fields: Any, seeds, number, validation: Trajectories, settings: Settings) -> FitState:
     """The state of each run at the start of a stage, with the validation error of its field."""
 

@@ -1,12 +1,14 @@
 """Sweeps and other jobs with a cache: what is finished is loaded, what was interrupted goes on, any other is run."""
 
+import hashlib
 import json
 import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import asdict
-from functools import partial
+from functools import cache, partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -24,7 +26,6 @@ from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, sa
 from hybrid_jax.io.datasets import Dataset, content_hash, versions
 from hybrid_jax.io.files import backup_path, json_value
 from hybrid_jax.io.models import describe
-from hybrid_jax.programs import source_digest
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import Progress, sweep
 from hybrid_jax.training.fitting import FitState, RunConfig
@@ -228,6 +229,17 @@ def identity_of(*inputs: Any) -> str:
             case _:
                 fixed.append(json_value(value))
     return digest(fixed, arrays)
+
+
+@cache
+def source_digest(package: str) -> str:
+    """The digest of all Python files of a package."""
+    spec = find_spec(package)
+    digest = hashlib.sha256()
+    for root in sorted(spec.submodule_search_locations or ()) if spec else ():
+        for path in sorted(Path(root).rglob("*.py")):
+            digest.update(f"{path.relative_to(root)}\n".encode() + path.read_bytes())
+    return digest.hexdigest()
 
 
 def _run_and_save(path: Path, work: Job) -> Found:

@@ -29,8 +29,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE, load_lapack
+from hybrid_jax.runtime import FAST_COMPILE, jit_with, load_lapack
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
@@ -229,7 +228,7 @@ def adapt(
     )
 
 
-_mse = kept_jit(rollout_mse, compiler_options=FAST_COMPILE)
+_mse = jit_with(FAST_COMPILE)(rollout_mse)
 
 
 def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any]:

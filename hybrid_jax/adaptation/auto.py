@@ -19,8 +19,7 @@ from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
@@ -100,7 +99,7 @@ class Auto:
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
 
-_compiled = kept_jit(Auto._solution, compiler_options=FAST_COMPILE)
+_compiled = jit_with(FAST_COMPILE)(Auto._solution)
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:

@@ -4,6 +4,7 @@ from dataclasses import dataclass, replace
 from functools import cache
 from typing import Any, ClassVar, Literal, NamedTuple, Protocol
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -16,7 +17,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, traina
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.estimation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import select_disturbance
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.training.channels import ChannelLoss
 from hybrid_jax.training.fitting import ADAM, CAPPED, DIVERGED, STOPPED, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings
@@ -125,7 +125,7 @@ class FineTune:
         return Solution(replace(state.best, **kept), state.epoch, state.status)
 
 
-_run, _fit_ridge = kept_jit(run), kept_jit(ridge.fit_ridge)
+_run, _fit_ridge = eqx.filter_jit(run), eqx.filter_jit(ridge.fit_ridge)
 
 
 @cache  # the same object for the same weight, so that its program is compiled once

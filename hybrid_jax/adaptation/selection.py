@@ -9,6 +9,7 @@ good for 0.1 s can be bad after 1 s.
 
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,7 +19,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
 from hybrid_jax.estimation.normal_equations import equations_of, has_effect, masked, steps_without
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 BLOCKS = 10
@@ -45,7 +45,7 @@ class Fits(NamedTuple):
     converged: Bool[Array, " c"]
 
 
-@kept_jit
+@eqx.filter_jit
 def fit_candidates(
     field: AbstractVectorField,
     windows: Trajectories,

@@ -19,7 +19,6 @@ from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
@@ -77,7 +76,7 @@ def rounding(windows: Trajectories, scale: Scale) -> Float[Array, ""]:
     return jnp.finfo(x.dtype).eps * jnp.linalg.norm(x.ravel())
 
 
-@kept_jit
+@eqx.filter_jit
 def fit_free(
     field: AbstractVectorField,
     windows: Trajectories,

@@ -3,6 +3,7 @@
 from collections.abc import Callable
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -12,7 +13,6 @@ from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 ErrorLoss = Callable[[Float[Array, " d"]], Float[Array, ""]]
@@ -30,7 +30,7 @@ class NormalEquations(NamedTuple):
 
 
 # A program of its own: selecting a disturbance and the covariance share it.
-@kept_jit
+@eqx.filter_jit
 def normal_equations(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, chunk: int, error: ErrorLoss | None, scale: Scale
 ) -> NormalEquations:

@@ -37,7 +37,6 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     normal_equations,
 )
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
 
@@ -105,7 +104,7 @@ def covariance_of(
     return found + jnp.diag(jnp.where(unknown, jnp.inf, 0.0))
 
 
-@kept_jit
+@eqx.filter_jit
 def _covariance(equations: NormalEquations, kind: Kind, entries: int, p: Int[Array, ""] | int, cluster: int):
     gram, score, square = equations
     n = len(score)
@@ -229,7 +228,7 @@ def select_disturbance(
     return _selection(fits, equations, windows.horizon)
 
 
-@kept_jit
+@eqx.filter_jit
 def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], horizon: int) -> DisturbanceSelection:
     disturbed, plain = fits
     gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)

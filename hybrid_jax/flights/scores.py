@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,7 +12,6 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks, rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
@@ -62,7 +62,7 @@ def flight_errors(
     return FlightErrors(*(np.concatenate(arrays)[: len(windows)] for arrays in zip(*found, strict=True)))
 
 
-@kept_jit
+@eqx.filter_jit
 def _errors(field, windows: Trajectories, solver) -> FlightErrors:
     predicted = rollout_batch(field, windows.x0, windows.u, windows.dt, solver)
     return errors_between(predicted, jnp.asarray(windows.x))

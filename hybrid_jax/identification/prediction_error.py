@@ -6,6 +6,7 @@ Each window's initial state and constant disturbance are eliminated from the equ
 from functools import partial
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +23,6 @@ from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.recordings import Inputs, Layout, Windows
 from hybrid_jax.integrate import RK4, integrate
 from hybrid_jax.matrices import solve
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 CHUNK = 64  # windows at a time
@@ -82,7 +82,7 @@ def errors_of(
     return found
 
 
-@kept_jit
+@eqx.filter_jit
 def all_errors(field, theta, changes, problem: Problem, layout: Layout):
     def one(each):
         window, change = each
@@ -91,7 +91,7 @@ def all_errors(field, theta, changes, problem: Problem, layout: Layout):
     return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
 
 
-@kept_jit
+@eqx.filter_jit
 def slopes_between(field, theta, changes, problem: Problem, layout: Layout):
     """∂ŷ/∂ξ of what commands do between samples: (n, t, k, ξ) of each quantity."""
     size = problem.windows.between.shape[1] * slow_commands.MODES * len(problem.inputs.root)
@@ -107,14 +107,14 @@ def slopes_between(field, theta, changes, problem: Problem, layout: Layout):
     return in_chunks(jax.vmap(one), (problem.windows, changes), CHUNK)
 
 
-@kept_jit
+@eqx.filter_jit
 def rms(field, theta, changes, problem: Problem, layout: Layout) -> dict[str, Array]:
     found = all_errors(field, theta, changes, problem, layout)
     counts = {name: jnp.sum(there) for name, there in problem.windows.there.items()}
     return {name: jnp.sqrt(jnp.sum(part**2, axis=(0, 1)) / counts[name]) for name, part in found.items()}
 
 
-@kept_jit
+@eqx.filter_jit
 def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
     """The normal equations of θ with each initial state eliminated, and what gives its step: −(a + B Δθ); the cost."""
 

@@ -26,7 +26,6 @@ from hybrid_jax.networks.normalisation import (
     affine,
     product,
 )
-from hybrid_jax.programs import kept_jit
 
 
 class FusedNetwork(AbstractVectorField):
@@ -193,7 +192,7 @@ def residual_network(
     return ResidualNetwork(*weights, scaling=ChannelScaling() if scaling is None else scaling, activation=activation)
 
 
-@kept_jit
+@eqx.filter_jit
 def _weights(key: PRNGKeyArray, fan_in: int, hidden: int, outputs: int, norm: str):
     """W₁, the normalisation, W₂ and b₂."""
     key_in, key_out, key_bias = jax.random.split(key, 3)

@@ -13,7 +13,6 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import AbstractScaling, Channels, ChannelScaling
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.trajectories import Trajectories
 
 SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
@@ -74,7 +73,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     return eqx.tree_at(_scalings, field, scalings)
 
 
-@kept_jit
+@eqx.filter_jit
 def _seen(
     probed: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
 ) -> list[batching.Moments]:

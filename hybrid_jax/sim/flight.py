@@ -8,7 +8,6 @@ import zlib
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -20,8 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FASTEST_COMPILE
+from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
 from hybrid_jax.sim.forces import Parameters, parameters_of, rotor_altitudes
@@ -76,7 +74,7 @@ def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flig
         return jax.tree.map(lambda *leaves: np.concatenate(leaves)[:flights], *jax.device_get(parts))
 
 
-@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+@jit_with(FASTEST_COMPILE)
 def _fly_chunk(
     shared: tuple[Quadrotor, Parameters, PRNGKeyArray],
     numbers: UInt[Array, " n"],
@@ -194,7 +192,7 @@ def permutation(key: PRNGKeyArray, n: int) -> Int[np.ndarray, " n"]:
     return order
 
 
-@partial(kept_jit, compiler_options=FASTEST_COMPILE)
+@jit_with(FASTEST_COMPILE)
 def _drawn(key: PRNGKeyArray, n: int) -> tuple[PRNGKeyArray, UInt[Array, " n"]]:
     key, own = jax.random.split(key)
     return key, jax.random.bits(own, (n,), jnp.uint32)

@@ -16,7 +16,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from jaxtyping import Float, Int, PyTree
 
-from hybrid_jax.programs import kept_jit
+from hybrid_jax.runtime import jit_with
 from hybrid_jax.sweep import hosts
 
 Numbers = Sequence[Any] | np.ndarray
@@ -93,7 +93,7 @@ class LaneMap:
         self._min_capacity = min_capacity
         mesh = Mesh(np.array(self.devices), (AXIS,))
         self._split, self._whole = NamedSharding(mesh, PartitionSpec(AXIS)), NamedSharding(mesh, PartitionSpec())
-        self._function, self._run = function, kept_jit(_on_mesh, compiler_options=compiler)
+        self._function, self._run = function, jit_with(compiler)(_on_mesh)
 
     def __call__(self, lanes: PyTree, shared: tuple, costs: Numbers, active: Numbers) -> PyTree:
         """The results of the active lanes, in the order of `active`, as host arrays."""

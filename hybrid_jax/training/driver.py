@@ -20,8 +20,7 @@ from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.programs import kept_jit
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
@@ -201,7 +200,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     return result
 
 
-_train, _train_by_kernels = kept_jit(fitting.run), kept_jit(fitting.run, compiler_options=FAST_COMPILE)
+_train, _train_by_kernels = eqx.filter_jit(fitting.run), jit_with(FAST_COMPILE)(fitting.run)
 
 
 @cache  # the same object for the same optimiser, so that its program is compiled once

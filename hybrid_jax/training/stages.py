@@ -14,7 +14,6 @@ from jaxtyping import PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
-from hybrid_jax.programs import kept_jit
 from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
 from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start
 from hybrid_jax.training.objective import Learner, Settings
@@ -77,7 +76,7 @@ def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
     return replace(state, best_mse=jnp.asarray(error, state.best_mse.dtype))
 
 
-_judged = kept_jit(judged)
+_judged = eqx.filter_jit(judged)
 
 
 def fit_in_stages(

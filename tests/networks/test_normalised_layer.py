@@ -1,15 +1,13 @@
 """The kernels of a network's layers do what JAX does, and JAX does it where they cannot be had."""
 
-import os
 from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from smoke import script
 
-from hybrid_jax import native, runtime
+from hybrid_jax import native
 from hybrid_jax.networks import normalised_layer as layers
 
 EPSILON = 1e-5
@@ -128,36 +126,3 @@ def test_without_kernels_jax_does_the_same(variables, reason, anew, tmp_path, mo
     np.testing.assert_array_equal(layers.normalised_layer(EPSILON, layers.RELU, *arrays), PLAIN(*arrays))
     assert reason in native.status()
     assert not list(tmp_path.rglob("*.so"))
-
-
-KEPT = """
-import jax
-import hybrid_jax as hj
-from hybrid_jax import native, training
-from benchmarks.subjects import make_windows, untrained
-hj.runtime.configure()
-traced = []
-jax.monitoring.register_event_duration_secs_listener(
-    lambda name, _, **about: traced.append(about.get("fun_name")) if name.endswith("trace_duration") else None
-)
-windows = make_windows(20, 2)
-fitted = training.fit(untrained("no_physics", hidden=32), windows, windows, jax.random.key(0), max_epochs=3)
-print([float(loss) for loss in fitted.history.train], fitted.best.weight_in.sum())
-print(native.status())
-print([name for name in traced if name and "run" in name])
-"""
-
-
-@needs_kernels
-@pytest.mark.slow
-def test_a_kept_program_finds_its_kernels_in_a_new_process(tmp_path):
-    own = os.environ | {runtime.PROGRAMS: str(tmp_path / "kept")}  # not where the tests before this one kept theirs
-    first, again = (script("-c", KEPT, env=own).splitlines() for _ in range(2))
-    assert again[0] == first[0]
-    assert first[1] == "used"
-    assert first[2] != "[]"
-    assert again[2] == "[]"
-    # The same program where the kernels are gone: it is compiled anew, and so are they.
-    elsewhere = script("-c", KEPT, env=own | {"XDG_CACHE_HOME": str(tmp_path)}).splitlines()
-    assert elsewhere[0] == first[0]
-    assert len(list(tmp_path.rglob("native/*.so"))) == 1
