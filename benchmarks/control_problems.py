@@ -63,7 +63,7 @@ def _problem(path: Path, *, start=0.0, off=(0.0, 0.0, 0.0), turn=0.0, wind=(0.0,
     return Problem(*(np.asarray(part, float) for part in (x0, CONTROLLER.horizon(states, first), wind)))
 
 
-VEHICLE = hj.multirotor(hj.IRIS, (), Terms(drag=(0.5, 0.5, 0.2)))  # the truth: physics of a model has no drag
+VEHICLE = hj.rigid_body(hj.IRIS, (), Terms(drag=(0.5, 0.5, 0.2)))  # the truth: physics of a model has no drag
 
 
 def trained(activation: str, epochs: int, hidden: int = 64, **options) -> AbstractVectorField:
@@ -77,7 +77,7 @@ def trained(activation: str, epochs: int, hidden: int = 64, **options) -> Abstra
 
 def adapted(model: AbstractVectorField) -> AbstractVectorField:
     """The model after least squares on flights of `VEHICLE` with 1.2 times the inertia, in a wind."""
-    other = disturbed(hj.multirotor(hj.IRIS, ("Ix", "Iy"), VEHICLE.terms), jnp.array([1.5, 0.5, 0.0, 0.0, 0.0, 0.0]))
+    other = disturbed(hj.rigid_body(hj.IRIS, ("Ix", "Iy"), VEHICLE.terms), jnp.array([1.5, 0.5, 0.0, 0.0, 0.0, 0.0]))
     heavier = jax.tree.map(lambda log_ratio: log_ratio + np.log(1.2), other.physics)
     other = hj.Hybrid(heavier, other.residual)
     return hj.adapt(model, flights(other, 200, seed=1), method="least_squares").field

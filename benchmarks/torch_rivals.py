@@ -32,7 +32,7 @@ class RigidBody(nn.Module):
         arms = torch.tensor(vehicle.rotor_positions)
         # Σu², Σ y u², −Σ x u², Σ s u²: thrust and torque of the rotors up to coefficients.
         mixer = torch.stack([torch.ones(4), arms[:, 1], -arms[:, 0], torch.tensor(vehicle.spin)], dim=1)
-        self.log_ratios = nn.Parameter(tensor(np.stack([field.log_ratios[name] for name in LEARNED])))
+        self.deviations = nn.Parameter(tensor(np.stack([field.deviations[name] for name in LEARNED])))
         self.register_buffer("nominal", torch.tensor([nominal(vehicle)[name] for name in LEARNED]))
         self.register_buffer("mixer", mixer)
         self.register_buffer("iz", torch.tensor(vehicle.inertia[2]))
@@ -43,7 +43,7 @@ class RigidBody(nn.Module):
     def forward(self, x: torch.Tensor, u: torch.Tensor) -> torch.Tensor:
         """ẋ (b, 13) for x (b, 13), u (b, 4)."""
         q, v, omega = x[:, 3:7], x[:, 7:10], x[:, 10:13]
-        ix, iy, k = (self.nominal * self.log_ratios.exp()).unbind()
+        ix, iy, k = (self.nominal * self.deviations.exp()).unbind()
         inertia = torch.stack([ix, iy, self.iz])
         wrench = (u * u) @ self.mixer * torch.stack([k, k, k, self.torque_coefficient])
         acceleration = wrench[:, :1] / self.mass * body_z(q) + self.gravity

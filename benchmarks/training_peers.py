@@ -98,7 +98,7 @@ def our_first(subject: tuple, solver: diffrax.AbstractSolver) -> dict[str, Any]:
     physics, network, running = adam.mu.physics, adam.mu.residual, field.residual.norm.running
     moment = {f"network.{name}": getattr(network, name) for name in ("weight_in", "weight_out", "bias_out")}
     moment |= {f"network.{name}": getattr(network.norm, name) for name in ("gain", "shift")}
-    moment["physics.log_ratios"] = jnp.stack([physics.log_ratios[name] for name in LEARNED])
+    moment["physics.deviations"] = jnp.stack([physics.deviations[name] for name in LEARNED])
     return {"loss": value, "first_moment": moment, "mean": running.mean, "variance": running.variance}
 
 

@@ -35,7 +35,7 @@ from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
+from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import evaluate
 from hybrid_jax.training.objective import Settings
@@ -187,7 +187,7 @@ def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test:
         field, windows = run
         choice = Auto().solve(field, windows, windows, shared).choice
         names[:] = choice.names
-        larger = extended(field, STATE_SIZE, INPUT_SIZE)
+        larger = extended(field, STATE_SIZE)
 
         def error(index):
             return rollout_mse(candidate(larger, choice, index), test, EVERY, shared.solver)

@@ -20,12 +20,10 @@ from .dynamics import (
     Frozen,
     Grid,
     Hybrid,
-    Multirotor,
     RigidBody,
     actuated,
     check_grid,
     diffusion,
-    multirotor,
     rigid_body,
     with_disturbance,
 )
@@ -45,7 +43,7 @@ __version__: str
 
 __all__ = ["Trajectories", "__version__", "runtime"]
 __all__ += ["AbstractVectorField", "Frozen", "Hybrid", "with_disturbance"]
-__all__ += ["IRIS", "Multirotor", "RigidBody", "Vehicle", "load_vehicle", "multirotor", "rigid_body"]
+__all__ += ["IRIS", "RigidBody", "Vehicle", "load_vehicle", "rigid_body"]
 __all__ += ["Actuator", "actuated"]
 __all__ += ["Diffusion", "Grid", "check_grid", "diffusion", "fit_gauss_newton", "grid_network"]
 __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "with_scaling"]

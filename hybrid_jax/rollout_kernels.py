@@ -14,7 +14,9 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import native
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, apply_residual
-from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, newton_euler
+from hybrid_jax.dynamics.equations import derivative
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
+from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import RK4, Solver, integrate
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, ChannelScaling, InputScaling
@@ -45,7 +47,8 @@ class Constants(NamedTuple):
         """ẋ of the rigid body."""
         if self.vehicle is None:
             return 0.0
-        return newton_euler(self.vehicle, dict(zip(LEARNED, theta, strict=True)), tuple(x), tuple(u))
+        known = {name: (value,) for name, value in zip(LEARNED, theta, strict=True)}
+        return derivative(self.vehicle, Terms(), known, tuple(x), tuple(u))
 
 
 class KernelField(NamedTuple):
@@ -73,7 +76,7 @@ class KernelField(NamedTuple):
                 return False
         if self.physics is None:
             return True
-        scalars = all(jnp.ndim(ratio) == 0 for ratio in self.physics.log_ratios.values())
+        scalars = all(jnp.ndim(ratio) == 0 for ratio in self.physics.deviations.values())
         return scalars and (d, inputs) == (STATE_SIZE, self.physics.vehicle.rotors)
 
     def rollout(self, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float) -> Float[Array, "t d b"]:
@@ -134,7 +137,7 @@ def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> 
     physics, network = (field.physics, field.residual) if type(field) is Hybrid else alone
     if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1):
         return None
-    if type(physics) not in (type(None), RigidBody, ForcedBody):
+    if physics is not None and not (type(physics) is RigidBody and _is_plain(physics)):
         return None
     if network is not None:
         if type(network) is not ResidualNetwork or network.activation != "relu":
@@ -142,6 +145,10 @@ def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> 
         if type(network.scaling) not in (InputScaling, ChannelScaling):
             return None
     return KernelField(physics, network)  # pyright: ignore[reportArgumentType]
+
+
+def _is_plain(body: RigidBody) -> bool:
+    return set(body.deviations) == set(LEARNED) and body.terms == Terms()
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0,))

@@ -16,7 +16,7 @@ from pendulum import pendulum
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.dynamics.terms import Terms
 
 ODD = replace(  # a vehicle without any symmetry
@@ -196,14 +196,14 @@ def _flights(truth, changed, model) -> System:
 
 def _iris() -> System:
     true = Terms(drag=(0.3, 0.3, 0.1))
-    heavy = jax.tree.map(lambda leaf: leaf + 0.2, multirotor(hj.IRIS, terms=true))
+    heavy = jax.tree.map(lambda leaf: leaf + 0.2, rigid_body(hj.IRIS, terms=true))
     residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
-    return _flights(multirotor(hj.IRIS, terms=true), heavy, hj.Hybrid(hj.rigid_body(hj.IRIS), residual))
+    return _flights(rigid_body(hj.IRIS, terms=true), heavy, hj.Hybrid(hj.rigid_body(hj.IRIS), residual))
 
 
 def _multirotor() -> System:
     def real(shift, learn=("Ix", "Iy", "k_rotors", "drag", "centre_of_mass"), drag=0.3):
-        return jax.tree.map(lambda leaf: leaf + shift, multirotor(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
+        return jax.tree.map(lambda leaf: leaf + shift, rigid_body(hj.IRIS, learn, Terms(drag=(drag, drag, 0.1))))
 
     residual = hj.residual_network(13, 4, jax.random.key(1), hidden=16)
     return _flights(real(0.05), real(0.15), hj.Hybrid(real(0.0, drag=0.0), residual))

@@ -136,7 +136,7 @@ def test_a_damaged_file_is_refused_or_unchanged(folder, files, load, damage):
 HYBRID = "hybrid_jax.dynamics.base:Hybrid"
 KINDS = st.sampled_from(["RigidBody", "Vehicle", "InputScaling", "BatchNorm", "os.system", HYBRID, "os:system"])
 NAMES = st.sampled_from(
-    ["physics", "residual", "log_ratios", "vehicle", "mass", "field", "scale", "k", "Ix", "Iy", "about"]
+    ["physics", "residual", "deviations", "vehicle", "mass", "field", "scale", "k", "Ix", "Iy", "about"]
 )
 FORGED = st.recursive(
     st.one_of(st.none(), st.integers(-2, 2), st.text(max_size=3), st.just({"array": "a"}), st.just({"array": "gone"})),

@@ -18,7 +18,7 @@ from surface import SPOILED, cases, is_finite, odd, outcome, spoiled
 import hybrid_jax as hj
 from hybrid_jax import metrics
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
@@ -33,7 +33,7 @@ BODY, SWING = hj.rigid_body(hj.IRIS), pendulum()
 NETWORK = hj.residual_network(2, 1, KEY, hidden=4)
 MIXED = hj.Hybrid(SWING, NETWORK)
 WINDOWS = jax.tree.map(np.asarray, swings(12, steps=3))
-DRAGGED = multirotor(hj.IRIS, ("drag",))
+DRAGGED = rigid_body(hj.IRIS, ("drag",))
 COVARIANCE = np.diag([1e-4, 4e-4, 9e-4])
 
 

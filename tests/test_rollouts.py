@@ -13,7 +13,7 @@ from systems import ODD
 from benchmarks.subjects import DT, untrained
 from hybrid_jax import native, rollouts
 from hybrid_jax.dynamics.base import Hybrid
-from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.integrate import RK4, integrate, rollout_batch
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
@@ -46,7 +46,7 @@ FIELDS = {
     "physics alone": RigidBody(THETA, ODD),
     "no physics": network(3, 2, hidden=32),
     "no input": network(5, 0, hidden=96),
-    "a force and a torque": Hybrid(ForcedBody(THETA, HEXACOPTER), network(13, 6)),
+    "a force and a torque": Hybrid(RigidBody(THETA, HEXACOPTER, wrench=True), network(13, 6)),
 }
 FIELD = FIELDS["the paper's"]
 

@@ -49,9 +49,9 @@ def flown():
 def test_equal_rotors_at_hover_speed_carry_the_weight_and_turn_nothing_but_yaw(rotors):
     vehicle = regular(rotors)
     x = jnp.zeros(13).at[3].set(1.0)
-    slope = hj.multirotor(vehicle, ("k_rotors",))(x, jnp.full(rotors, vehicle.hover_speed))
+    slope = hj.rigid_body(vehicle, ("k_rotors",))(x, jnp.full(rotors, vehicle.hover_speed))
     np.testing.assert_allclose(slope[7:12], 0, atol=1e-5)
-    assert hj.multirotor(vehicle, ("k_rotors",)).theta()["k_rotors"].shape == (rotors,)
+    assert hj.rigid_body(vehicle, ("k_rotors",)).theta()["k_rotors"].shape == (rotors,)
 
 
 def test_the_simulator_flies_a_hexarotor_that_the_equations_predict(flown):

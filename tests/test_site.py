@@ -40,7 +40,7 @@ def test_every_public_name_has_an_entry(site):
     entries = {line.split(" ")[0] for line in inventory.splitlines()}
     for package in PACKAGES:
         for name in (name for name in import_module(package).__all__ if not name.startswith("_")):
-            # `multirotor` and `rigid_body` have the names of their modules.
+            # `rigid_body` has the name of its module.
             assert {f"{package}.{name}", f"hybrid_jax.dynamics.{name}.{name}"} & entries, f"{package}.{name}"
 
 

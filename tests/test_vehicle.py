@@ -7,7 +7,7 @@ import pytest
 import surface
 
 from hybrid_jax import rigid_body
-from hybrid_jax.dynamics.multirotor import Multirotor
+from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.vehicle import IRIS, load_vehicle
@@ -177,7 +177,7 @@ def test_hover_speed_carries_the_weight():
 def test_vehicle_without_terms_is_the_rigid_body_of_the_paper(written):
     found = load_vehicle_model(written())
     assert found == VehicleModel(load_vehicle(written()))
-    assert set(found.physics().deviations) == set(rigid_body(found.vehicle).log_ratios)
+    assert set(found.physics().deviations) == set(rigid_body(found.vehicle).deviations)
 
 
 def test_terms_and_learned_names_are_read(written):
@@ -187,7 +187,7 @@ def test_terms_and_learned_names_are_read(written):
     )
     assert found.terms == Terms(drag=(0.1, 0.2, 0.0), motor_time_constant=0.02)
     physics = found.physics()
-    assert isinstance(physics, Multirotor)
+    assert isinstance(physics, RigidBody)
     assert set(physics.deviations) == {"k_rotors", "drag"}
     assert physics.vehicle.mass == 2
     assert LAG in found.learn

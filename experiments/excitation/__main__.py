@@ -40,7 +40,6 @@ from experiments.runner.stages import stages_of
 from hybrid_jax import control
 from hybrid_jax.control import Controller
 from hybrid_jax.dynamics.disturbance import with_disturbance
-from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import nominal, rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
@@ -145,7 +144,7 @@ def experiment(config: ExcitationConfig, console: Console) -> None:
 
 
 def designed(config: ExcitationConfig) -> Excitation:
-    model = with_disturbance(multirotor(IRIS, config.parameters))
+    model = with_disturbance(rigid_body(IRIS, config.parameters))
     noise = sizes(noise_of(config)).tolist()
     search = {name: getattr(config, name) for name in ("seconds", "bandwidth", "starts", "steps")}
     return excitation(model, config.parameters, config.bounds, noise=noise, window=STEPS * DT, dt=DT, **search)
@@ -226,7 +225,7 @@ def _fit(parameters: tuple[str, ...], noise: Noise, states: Array, inputs: Array
         log[:n:STEPS], inputs[:n].reshape(-1, STEPS, inputs.shape[1]), log[1 : n + 1].reshape(-1, STEPS, 13), DT
     )
     scale = sizes(noise)
-    found = fit_least_squares(with_disturbance(multirotor(IRIS, parameters)), windows, scale=scale)
+    found = fit_least_squares(with_disturbance(rigid_body(IRIS, parameters)), windows, scale=scale)
     covariance = covariance_of(found.field, windows, scale=scale, cluster=len(windows) // BLOCKS)
     told = information_of(found.field, states, inputs, DT, STEPS, scale)
     stds = jnp.sqrt(jnp.diagonal(told.covariance(jnp.ones(len(covariance), bool))))

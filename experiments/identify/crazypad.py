@@ -16,8 +16,7 @@ from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
-from hybrid_jax.dynamics.corrected_body import CorrectedBody
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal
@@ -108,7 +107,7 @@ def rms(errors: np.ndarray) -> float:
 
 def source(normal: list[Flight]) -> Any:
     """What normal flights tell: effectiveness of each rotor, and lag."""
-    learn = multirotor(VEHICLE, ("k_rotors",))
+    learn = rigid_body(VEHICLE, ("k_rotors",))
     field = actuated(learn, ACTUATOR, ("time_constant",))
     return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
 
@@ -122,7 +121,7 @@ def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, 
 def take_off(field: Any, normal: list[Flight]) -> Any:
     """The field with what normal flights tell of each rotor in the seconds after take-off."""
     parts = [first_seconds(each)[0] for each in normal]
-    return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("log_efficiency",)).field
+    return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("efficiency",)).field
 
 
 def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " n"], float]:
@@ -130,18 +129,19 @@ def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " 
 
     All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
     """
-    (part, end), whole = first_seconds(flight), np.asarray(fresh.body.log_efficiency)
-    found = identify(fresh, [part], SHORT, MEASURED, free=("log_efficiency",))
+    (part, end), whole = first_seconds(flight), np.asarray(fresh.body.deviations["efficiency"])
+    found = identify(fresh, [part], SHORT, MEASURED, free=("efficiency",))
     efficiencies = np.array([found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)])
     lost = 1 - efficiencies[:, [0, 2, 1]] / np.exp(whole)[:, None]
-    worst = f"log_efficiency[{lost[:, 0].argmax()}]"
+    worst = f"efficiency[{lost[:, 0].argmax()}]"
     alone: Any = identify(fresh, [part], SHORT, ("specific_force",), free=(worst,)).field
-    return lost, np.asarray(alone.body.log_efficiency) - whole, end
+    return lost, np.asarray(alone.body.deviations["efficiency"]) - whole, end
 
 
 def changed(field: Any, log_efficiency) -> Any:
     """The field with rotors that give other shares of their thrust."""
-    return replace(field, body=CorrectedBody(field.body, jnp.asarray(log_efficiency), jnp.zeros(3)))
+    body: Any = corrected(field.body)
+    return replace(field, body=replace(body, deviations=body.deviations | {"efficiency": jnp.asarray(log_efficiency)}))
 
 
 def run(options: Options) -> None:

@@ -23,7 +23,6 @@ from hybrid_jax.adaptation.ridge import defects
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.multirotor import multirotor
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.airborne import airborne
@@ -64,7 +63,7 @@ def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated
     """The actuators that explain the accelerometer of some flights; without the voltage, of a constant gain."""
     own = ACTUATOR if voltage else replace(ACTUATOR, nominal_voltage=0.0, voltage_exponent=0.0)
     learn = ("curve", "time_constant", "voltage_exponent") if voltage else ("curve", "time_constant")
-    field = start if start is not None else actuated(multirotor(VEHICLE, ()), own, learn)
+    field = start if start is not None else actuated(rigid_body(VEHICLE, ()), own, learn)
     return identify(field, recordings, FORCE, ("specific_force",), free=free).field  # pyright: ignore[reportReturnType]
 
 
@@ -135,7 +134,7 @@ def run(options: Options) -> None:
     a, b = ([read_recording(options.folder / f"{name}.csv.gz", columns) for name in part] for part in flown)
     aware, constant = thrust_of(a), thrust_of(a, voltage=False)
     console.print("A:", {name: np.asarray(value).round(4).tolist() for name, value in aware.theta().items()})
-    of_a = fitted_to(multirotor(VEHICLE, LEARN, Terms()), a, aware, 100)
+    of_a = fitted_to(rigid_body(VEHICLE, LEARN, Terms()), a, aware, 100)
     forces, scores = [], {}
     for i, left in enumerate(b):
         others = b[:i] + b[i + 1 :]

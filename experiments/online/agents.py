@@ -12,11 +12,10 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.corrected_body import corrected
+from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.disturbance import disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.dynamics.terms import Terms, units_of
 from hybrid_jax.online.estimator import OnlineAdaptation
 from hybrid_jax.online.hypotheses import Cause
@@ -52,7 +51,7 @@ AGENTS = {
     "oracle": "oracle",
 }
 LEARNED = ("Ix", "Iy", "Iz", "centre_of_mass")
-PARTS = 4 * 3  # Ix, Iy, Iz, centre of mass (2), efficiency (4), added drag (3): entries of θ before the disturbance
+PARTS = 4 * 3  # Ix, Iy, Iz, added drag (3), centre of mass (2), efficiency (4): entries of θ before the disturbance
 # Logarithms of inertia and efficiency, 1 cm or so of the arm, and half the vehicle's own drag or more.
 PRIOR = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3, "centre_of_mass": 0.05, "efficiency": 0.2, "added_drag": 0.3}
 DISTURBANCE = (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)  # m/s², rad/s²
@@ -73,8 +72,8 @@ CAUSES = (
 
 def nominal() -> AbstractVectorField:
     """The Iris with its drag and without ground effect; inertia, centre of mass, efficiencies and drag may change."""
-    body = multirotor(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
-    return corrected(body, IRIS.rotors)
+    body = rigid_body(IRIS, LEARNED, Terms(drag=(DRAG_COEFFICIENT, DRAG_COEFFICIENT, DRAG_COEFFICIENT)))
+    return corrected(body)
 
 
 def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
@@ -86,18 +85,12 @@ def true_theta(domain: Domain) -> Float[np.ndarray, " 12"]:
     if weak_rotor in domain.forces:
         efficiency[0] += math.log(1 - LOST_THRUST)
     drag = np.full(3, domain.drag_coefficient / vehicle.mass - DRAG_COEFFICIENT / IRIS.mass)
-    return np.concatenate([inertia, centre, efficiency, drag])
+    return np.concatenate([inertia, drag, centre, efficiency])
 
 
 def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
     """`nominal` at other parameters, in the order of `true_theta`."""
-    values = jnp.asarray(theta, float)
-    deviations = dict(zip(LEARNED, [*values[:3], values[3:5]], strict=True))
-    return eqx.tree_at(
-        lambda field: [*(field.body.deviations[name] for name in LEARNED), field.log_efficiency, field.drag],
-        nominal(),
-        [*deviations.values(), values[5:9], values[9:12]],
-    )
+    return ravel_learned(nominal())[1](jnp.asarray(theta, float))
 
 
 class Told(AbstractEstimator):

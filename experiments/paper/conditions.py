@@ -16,7 +16,7 @@ from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.rigid_body import ForcedBody, perturbed, perturbed_by
+from hybrid_jax.dynamics.rigid_body import perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.networks.factory import make_residual
@@ -73,7 +73,7 @@ def _fresh_fields(
             physics = perturbed(vehicle, _key(seed, PHYSICS), low=guess[0], high=guess[1])
         else:
             physics = perturbed_by(vehicle, _key(seed, PHYSICS), guess)
-        physics = ForcedBody(physics.log_ratios, vehicle) if forced else physics
+        physics = replace(physics, wrench=forced)
         network = make_residual(_key(seed, NETWORK), vehicle=vehicle, **options)
         return {"hybrid": Hybrid(physics, network), "no_physics": network, "physics_only": physics}[model]
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
-from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
+from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.networks.factory import make_residual
@@ -131,7 +131,7 @@ def equivalent_recipe(model: str, recipe: str, among: Sequence[str]) -> str:
 
 def thrust_baseline(model: VehicleModel) -> AbstractVectorField:
     """Nominal thrust with frozen body rates: the baseline that errors are compared with."""
-    return FrozenRates(multirotor(model.vehicle, (), model.terms))
+    return FrozenRates(rigid_body(model.vehicle, (), model.terms))
 
 
 def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:
@@ -139,7 +139,7 @@ def physics_of(model: VehicleModel, recipe: Recipe) -> AbstractVectorField:
     terms = model.terms
     if recipe.physics == "torque_off":
         terms = replace(terms, torque_gain=(0.0, 0.0, 0.0))
-    body = multirotor(model.vehicle, recipe.learn or model.learn, terms)
+    body = rigid_body(model.vehicle, recipe.learn or model.learn, terms)
     return FrozenRates(body) if recipe.physics == "frozen_rates" else body
 
 
@@ -179,7 +179,7 @@ def body_of(field: Any) -> Any:
 
 
 def _is_body(node: Any) -> bool:
-    return isinstance(node, Multirotor)
+    return isinstance(node, RigidBody)
 
 
 def objective_of(model: VehicleModel, windows: Trajectories, recipe: Recipe) -> ChannelLoss:

@@ -37,7 +37,7 @@ from experiments.reporting import names
 from experiments.reporting.results import Results
 from hybrid_jax.dynamics.base import AbstractVectorField, Blend
 from hybrid_jax.dynamics.baselines import HoldState
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows, require_length
 from hybrid_jax.trajectories import Trajectories
@@ -156,7 +156,7 @@ class Trainer:
     def linear_residuals(self, seeds: int, size: int) -> Sequence[AbstractVectorField]:
         """Linear residuals of the rigid body, fitted to N target windows; with N = 0 to all windows of the source."""
         config, recipe = self.experiment.config, self.experiment.config.tried[0]
-        before, after = (multirotor(e.vehicle, (), e.terms) for e in (self.experiment.before, self.experiment.after))
+        before, after = (rigid_body(e.vehicle, (), e.terms) for e in (self.experiment.before, self.experiment.after))
         if size == 0:
             data = self.source_data(recipe)
             return linear_residuals(before, data, [np.arange(len(data.train))], after if self.adapts else before)

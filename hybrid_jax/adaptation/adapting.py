@@ -19,9 +19,8 @@ from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_o
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.dynamics.corrected_body import simplified
-from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody, moves_a_rigid_body
+from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance, without_zeros
+from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body, uncorrected
 from hybrid_jax.estimation.least_squares import check_windows
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters
 from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
@@ -205,7 +204,9 @@ def adapt(
     before = mse(field, windows)  # its program is read, and SciPy's functions imported, while the device solves
     import scipy.special  # noqa: F401
 
-    adapted = simplified(solution.field) if disturbance_of(field) is None else solution.field  # what windows need
+    adapted = solution.field
+    if disturbance_of(field) is None:
+        adapted = uncorrected(without_zeros(adapted))  # what windows need
     rigid = moves_a_rigid_body(field)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, rigid)
     without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
@@ -283,7 +284,7 @@ def _parameters(
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own = physics_of(without_disturbance(field))
-    known = UNITS if isinstance(own, AbstractRigidBody) else getattr(own, "units", {})
+    known = UNITS if isinstance(own, RigidBody) else getattr(own, "units", {})
     values = named_parameters(field)
     units = {name: known.get(name, known.get(name.split("[")[0])) for name in values}
     alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}

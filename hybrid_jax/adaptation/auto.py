@@ -14,9 +14,8 @@ from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
 from hybrid_jax.adaptation.methods import Solution, scale_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
-from hybrid_jax.dynamics.corrected_body import corrected
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.dynamics.rigid_body import corrected, moves_a_rigid_body
 from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
@@ -84,7 +83,7 @@ class Auto:
 
     def _solution(self, field, train: Trajectories, solver: Solver, scale: Scale) -> Solution:
         n, d = train.x0.shape
-        larger = extended(field, d, train.u.shape[-1])
+        larger = extended(field, d)
         fitted = free_parameters(larger)
         left = n - blocks_of(n, self.blocks)[0].shape[1]  # windows that fit a block's prediction
         fitted = {name: free for name, free in fitted.items() if name == "source" or free.sum() < left}
@@ -108,10 +107,9 @@ def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""]
     return adapted if choice.change is None else with_change(adapted, choice.change[index])  # type: ignore
 
 
-def extended(field: AbstractVectorField, d: int, m: int) -> AbstractVectorField:
+def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
     """The field with all parameters that a candidate may fit, at values that change nothing."""
-    field = corrected(field, m) if moves_a_rigid_body(field) else field
-    return sized(with_disturbance(field), d)
+    return sized(with_disturbance(corrected(field)), d)
 
 
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:

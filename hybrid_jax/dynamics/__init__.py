@@ -1,7 +1,7 @@
 """Vector fields ẋ = f(x, u) and the physics of a multirotor.
 
-`base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` and
-`multirotor` (with `terms`) the equations of motion, `actuators` what is between command and rotor, `disturbance` a
+`base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` with
+`equations` and `terms` the equations of motion, `actuators` what is between command and rotor, `disturbance` a
 constant disturbance, `estimator` the protocol of what learns in flight, `baselines` reference models, and
 `vehicle_file` reads all of them from a TOML file. `grids` has quantities on a periodic grid in space, and diffusion.
 """
@@ -12,8 +12,7 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
-from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed, rigid_body
+from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body, with_vehicle
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
 
@@ -21,5 +20,5 @@ __all__ = ["AbstractVectorField", "Blend", "Frozen", "FrozenRates", "HoldState",
 __all__ += ["Actuated", "Actuator", "actuated", "rotor_speeds"]
 __all__ += ["AbstractEstimator", "ConstantDisturbance", "disturbed", "with_disturbance"]
 __all__ += ["Diffusion", "Grid", "check_grid", "diffusion"]
-__all__ += ["ForcedBody", "Multirotor", "RigidBody", "Terms", "VehicleModel"]
-__all__ += ["load_vehicle_model", "multirotor", "perturbed", "rigid_body", "with_vehicle"]
+__all__ += ["RigidBody", "Terms", "VehicleModel"]
+__all__ += ["load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
@@ -81,7 +81,7 @@ class Actuated(AbstractVectorField):
 
     accepts_batch: ClassVar[bool] = True
 
-    body: AbstractRigidBody
+    body: RigidBody
     deviations: dict[str, Float[Array, "..."]]
     actuator: Actuator = eqx.field(static=True)
 
@@ -108,7 +108,7 @@ class Actuated(AbstractVectorField):
 
     @property
     def _vehicle(self) -> Vehicle:
-        return self.body.vehicle  # pyright: ignore[reportAttributeAccessIssue]
+        return self.body.vehicle
 
     def theta(self) -> dict[str, Array]:
         """The learned parameters of the body and of the actuator, in SI units."""
@@ -180,9 +180,9 @@ class Actuated(AbstractVectorField):
         return jax.lax.scan(interval, targets[0], targets)[0]
 
 
-def actuated(body: AbstractRigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
+def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
     """The body behind its actuators, which learn the parameters named in `learn`; see `check_actuator_names`."""
-    check_actuator_names(learn, actuator, tuple(getattr(body, "deviations", ())))
+    check_actuator_names(learn, actuator, tuple(body.deviations))
     shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
     return Actuated(body, {name: jnp.zeros(shapes.get(name, ())) for name in learn}, actuator)
 

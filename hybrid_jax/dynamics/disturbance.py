@@ -8,6 +8,7 @@ from typing import ClassVar
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
@@ -113,3 +114,16 @@ def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
     """The constant disturbance of the field's physics, if it has one."""
     physics = physics_of(field)
     return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]
+
+
+def without_zeros(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with a constant disturbance of those states alone where it is not zero; outside of compiled code."""
+    found = disturbance_of(field)
+    if found is None or np.asarray(found.value).all():
+        return field
+    size = np.shape(found.value)[0]
+    kept = np.flatnonzero(found.value)
+    if not len(kept):
+        return without_disturbance(field)
+    indices = found.indices or tuple(range(STATE_SIZE - size, STATE_SIZE))
+    return eqx.tree_at(disturbance_of, field, ConstantDisturbance(found.value[kept], tuple(indices[i] for i in kept)))

@@ -1,4 +1,4 @@
-"""Equations of motion of a multirotor; see `multirotor`.
+"""Equations of motion of a multirotor; see `rigid_body`.
 
 They take the entries of θ_p, x and u as separate arrays, which spares stacking and unstacking them.
 """
@@ -26,7 +26,7 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
     thrust, torque = _wrench(vehicle, constants, u)
     gravity = jnp.reshape(jnp.array([0.0, 0.0, -vehicle.gravity], thrust.dtype), (3,) + (1,) * thrust.ndim)
     acceleration = (thrust / constants["mass"][0]) * rotation.body_z(q) + gravity
-    attitude = attitude_matrix(q)
+    attitude = rotation.matrix(q)
     velocity = [dot(column, v) for column in zip(*attitude, strict=True)]
     force = _specific_force(constants, velocity, torque)
     faster = _velocity_error(constants, velocity, force)
@@ -43,7 +43,9 @@ def derivative(vehicle: Vehicle, terms: Terms, theta: dict[str, Rows], x: Rows, 
 
 def _wrench(vehicle: Vehicle, constants: Constants, u: Rows):
     """Total thrust [N] and torque [N m] of the rotors about the centre of mass."""
-    squares = [speed * speed for speed in u]
+    squares, efficiency = [speed * speed for speed in u], constants["efficiency"]
+    if is_present(efficiency, absent=1.0):
+        squares = [share * square for share, square in zip(efficiency, squares, strict=True)]
     (k,), of_rotors, gain = constants["k"], constants["k_rotors"], constants["torque_gain"]
     if isinstance(of_rotors[0], int | float):
         loads = squares
@@ -65,6 +67,8 @@ def _specific_force(constants: Constants, velocity, torque):
     x, y, z = 0.0, 0.0, 0.0
     if is_present(drag):
         x, y, z = (-(factor / mass) * part for factor, part in zip(drag, velocity, strict=True))
+    if is_present(added := constants["added_drag"]):
+        x, y, z = (one - factor * part for one, factor, part in zip((x, y, z), added, velocity, strict=True))
     if is_present(pull):
         x, y = x + pull[0] / mass * torque[1], y - pull[1] / mass * torque[0]
     return [x, y, z]
@@ -101,16 +105,6 @@ def _euler(inertia, torque, omega: Rows) -> Float[Array, " 3 *b"]:
 def in_world(attitude, parts) -> Float[Array, " 3 *b"]:
     """A body vector, of which the entries that are not given are zero, in the world frame."""
     return jnp.stack([dot(row[: len(parts)], parts) for row in attitude])
-
-
-def attitude_matrix(q: Rows):
-    """The rows of R, which turns body vectors into world vectors (scaled by |q|², as `rotation.rotate`)."""
-    w, x, y, z = q
-    return (
-        (w * w + x * x - y * y - z * z, 2 * (x * y - w * z), 2 * (x * z + w * y)),
-        (2 * (x * y + w * z), w * w - x * x + y * y - z * z, 2 * (y * z - w * x)),
-        (2 * (x * z - w * y), 2 * (y * z + w * x), w * w - x * x - y * y + z * z),
-    )
 
 
 def dot(a, b) -> Array:

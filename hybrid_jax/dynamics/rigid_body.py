@@ -1,6 +1,5 @@
-"""f_p: the Newton–Euler equations of a multirotor with unknown Ix, Iy and k (paper, Eq. 10)."""
+"""f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10)."""
 
-from abc import abstractmethod
 from typing import ClassVar
 
 import equinox as eqx
@@ -9,84 +8,132 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from hybrid_jax import checks
+from hybrid_jax import checks, rotation
+from hybrid_jax.dynamics import equations
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import expand_trailing
-from hybrid_jax.dynamics.equations import derivative, evaluate_columns
-from hybrid_jax.dynamics.terms import Terms
+from hybrid_jax.dynamics.terms import CORRECTIONS, LOGARITHMIC, Terms, check_names, nominal_values, shape_of, units_of
 from hybrid_jax.rotation import Rows
-from hybrid_jax.state import BODY_RATES, STATE_SIZE
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 LEARNED = ("Ix", "Iy", "k")
+INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1, "Iz": BODY_RATES.start + 2}
 
 
-class AbstractRigidBody(AbstractVectorField):
-    """A field whose state is that of state.py (13) and whose parameters have physical units."""
+class RigidBody(AbstractVectorField):
+    """A rigid body carried by its rotors, and what `Terms` add: x is that of state.py (13), u the rotor speeds [rad/s].
+
+        ṗ = R (S Rᵀv + λ E f),   v̇ = R (T e_z / m + f) − g e_z,   J ω̇ = G τ − ω × J ω + A Rᵀv − B ω
+        m f = C (τ_y, −τ_x, 0) − D Rᵀv − m c Rᵀv,   E = diag(1, 1, 0)
+
+    T and τ are thrust and torque of the rotors about the centre of mass; a rotor's thrust is k_i u_i², with one k or
+    one for each, and G scales the torque where the speeds do not tell it. Rotor drag D, the moment A and the damping B:
+    Faessler, Franchi and Scaramuzza, "Differential flatness of quadrotor dynamics subject to rotor drag for accurate
+    tracking of high-speed trajectories", 2018 (A there has the other sign). C is a cable that pulls at 1/C below the
+    centre of mass: the state does not hold the load's position, but the torque that balances its moment reveals it.
+
+    S and λ describe a state estimator that takes all force but gravity to be along the body's z axis, and corrects its
+    velocity v̂ for other forces by the position alone: d/dt v̂ = R T e_z / m − g e_z + (v − v̂) / λ across the thrust.
+    Then v − v̂ is λ times the force in the log: f and what a residual adds to it. S models the same for drag alone.
+
+    Two corrections say how a body has changed (`corrected`): `efficiency` e, with which a rotor gives e times the
+    thrust and the reaction torque of a sound one at the same speed, and `added_drag` c [1/s] along the body's axes.
+
+    Parameters are deviations from nominal, so that all start at zero and one learning rate fits them all: positive ones
+    as log(value / nominal), the others in units of the vehicle's weight and arm, at 1 m/s and 10 rad/s. The lag of the
+    rotors is applied to the log (`hybrid_jax.flights.checks.cleaning`): as four more states it would be unknown at the
+    start of each window.
+
+    Attributes:
+        deviations: of each learned parameter, by name; shapes as of `shape_of`.
+        vehicle: its constants, which are the nominal values.
+        terms: nominal values of further terms; those that are zero and not learned cost nothing.
+        wrench: whether a residual is a force and a torque and not an acceleration. Its v̇ and ω̇ then hold at nominal
+            mass and inertia and are scaled by nominal / m and nominal / I at others, so that a learned aerodynamic
+            torque remains valid when the inertia changes.
+
+    Raises:
+        ValueError: an unknown parameter name, two that only their ratio or product tells, or no vehicle or terms.
+    """
 
     accepts_batch: ClassVar[bool] = True
 
-    def __check_init__(self):
-        vehicle = getattr(self, "vehicle", None)
-        if not isinstance(vehicle, Vehicle):
-            raise ValueError(f"vehicle must be a Vehicle, got {checks.short_repr(vehicle)}")
-
-    @abstractmethod
-    def theta(self) -> dict[str, Array]:
-        """The learned parameters in SI units, by name; each entry grows with the parameter that holds it."""
-
-
-class RigidBody(AbstractRigidBody):
-    """A rigid body carried by its rotors, with no drag, ground effect or wind.
-
-    θ_p is held as log(value / nominal), so that one learning rate fits Ix ≈ 3e-2 and k ≈ 9e-6 and all stay positive.
-
-    Raises:
-        ValueError: other parameters than Ix, Iy, k, or no vehicle.
-    """
-
-    log_ratios: dict[str, Float[Array, ""]]  # log(Ix / nominal), log(Iy / nominal), log(k / nominal)
+    deviations: dict[str, Float[Array, "..."]]
     vehicle: Vehicle = eqx.field(static=True)
+    terms: Terms = eqx.field(static=True, default_factory=Terms)
+    wrench: bool = eqx.field(static=True, default=False)
 
     def __check_init__(self):
-        if not isinstance(self.log_ratios, dict) or set(self.log_ratios) != set(LEARNED):
-            raise ValueError(f"log_ratios must hold {', '.join(LEARNED)}, got {checks.short_repr(self.log_ratios)}")
+        checks.instance("vehicle", self.vehicle, Vehicle)
+        checks.instance("terms", self.terms, Terms)
+        checks.instance("deviations", self.deviations, dict)
+        check_names(tuple(name for name in self.deviations if name not in CORRECTIONS))
 
-    def theta(self) -> dict[str, Float[Array, ""]]:
-        """θ_p in SI units: Ix, Iy [kg m²], k [N/(rad/s)²]."""
-        return {name: value * jnp.exp(self.log_ratios[name]) for name, value in nominal(self.vehicle).items()}
+    def theta(self) -> dict[str, Float[Array, "..."]]:
+        """The learned parameters in SI units, by name; see `Vehicle` and `Terms`."""
+        shapes = {name: shape_of(self.vehicle, name) for name in self.deviations}
+        entries = self.entries().items()
+        return {name: jnp.stack(rows).reshape(at) if (at := shapes[name]) else rows[0] for name, rows in entries}
+
+    def entries(self) -> dict[str, Rows]:
+        """θ_p number by number."""
+        units, known = units_of(self.vehicle), nominal_values(self.vehicle, self.terms)
+
+        def value(name: str, middle: float, deviation: Array) -> Array:
+            return middle * jnp.exp(deviation) if name in LOGARITHMIC else middle + units[name] * deviation
+
+        def values(name: str, deviation) -> Rows:
+            if not isinstance(deviation, tuple):
+                deviation = tuple(jnp.ravel(deviation)) if shape_of(self.vehicle, name) else (deviation,)
+            return tuple(value(name, *pair) for pair in zip(known[name], deviation, strict=True))
+
+        return {name: values(name, self.deviations[name]) for name in sorted(self.deviations)}
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         return self.of_rows(tuple(x), tuple(u))
 
     def train_batch(self, x, u):
-        return evaluate_columns(RigidBody.of_rows, self, x, u)
+        by_number = jax.tree.map(lambda leaf: tuple(jnp.ravel(leaf)) if jnp.ndim(leaf) else leaf, self)
+        return equations.evaluate_columns(RigidBody.of_rows, by_number, x, u)
 
     def of_rows(self, x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-        return newton_euler(self.vehicle, self.theta(), x, u)
-
-
-def newton_euler(vehicle: Vehicle, theta: dict[str, Array], x: Rows, u: Rows) -> Float[Array, " 13 *b"]:
-    """ẋ of a rigid body with θ_p = {"Ix": …, "Iy": …, "k": …}."""
-    return derivative(vehicle, Terms(), {name: (value,) for name, value in theta.items()}, x, u)
-
-
-class ForcedBody(RigidBody):
-    """A rigid body for which a residual is a force and a torque, not an acceleration.
-
-    Its ω̇ holds at the nominal inertia and is scaled by nominal / I at another one, so that a learned aerodynamic torque
-    remains valid when the inertia changes.
-    """
+        """ẋ from the entries of x and u."""
+        return equations.derivative(self.vehicle, self.terms, self.entries(), x, u)
 
     def apply_residual(self, x, residual):
-        ratios = jnp.stack([jnp.exp(-self.log_ratios[name]) for name in ("Ix", "Iy")])
-        factors = jnp.ones(STATE_SIZE, ratios.dtype).at[BODY_RATES.start : -1].set(ratios)
-        return expand_trailing(factors, residual) * residual
+        """A residual force, too, changes the position before it shows in the estimated velocity."""
+        if self.wrench:
+            factors = jnp.ones(STATE_SIZE, residual.dtype)
+            for name, at in INERTIAS.items():
+                factors = factors.at[at].set(jnp.exp(-self.deviations[name])) if name in self.deviations else factors
+            residual = expand_trailing(factors, residual) * residual
+        lag = self.entries().get("velocity_lag", (self.terms.velocity_lag,))
+        if not equations.is_present(lag):
+            return residual
+        attitude = rotation.matrix(tuple(x[QUATERNION]))
+        across = [equations.dot(column, tuple(residual[VELOCITY])) for column in zip(*attitude, strict=True)][:2]
+        position = residual[POSITION] + lag[0] * equations.in_world(attitude, across)
+        return jnp.concatenate([position, residual[POSITION.stop :]])
 
 
-def rigid_body(vehicle: Vehicle) -> RigidBody:
-    """The rigid body at the vehicle's nominal θ_p."""
-    return RigidBody({name: jnp.zeros(()) for name in LEARNED}, vehicle)
+def rigid_body(
+    vehicle: Vehicle, learn: tuple[str, ...] = LEARNED, terms: Terms | None = None, wrench: bool = False
+) -> RigidBody:
+    """The rigid body at its nominal values.
+
+    Args:
+        vehicle: its constants.
+        learn: names of the parameters that it learns, of `terms.SHAPES`.
+        terms: nominal values of what it has beyond thrust, torque and weight; by default nothing.
+        wrench: whether a residual beside it is a force and a torque, see `RigidBody`.
+
+    Raises:
+        ValueError: as of `check_names`.
+    """
+    check_names(tuple(learn))
+    deviations = {name: jnp.zeros(shape_of(vehicle, name)) for name in learn}
+    return RigidBody(deviations, vehicle, Terms() if terms is None else terms, wrench)
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
@@ -103,10 +150,53 @@ def perturbed_by(vehicle: Vehicle, key: PRNGKeyArray, off: float) -> RigidBody:
     return RigidBody(dict(zip(LEARNED, np.log(1 + off) * signs, strict=True)), vehicle)
 
 
+def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
+    """The field on another vehicle, such as the same one with a payload, with the same θ_p in SI units.
+
+    Its deviations differ, as they are relative to the vehicle's nominal values, weight and arm.
+    """
+    units, known = units_of(vehicle), nominal_values(vehicle, field.terms)
+
+    def deviation(name: str, value: Array) -> Array:
+        middle = jnp.asarray(known[name], value.dtype).reshape(shape_of(vehicle, name))
+        return jnp.log(value / middle) if name in LOGARITHMIC else (value - middle) / units[name]
+
+    deviations = {name: deviation(name, value) for name, value in field.theta().items()}
+    return RigidBody(deviations, vehicle, field.terms, field.wrench)
+
+
+def corrected(field: AbstractVectorField) -> AbstractVectorField:
+    """The field with corrections of its rigid bodies that change nothing yet; itself if it has none, or has them."""
+
+    def larger(node):
+        if not is_body(node) or node.deviations.keys() & CORRECTIONS:
+            return node
+        dtype = jnp.result_type(*jax.tree.leaves(node) or [float])
+        zero = {name: jnp.zeros(shape_of(node.vehicle, name), dtype) for name in CORRECTIONS}
+        return RigidBody(node.deviations | zero, node.vehicle, node.terms, node.wrench)
+
+    return jax.tree.map(larger, field, is_leaf=is_body)
+
+
+def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
+    """The field without corrections of rigid bodies that are zero; outside of compiled code."""
+
+    def smaller(node):
+        if not is_body(node) or any(np.any(node.deviations.get(name, 0)) for name in CORRECTIONS):
+            return node
+        kept = {name: value for name, value in node.deviations.items() if name not in CORRECTIONS}
+        return RigidBody(kept, node.vehicle, node.terms, node.wrench)
+
+    return jax.tree.map(smaller, field, is_leaf=is_body)
+
+
+def is_body(node) -> bool:
+    return isinstance(node, RigidBody)
+
+
 def moves_a_rigid_body(field) -> bool:
     """Whether a field contains a rigid body, so that its state is that of state.py."""
-    parts = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
-    return any(isinstance(part, AbstractRigidBody) for part in parts)
+    return any(map(is_body, jax.tree.leaves(field, is_leaf=is_body)))
 
 
 def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:

@@ -13,6 +13,8 @@ POSITIVE = {"mass": (), "Ix": (), "Iy": (), "Iz": (), "k": (), "k_rotors": (4,),
 SIGNED = {"torque_gain": (3,), "centre_of_mass": (2,), "drag": (3,), "cable_pull": (2,), "aerodynamic_moment": (3, 3)}
 SIGNED |= {"rate_damping": (3,), "velocity_gain": (3,), "velocity_lag": ()}
 SHAPES = POSITIVE | SIGNED  # of all learnable parameters, for four rotors; see `shape_of`
+CORRECTIONS = {"efficiency": (4,), "added_drag": (3,)}  # of a body that has changed; see `rigid_body.corrected`
+LOGARITHMIC = (*POSITIVE, "efficiency")
 Three = tuple[float, float, float]
 NONE = (0.0, 0.0, 0.0)
 
@@ -56,15 +58,16 @@ def check_names(learn: tuple[str, ...], also: tuple[str, ...] = ()) -> None:
 
 
 def shape_of(vehicle: Vehicle, name: str) -> tuple[int, ...]:
-    """The shape of a learnable parameter of this vehicle."""
-    return (vehicle.rotors,) if name == "k_rotors" else SHAPES[name]
+    """The shape of a learnable parameter or correction of this vehicle."""
+    return (vehicle.rotors,) if name in ("k_rotors", "efficiency") else (SHAPES | CORRECTIONS)[name]
 
 
 def nominal_values(vehicle: Vehicle, terms: Terms) -> dict[str, tuple[float, ...]]:
-    """The nominal value of everything in `SHAPES`, number by number; SI units."""
+    """The nominal value of everything in `SHAPES` and `CORRECTIONS`, number by number; SI units."""
     k, (ix, iy, iz) = vehicle.thrust_coefficient, vehicle.inertia
     own = {"Ix": (ix,), "Iy": (iy,), "Iz": (iz,), "k": (k,), "k_rotors": (k,) * vehicle.rotors}
     own |= {"mass": (vehicle.mass,), "torque_coefficient": (vehicle.torque_coefficient,)}
+    own |= {"efficiency": (1.0,) * vehicle.rotors, "added_drag": NONE}
     return own | {name: tuple(np.ravel(getattr(terms, name)).tolist()) for name in SIGNED}
 
 
@@ -74,4 +77,4 @@ def units_of(vehicle: Vehicle) -> dict[str, float]:
     arm = sum(math.hypot(*place) for place in vehicle.rotor_positions) / vehicle.rotors
     forces = {"drag": weight / SPEED, "aerodynamic_moment": weight * arm / SPEED, "rate_damping": weight * arm / RATE}
     places = {"centre_of_mass": arm, "cable_pull": 1 / arm}
-    return forces | places | dict.fromkeys(("torque_gain", "velocity_gain", "velocity_lag"), 1.0)
+    return forces | places | dict.fromkeys(("torque_gain", "velocity_gain", "velocity_lag", "added_drag"), 1.0)

@@ -13,8 +13,7 @@ from typing import Any
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.actuators import NAMES, Actuated, Actuator, actuated, check_actuator_names
-from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
-from hybrid_jax.dynamics.rigid_body import LEARNED
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, rigid_body
 from hybrid_jax.dynamics.terms import Terms, check_names
 from hybrid_jax.vehicle import TABLES, Vehicle, from_table, read_tables, require_known, vehicle_of
 
@@ -35,9 +34,9 @@ class VehicleModel:
     def __post_init__(self):
         check_learned(self.learn, self.actuator)
 
-    def physics(self) -> Multirotor:
+    def physics(self) -> RigidBody:
         """The field at its nominal values that is told rotor speeds."""
-        return multirotor(self.vehicle, learned_by_field(self.learn), self.terms)
+        return rigid_body(self.vehicle, learned_by_field(self.learn), self.terms)
 
     def commanded(self) -> Actuated:
         """The field at its nominal values that is told commands; ValueError without `[actuator]`."""

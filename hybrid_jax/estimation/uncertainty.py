@@ -23,7 +23,7 @@ from hybrid_jax.dynamics.disturbance import (
     with_physics,
     without_disturbance,
 )
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.normal_equations import (
@@ -181,7 +181,7 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
     if isinstance(physics, Hybrid) and disturbance is not None:
         found, values = named_parameters(physics.physics), jnp.atleast_1d(disturbance.value)
         labels = disturbance.indices or range(len(values))
-        if isinstance(physics.physics, AbstractRigidBody):
+        if isinstance(physics.physics, RigidBody):
             labels = [STATE_NAMES[i] for i in disturbance.indices or range(-len(values), 0)]
         return found | {f"disturbance[{label}]": value for label, value in zip(labels, values, strict=True)}
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(physics, trainable(physics)))

@@ -72,7 +72,7 @@ def identify(
     Args:
         field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
         measured: quantities that are compared, by default all that every recording has.
-        free: names of parameters that are fitted, such as k or log_efficiency[2], by default all; the others stay.
+        free: names of parameters that are fitted, such as k or efficiency[2], by default all; the others stay.
         known: the covariance of those that stay, to which the fitted ones owe a part of theirs; by default zero.
         rounds: fits, each with channels weighted by the errors of the one before.
 

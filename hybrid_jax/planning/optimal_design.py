@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import sized
-from hybrid_jax.dynamics.rigid_body import AbstractRigidBody
+from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation.least_squares import ravel_parameters, rounding
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.planning.fisher_information import Information, information_of, told_apart
@@ -200,11 +200,11 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
         return InputSeries(bounds, *numbers)
     if not isinstance(bounds, FlightBounds):
         raise ValueError(f"bounds must be FlightBounds or InputBounds, got {checks.short_repr(bounds)}")
-    parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, AbstractRigidBody))
-    bodies = [part for part in parts if isinstance(part, AbstractRigidBody)]
+    parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, RigidBody))
+    bodies = [part for part in parts if isinstance(part, RigidBody)]
     if not bodies or any(getattr(part, "rotor_states", 0) for part in (model, *bodies)):
         raise ValueError("bounds must be InputBounds, as the model is no multirotor that is told its rotor speeds")
-    vehicle = bodies[0].vehicle  # pyright: ignore[reportAttributeAccessIssue]
+    vehicle = bodies[0].vehicle
     least, most = bounds.rotor_speed
     if not least < vehicle.hover_speed / vehicle.max_rotor_speed < most or vehicle.rotors < 4:
         share = vehicle.hover_speed / vehicle.max_rotor_speed

@@ -193,7 +193,7 @@ def test_a_step_of_the_last_layer_leaves_the_others():
 
 
 def test_candidates_of_a_rigid_body_fit_what_their_names_say():
-    field = extended(hj.rigid_body(hj.IRIS), 13, 4)
+    field = extended(hj.rigid_body(hj.IRIS), 13)
     names, free = [*named_parameters(field)], free_parameters(field)
     assert [*free] == [*OF_A_RIGID_BODY]
     assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 3 + 6

@@ -1,5 +1,6 @@
 """The Jacobian of a step equals that of autodiff, for any field."""
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -13,7 +14,6 @@ from hybrid_jax.control.rotor_lag import stage_shares, step_of
 from hybrid_jax.control.sensitivities import advance_lagged, advance_with_jacobian, condensed_lagged
 from hybrid_jax.dynamics.base import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.rigid_body import ForcedBody
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, LinearResidual
 
@@ -41,7 +41,7 @@ def body():
 
 
 def invariant():
-    forced = ForcedBody(body().log_ratios, hj.IRIS)
+    forced = replace(body(), wrench=True)
     return hj.Hybrid(forced, network("near_ground", "rotors", "none", linear=True))
 
 

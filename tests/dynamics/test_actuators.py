@@ -16,7 +16,7 @@ from hybrid_jax.export.program import sizes_of
 from hybrid_jax.vehicle import IRIS
 
 LAGGING = Actuator((100.0, 900.0), time_constants=(0.04, 0.08))
-BODY = hj.multirotor(IRIS, ("Ix", "k_rotors"))
+BODY = hj.rigid_body(IRIS, ("Ix", "k_rotors"))
 LEVEL = np.zeros(13)
 LEVEL[3] = 1
 
@@ -51,7 +51,7 @@ def test_in_the_steady_state_a_commanded_vehicle_is_the_one_that_is_told_the_spe
 
 def test_a_curve_of_thrust_gives_that_thrust_and_a_voltage_acts_as_the_command_times_its_power():
     thrust = Actuator((0.5, 0.0, 8.0), "thrust", nominal_voltage=12.0, voltage_exponent=0.5)
-    field = actuated(hj.multirotor(IRIS, ()), thrust)
+    field = actuated(hj.rigid_body(IRIS, ()), thrust)
     w = field.steady_speeds(jnp.array([0.3, 0.4, 0.5, 0.6, 10.0]))
     share = jnp.array([0.3, 0.4, 0.5, 0.6]) * (10 / 12) ** 0.5
     np.testing.assert_allclose(IRIS.thrust_coefficient * w**2, 0.5 + 8 * share**2, rtol=1e-5)
@@ -85,7 +85,7 @@ def test_a_log_of_commands_becomes_one_of_the_mean_speeds_of_each_interval():
 
 
 def test_a_commanded_field_is_saved_exported_and_disturbed_in_its_body(tmp_path):
-    field = actuated(hj.multirotor(IRIS, ("Ix",)), LAGGING, ("curve", "time_constants", "delay"))
+    field = actuated(hj.rigid_body(IRIS, ("Ix",)), LAGGING, ("curve", "time_constants", "delay"))
     hj.save(tmp_path / "model.npz", field)
     loaded = hj.load(tmp_path / "model.npz").field
     assert named_parameters(loaded).keys() >= {"curve[1]", "time_constants[0]", "delay", "Ix"}

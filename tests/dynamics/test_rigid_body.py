@@ -11,7 +11,7 @@ from systems import ODD
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import HoldState
-from hybrid_jax.dynamics.rigid_body import LEARNED, ForcedBody, RigidBody, perturbed, rigid_body
+from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -96,11 +96,11 @@ def test_theta_is_nominal_at_zero_and_positive_everywhere():
 def test_a_guess_lies_in_its_box_and_follows_its_key():
     guesses = jax.vmap(lambda key: perturbed(IRIS, key, low=0.5, high=2.0))(jax.random.split(jax.random.key(0), 500))
     for name in LEARNED:
-        factors = np.exp(guesses.log_ratios[name])
+        factors = np.exp(guesses.deviations[name])
         assert 0.5 <= factors.min() < 0.51  # 500 draws leave a gap of about ln 4 / 500 at the ends
         assert 1.96 < factors.max() <= 2.0
     again = perturbed(IRIS, jax.random.split(jax.random.key(0), 500)[3], low=0.5, high=2.0)
-    assert all(again.log_ratios[name] == guesses.log_ratios[name][3] for name in LEARNED)
+    assert all(again.deviations[name] == guesses.deviations[name][3] for name in LEARNED)
 
 
 def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
@@ -115,7 +115,7 @@ def test_a_torque_beside_a_forced_body_turns_it_by_its_own_inertia():
     logs = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
     inertia = np.array(ODD.inertia) * np.exp([0.3, -0.4, 0.0])
     added = np.concatenate([np.zeros(7), force / ODD.mass, torque / inertia])
-    body = ForcedBody(logs, ODD)
+    body = RigidBody(logs, ODD, wrench=True)
     for field in (Hybrid(body, Push()), Hybrid(Hybrid(body, HoldState()), Push())):
         for x, u in zip(*samples(3), strict=True):
             np.testing.assert_allclose(field(x, u), RigidBody(logs, ODD)(x, u) + added, rtol=1e-12, atol=1e-11)

@@ -59,7 +59,7 @@ def test_parameters_and_push_are_found_together_and_the_network_stays():
     found = fit_least_squares(with_disturbance(hybrid()), flights(disturbed_by(PUSH)))
     assert found.converged
     for name, ratio in RATIOS.items():
-        np.testing.assert_allclose(found.field.physics.physics.log_ratios[name], ratio, atol=2e-3)
+        np.testing.assert_allclose(found.field.physics.physics.deviations[name], ratio, atol=2e-3)
     np.testing.assert_allclose(found.field.physics.residual.value, PUSH, atol=5e-3)
     assert eqx.tree_equal(found.field.residual, network())
 

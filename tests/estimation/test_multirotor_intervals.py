@@ -8,8 +8,7 @@ from pushes import Push, pushes
 
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.disturbance import with_disturbance
-from hybrid_jax.dynamics.multirotor import Multirotor, multirotor
-from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.training.channels import Channel, ChannelLoss
@@ -22,7 +21,7 @@ Z = 1.959964  # of 95 %, from the normal distribution's table
 
 @pytest.mark.parametrize("wrap", [lambda field: field, lambda field: Hybrid(field, Push(jnp.ones(2)))])
 def test_every_entry_has_its_interval_in_si_units(wrap):
-    found = intervals(wrap(multirotor(IRIS, LEARN)), np.diag(ERRORS**2))
+    found = intervals(wrap(rigid_body(IRIS, LEARN)), np.diag(ERRORS**2))
     drag, rotors = ([f"{name}[{i}]" for i in range(count)] for name, count in (("drag", 3), ("k_rotors", 4)))
     assert set(found) == {"Ix", *drag, *rotors}
     for name, error in zip(("Ix", *rotors), ERRORS[[0, 4, 5, 6, 7]], strict=True):
@@ -34,20 +33,8 @@ def test_every_entry_has_its_interval_in_si_units(wrap):
 
 
 def test_a_matrix_has_rows_and_columns():
-    found = intervals(multirotor(IRIS, ("aerodynamic_moment",)), np.eye(9) * 1e-4)
+    found = intervals(rigid_body(IRIS, ("aerodynamic_moment",)), np.eye(9) * 1e-4)
     assert list(found) == [f"aerodynamic_moment[{i},{j}]" for i in range(3) for j in range(3)]
-
-
-def test_of_the_paper_s_parameters_they_are_those_of_the_rigid_body():
-    logs = {"Ix": jnp.asarray(0.3), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.1)}
-    covariance = np.diag([1e-4, 4e-4, 9e-4])
-    ours, theirs = (intervals(field(logs, IRIS), covariance) for field in (Multirotor, RigidBody))
-    assert list(theirs) == ["Ix", "Iy", "k"]
-    for name, interval in theirs.items():
-        np.testing.assert_allclose(ours[name], interval, rtol=1e-6)
-        value = interval.value
-        assert value == RigidBody(logs, IRIS).theta()[name]
-        np.testing.assert_allclose(interval.high * interval.low, value**2, rtol=1e-6)  # about it as a ratio
 
 
 def test_a_disturbance_has_intervals_beside_the_parameters():

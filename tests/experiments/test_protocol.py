@@ -217,9 +217,9 @@ def test_a_seed_gives_all_models_the_same_parts():
     assert isinstance(fields["hybrid"], Hybrid)
     assert eqx.tree_equal(fields["hybrid"].residual, fields["no_physics"])
     assert eqx.tree_equal(fields["hybrid"].physics, fields["physics_only"])
-    for leaf in (fields["no_physics"].weight_in, fields["physics_only"].log_ratios["Ix"]):
+    for leaf in (fields["no_physics"].weight_in, fields["physics_only"].deviations["Ix"]):
         assert len(np.unique(leaf, axis=0)) == SMALL.seeds
-    factors = np.exp(list(fields["physics_only"].log_ratios.values()))
+    factors = np.exp(list(fields["physics_only"].deviations.values()))
     assert ((factors >= 0.8) & (factors <= 1.25)).all()
 
 

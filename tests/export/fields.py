@@ -1,5 +1,6 @@
 """One field of every kind, for the tests of export, with states and inputs to try them on; made when asked for."""
 
+from dataclasses import replace
 from functools import cache, partial
 
 import equinox as eqx
@@ -11,8 +12,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.multirotor import multirotor
-from hybrid_jax.dynamics.rigid_body import ForcedBody, RigidBody, perturbed
+from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import NORMS, InputScaling, LinearResidual, residual_network
@@ -59,7 +59,7 @@ def body():
 
 @cache
 def per_rotor():
-    return moved(multirotor(IRIS, tuple(name for name in SHAPES if name not in ("mass", "k")), TERMS))
+    return moved(rigid_body(IRIS, tuple(name for name in SHAPES if name not in ("mass", "k")), TERMS))
 
 
 def with_norm(norm):
@@ -73,11 +73,11 @@ def with_residual(inputs, outputs):
 FIELDS = {
     "rigid body": body,
     "multirotor, per rotor": per_rotor,
-    "multirotor": lambda: multirotor(IRIS, (), TERMS),
+    "multirotor": lambda: rigid_body(IRIS, (), TERMS),
     **{f"hybrid, norm {norm}": partial(with_norm, norm) for norm in NORMS},
     **{f"residual from {inputs} to {outputs}": partial(with_residual, inputs, outputs) for inputs, outputs in PAIRS},
     "linear path": lambda: Hybrid(
-        moved(ForcedBody(body().log_ratios, IRIS)), network(inputs="near_ground", outputs="accelerations", linear=True)
+        moved(replace(body(), wrench=True)), network(inputs="near_ground", outputs="accelerations", linear=True)
     ),
     "linear residual": lambda: Hybrid(body(), moved(LinearResidual(jnp.zeros((13, 17)), jnp.zeros(13)))),
     "frozen rates": lambda: FrozenRates(per_rotor()),

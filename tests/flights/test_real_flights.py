@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
-from hybrid_jax.dynamics.multirotor import multirotor
+from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.checks.consistency import OK, check_log
 from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.scores import flight_errors
@@ -52,7 +52,7 @@ HELD_OUT = {"hold": (0.0903, 0.282, 0.145, 1.534), "thrust": (0.0144, 0.0661, 0.
 @pytest.mark.parametrize("name", HELD_OUT)
 def test_baseline_errors_are_close_to_published_ones(name):
     vehicle = load_vehicle(FOLDER / "crazyflie_payload" / "vehicle.toml", "payload")
-    field = {"hold": HoldState(), "thrust": FrozenRates(multirotor(vehicle, ()))}[name]
+    field = {"hold": HoldState(), "thrust": FrozenRates(rigid_body(vehicle, ()))}[name]
     windows = cut_windows([read_csv(file) for file in FILES if file.parent.name == "payload"], 10, 10).windows
     found = np.sqrt([np.mean(part[:, 9] ** 2) for part in flight_errors(field, windows)])
     np.testing.assert_allclose(found[:2], HELD_OUT[name][:2], rtol=0.15)

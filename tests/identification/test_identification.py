@@ -29,7 +29,7 @@ LAYOUT = Layout(DT, 20, 60, span=0.05)
 @cache
 def pilot_of(late):
     """A program from shakes to the commands that a pilot gives, which act `late` steps later, and measurements."""
-    field = actuated(hj.multirotor(TRUTH, ()), replace(ACTUATOR, time_constants=0.07))
+    field = actuated(hj.rigid_body(TRUTH, ()), replace(ACTUATOR, time_constants=0.07))
     hover = (TRUTH.hover_speed - 100) / 900
     roll, pitch = np.sign(np.array(TRUTH.rotor_positions)[:, 1]), -np.sign(np.array(TRUTH.rotor_positions)[:, 0])
 
@@ -80,7 +80,7 @@ def twin():
 
 
 def start(body=("Ix", "Iy", "k"), own=("time_constant",)):
-    return actuated(hj.multirotor(IRIS, body), ACTUATOR, own)
+    return actuated(hj.rigid_body(IRIS, body), ACTUATOR, own)
 
 
 def holds(found, **truth):
@@ -121,7 +121,7 @@ def test_what_a_log_does_not_tell_has_an_interval_as_wide_as_that(twin):
 
 def test_an_estimated_initial_state_predicts_better_than_one_noisy_sample(twin):
     signals = only(twin, "position", "velocity", "attitude", "rates")
-    field = actuated(hj.multirotor(TRUTH, ("Ix",)), replace(ACTUATOR, time_constants=0.07))
+    field = actuated(hj.rigid_body(TRUTH, ("Ix",)), replace(ACTUATOR, time_constants=0.07))
     size = [
         np.sqrt((prediction_errors(field, [signals], replace(LAYOUT, initial=initial))["position"] ** 2).mean())
         for initial in ("estimated", "sample")
@@ -150,7 +150,7 @@ def test_a_fast_signal_is_averaged_without_delay_and_a_slow_one_is_there_at_its_
 
 
 def test_the_accelerometer_feels_thrust_and_no_gravity_and_changes_of_attitude_are_found_again():
-    field, x = hj.multirotor(IRIS, ()), jnp.zeros(13).at[3].set(1.0)
+    field, x = hj.rigid_body(IRIS, ()), jnp.zeros(13).at[3].set(1.0)
     force = measure("specific_force", field, x, jnp.full(4, IRIS.hover_speed))
     np.testing.assert_allclose(force, [0, 0, 9.81], atol=1e-4)
     np.testing.assert_allclose(measure("specific_force", field, x, jnp.zeros(4)), 0, atol=1e-5)
@@ -162,6 +162,6 @@ def test_what_is_missing_or_too_short_is_named(twin):
     assert "has no velocity" in refusal(lambda: identify(start(), [only(twin, "rates")], LAYOUT, ("velocity",)))
     short = replace(LAYOUT, steps=10_000)
     assert "in flight without a gap" in refusal(lambda: identify(start(), [only(twin, "rates")], short))
-    charged = actuated(hj.multirotor(IRIS, ("Ix",)), replace(ACTUATOR, nominal_voltage=15.0, voltage_exponent=1.0))
+    charged = actuated(hj.rigid_body(IRIS, ("Ix",)), replace(ACTUATOR, nominal_voltage=15.0, voltage_exponent=1.0))
     assert "has no battery voltage" in refusal(lambda: identify(charged, [only(twin, "rates")], LAYOUT))
     assert "windows for" in refusal(lambda: identify(start(), [only(twin, "rates")], replace(LAYOUT, most=3)))

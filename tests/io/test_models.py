@@ -99,14 +99,15 @@ def test_other_files_are_refused(tmp_path):
     for metadata in ({}, [1], {"field": 3, "about": {}}, {"field": {"array": "gone"}, "about": {}}):
         save_archive(other, models.FORMAT, metadata, {})
         assert "not a complete model" in refusal(other)
-    save_archive(other, models.FORMAT_1, {"field": {"kind": "RigidBody", "fields": {"mass": 1}}, "about": {}}, {})
-    assert "has fields log_ratios, vehicle, but the file has mass" in refusal(other)
+    body = {"class": "hybrid_jax.dynamics.rigid_body:RigidBody", "fields": {"mass": 1}}
+    save_archive(other, models.FORMAT, {"field": body, "about": {}}, {})
+    assert "has fields deviations, vehicle, terms, wrench, but the file has mass" in refusal(other)
 
 
 def test_a_vehicle_in_a_file_is_checked(tmp_path):
     tree = Structure(PHYSICS).tree
     tree["fields"]["vehicle"]["fields"]["mass"] = -1.0
-    arrays = {f"field/log_ratios/{name}": to_numpy(value) for name, value in PHYSICS.log_ratios.items()}
+    arrays = {f"field/deviations/{name}": to_numpy(value) for name, value in PHYSICS.deviations.items()}
     save_archive(tmp_path / "model.npz", models.FORMAT, {"field": tree, "about": {}}, arrays)
     assert "mass must be a positive" in refusal(tmp_path / "model.npz")
 

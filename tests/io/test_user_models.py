@@ -19,13 +19,11 @@ from smoke import script
 from user_modules import MAKERS, made, prediction
 
 import hybrid_jax as hj
-import hybrid_jax.adaptation.expert_augmentation  # defines two of the old classes
 from hybrid_jax.io import describe, structure
 from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.models import FORMAT
 
 KEY = jax.random.key(1)
-OLD_FILES = sorted((Path(__file__).parent / "saved_by_version_1").glob("*.npz"))
 
 
 @pytest.fixture(scope="module")
@@ -70,19 +68,6 @@ def test_two_runs_of_a_script_share_its_classes(tmp_path):
     )
     first, second = (script("script.py", what, cwd=tmp_path) for what in ("save", "load"))
     assert first == second
-
-
-@pytest.mark.parametrize("path", OLD_FILES, ids=lambda path: path.stem)
-def test_files_of_version_1_predict_what_they_did(path):
-    model = hj.load(path)
-    x0, u, dt = np.float32(model.about["x0"]), np.float32(model.about["u"]), model.about["dt"]
-    if "past" in model.about:
-        found = model.field.predict(hj.Trajectories(x0, u, np.float32(model.about["past"]), dt), u)
-    else:
-        found = model.predict(x0, u, dt)
-    # Programs of another optimisation level round differently.
-    np.testing.assert_allclose(found, model.about["prediction"], rtol=1e-5, atol=1e-5)
-    assert len(OLD_FILES) == 23
 
 
 def module_with(monkeypatch, name, sign):

@@ -10,12 +10,11 @@ import pytest
 from jax.flatten_util import ravel_pytree
 from matrices import newton_euler
 
-from hybrid_jax import Hybrid, load, rigid_body, rotation, save
+from hybrid_jax import Hybrid, load, rotation, save
 from hybrid_jax.dynamics.base import Frozen, infer_batch, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.multirotor import Multirotor, multirotor, with_vehicle
-from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body
+from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body, rigid_body, with_vehicle
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
@@ -61,21 +60,14 @@ def one_by_one(field, x, u):
 def test_at_nominal_it_is_the_rigid_body(learn):
     x, u = samples()
     np.testing.assert_allclose(
-        one_by_one(multirotor(IRIS, learn), x, u), one_by_one(rigid_body(IRIS), x, u), rtol=1e-14, atol=1e-13
+        one_by_one(rigid_body(IRIS, learn), x, u), one_by_one(rigid_body(IRIS), x, u), rtol=1e-14, atol=1e-13
     )
-
-
-def test_with_the_paper_s_parameters_it_is_the_rigid_body_everywhere():
-    logs = {"Ix": jnp.asarray(0.3), "Iy": jnp.asarray(-0.2), "k": jnp.asarray(0.1)}
-    ours, theirs, (x, u) = Multirotor(logs, IRIS), RigidBody(logs, IRIS), samples()
-    np.testing.assert_array_equal(one_by_one(ours, x, u), one_by_one(theirs, x, u))
-    assert ours.theta() == theirs.theta()
 
 
 def test_it_is_newton_euler_with_drag_moment_damping_gain_and_offset():
     k = (8e-6, 9e-6, 8.5e-6, 7e-6)
     vehicle = replace(IRIS, thrust_coefficient=8e-6)
-    field = multirotor(vehicle, ("k_rotors",), KNOWN)
+    field = rigid_body(vehicle, ("k_rotors",), KNOWN)
     field = eqx.tree_at(lambda field: field.deviations["k_rotors"], field, jnp.log(jnp.array(k) / 8e-6))
     x, u = samples()
     expected = np.stack(
@@ -89,14 +81,14 @@ def test_a_known_term_is_a_learned_one_at_its_value(name):
     x, u = samples()
     value = getattr(KNOWN, name)
     terms = Terms(**{"drag": KNOWN.drag, name: value})  # a lag without a force is none
-    known, learned = multirotor(IRIS, (), terms), multirotor(IRIS, (name,), terms)
+    known, learned = rigid_body(IRIS, (), terms), rigid_body(IRIS, (name,), terms)
     np.testing.assert_allclose(learned.theta()[name], value, rtol=1e-15)
     np.testing.assert_allclose(one_by_one(learned, x, u), one_by_one(known, x, u), rtol=1e-13, atol=1e-12)
     assert (one_by_one(moved(learned), x, u) != one_by_one(known, x, u)).any()
 
 
 MINIBATCHES = {"rigid body": rigid_body(IRIS)} | {
-    " ".join(learn) or "nothing": multirotor(IRIS, learn, KNOWN) for learn in [("Ix", "Iy", "k"), ALL, ("drag",), ()]
+    " ".join(learn) or "nothing": rigid_body(IRIS, learn, KNOWN) for learn in [("Ix", "Iy", "k"), ALL, ("drag",), ()]
 }
 
 
@@ -116,8 +108,8 @@ def test_a_minibatch_and_its_gradient_are_those_of_its_samples(field):
 
 def test_all_terms_are_recovered_from_flights_made_with_them():
     learn = tuple(name for name in ALL if name not in ("torque_gain", "velocity_gain"))
-    truth, (x, u) = moved(multirotor(IRIS, learn), 0.05), samples(30)
-    start, rebuild = ravel_pytree(multirotor(IRIS, learn))
+    truth, (x, u) = moved(rigid_body(IRIS, learn), 0.05), samples(30)
+    start, rebuild = ravel_pytree(rigid_body(IRIS, learn))
 
     @jax.jit
     def flown(parameters):
@@ -139,8 +131,8 @@ AROUND |= {"hybrid": lambda body: Hybrid(body, HoldState())}
 def test_position_moves_with_the_true_velocity_where_the_log_s_lags(around):
     """An estimator that knows thrust alone has v̂˙ = R T e_z / m − g e_z + (v − v̂) / λ, the last across the thrust."""
     lag, (x, u) = 0.25, samples()
-    field = around(multirotor(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
-    thrust = one_by_one(multirotor(IRIS, ()), x, u)[VELOCITY]
+    field = around(rigid_body(IRIS, (), Terms(drag=(0.3, 0.4, 0.0), velocity_lag=lag)))
+    thrust = one_by_one(rigid_body(IRIS, ()), x, u)[VELOCITY]
     behind = jnp.asarray([0.3, -0.2, 0.0])  # v − v̂ in the body
     alone = lambda field, x, u: field(x[:, 0], u[:, 0])[:, None]  # noqa: E731
     evaluations = [*map(eqx.filter_jit, (train_batch, infer_batch, alone))]
@@ -160,14 +152,14 @@ def test_a_body_that_does_not_turn_tells_where_its_cable_pulls():
     arms = np.array(IRIS.rotor_positions)
     held = [*-np.cross([0.0, 0.0, -below], pull)[:2], IRIS.mass * IRIS.gravity]
     lifts = np.linalg.lstsq(np.stack([arms[:, 1], -arms[:, 0], np.ones(4)]), np.array(held))[0]
-    field = multirotor(IRIS, (), Terms(cable_pull=(1 / below, 1 / below)))
+    field = rigid_body(IRIS, (), Terms(cable_pull=(1 / below, 1 / below)))
     level = jnp.zeros(13).at[3].set(1.0)
     derivative = field(level, jnp.sqrt(lifts / IRIS.thrust_coefficient))
     np.testing.assert_allclose(IRIS.mass * derivative[VELOCITY], pull, atol=1e-12)
 
 
 def test_what_is_learned_goes_with_the_vehicle_to_another():
-    field = moved(multirotor(IRIS, ALL, KNOWN))
+    field = moved(rigid_body(IRIS, ALL, KNOWN))
     heavy = with_vehicle(field, replace(IRIS, mass=2.0, inertia=(0.03, 0.04, 0.06), thrust_coefficient=9e-6))
     for name, value in field.theta().items():
         np.testing.assert_allclose(heavy.theta()[name], value, rtol=1e-12, atol=1e-15)
@@ -176,26 +168,26 @@ def test_what_is_learned_goes_with_the_vehicle_to_another():
 
 def test_a_learned_mass_is_that_of_a_heavier_vehicle():
     heavier = replace(IRIS, mass=1.3 * IRIS.mass)
-    learned = Multirotor({"mass": jnp.log(1.3)}, IRIS, KNOWN)
+    learned = RigidBody({"mass": jnp.log(1.3)}, IRIS, KNOWN)
     np.testing.assert_allclose(learned.theta()["mass"], heavier.mass)
     x, u = samples()
-    expected = one_by_one(multirotor(heavier, (), KNOWN), x, u)
+    expected = one_by_one(rigid_body(heavier, (), KNOWN), x, u)
     np.testing.assert_allclose(one_by_one(learned, x, u), expected, rtol=1e-13, atol=1e-13)
 
 
 def test_the_mass_of_a_payload_is_found_where_the_thrust_is_known():
     x0, u = samples(20)
     u = jnp.broadcast_to(u.T[:, None], (20, 10, 4))
-    loaded = multirotor(replace(IRIS, mass=1.2 * IRIS.mass), ())
+    loaded = rigid_body(replace(IRIS, mass=1.2 * IRIS.mass), ())
     windows = Trajectories(x0.T, u, rollout_batch(loaded, x0.T, u, 0.01), 0.01)
-    found = fit_least_squares(multirotor(IRIS, ("mass",)), windows).field
+    found = fit_least_squares(rigid_body(IRIS, ("mass",)), windows).field
     np.testing.assert_allclose(found.theta()["mass"], 1.2 * IRIS.mass, rtol=1e-6)
 
 
 def test_no_torque_without_gain():
     x, u = samples()
     still = x.at[BODY_RATES].set(0.0)
-    derivative = one_by_one(multirotor(IRIS, (), Terms(torque_gain=(0.0, 0.0, 0.0))), still, u)
+    derivative = one_by_one(rigid_body(IRIS, (), Terms(torque_gain=(0.0, 0.0, 0.0))), still, u)
     np.testing.assert_array_equal(derivative[BODY_RATES], 0)
 
 
@@ -210,7 +202,7 @@ def test_no_torque_without_gain():
 )
 def test_what_cannot_be_learned_is_refused(learn, said):
     with pytest.raises(ValueError, match=said):
-        multirotor(IRIS, learn)
+        rigid_body(IRIS, learn)
 
 
 @pytest.mark.parametrize(
@@ -224,7 +216,7 @@ def test_a_term_that_is_none_is_refused_by_name(term):
 
 
 def test_it_survives_a_file_and_its_states_are_checked(tmp_path):
-    field = Hybrid(moved(multirotor(IRIS, ALL, KNOWN)), rigid_body(IRIS))
+    field = Hybrid(moved(rigid_body(IRIS, ALL, KNOWN)), rigid_body(IRIS))
     save(tmp_path / "model.npz", field)
     assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)
     assert sum(jax.tree.leaves(trainable(field.physics))) == len(ALL)
@@ -233,5 +225,5 @@ def test_it_survives_a_file_and_its_states_are_checked(tmp_path):
 
 def test_single_precision_stays_single():
     x, u = (part[:, 0].astype(np.float32) for part in samples())
-    field = jax.tree.map(lambda leaf: leaf.astype(np.float32), multirotor(IRIS, ALL, KNOWN))
+    field = jax.tree.map(lambda leaf: leaf.astype(np.float32), rigid_body(IRIS, ALL, KNOWN))
     assert field(x, u).dtype == np.float32

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.corrected_body import CorrectedBody, corrected, simplified
-from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.dynamics.disturbance import with_disturbance, without_zeros
+from hybrid_jax.dynamics.rigid_body import corrected, uncorrected
 from hybrid_jax.rotation import from_axis_angle
 from hybrid_jax.sim.changes import DOUBLED_DRAG, LOADED, WEAK_ROTOR, loaded
 from hybrid_jax.sim.domain import SOURCE
@@ -18,28 +18,33 @@ BODY = hj.rigid_body(hj.IRIS)
 U = jnp.array([640.0, 660.0, 650.0, 630.0])
 
 
+def changed(efficiency=(1.0, 1.0, 1.0, 1.0), drag=0.0):
+    deviations = {"efficiency": jnp.log(jnp.array(efficiency)), "added_drag": jnp.full(3, drag)}
+    return hj.RigidBody(BODY.deviations | deviations, hj.IRIS)
+
+
 def moving():
     tilted = from_axis_angle(jnp.array([0.6, 0.8, 0.0]), jnp.asarray(0.4))
     return jnp.zeros(13).at[2].set(50.0).at[3:7].set(tilted).at[7:].set(jnp.array([1, -2, 0.5, 0.3, -0.2, 0.1]))
 
 
 def test_without_a_change_it_is_the_body_and_is_simplified_to_it():
-    larger = corrected(hj.Hybrid(BODY, hj.residual_network(13, 4, jax.random.key(0), hidden=4)), 4)
-    assert isinstance(larger.physics, CorrectedBody)
+    larger = corrected(hj.Hybrid(BODY, hj.residual_network(13, 4, jax.random.key(0), hidden=4)))
+    assert eqx.tree_equal(larger.physics, changed())
     np.testing.assert_array_equal(larger.physics(moving(), U), BODY(moving(), U))
-    assert eqx.tree_equal(simplified(with_disturbance(larger)).physics, BODY)
-    weak = eqx.tree_at(lambda field: field.physics.log_efficiency, larger, jnp.array([-0.1, 0, 0, 0]))
-    assert isinstance(simplified(weak).physics, CorrectedBody)
+    assert eqx.tree_equal(uncorrected(without_zeros(with_disturbance(larger))).physics, BODY)
+    weak = changed((0.9, 1, 1, 1))
+    assert eqx.tree_equal(uncorrected(weak), weak)
 
 
 def test_an_efficiency_is_a_factor_on_thrust_and_reaction_torque():
-    weak = CorrectedBody(BODY, jnp.log(jnp.array([0.85, 1, 1, 1])), jnp.zeros(3))
+    weak = changed((0.85, 1, 1, 1))
     slower = U.at[0].multiply(np.sqrt(0.85))  # both go with the square of the speed
     np.testing.assert_allclose(weak(moving(), U), BODY(moving(), slower), rtol=1e-6, atol=1e-6)
 
 
 def test_drag_slows_along_the_axes_of_the_body():
-    dragged = CorrectedBody(BODY, jnp.zeros(4), jnp.full(3, 0.3))
+    dragged = changed(drag=0.3)
     change = dragged(moving(), U) - BODY(moving(), U)
     np.testing.assert_allclose(change[VELOCITY], -0.3 * moving()[VELOCITY], atol=1e-6)  # alike along all axes
     np.testing.assert_array_equal(change[BODY_RATES], 0.0)
@@ -53,7 +58,7 @@ def test_drag_slows_along_the_axes_of_the_body():
 def test_it_can_be_what_the_simulator_flies(domain, efficiency, drag):
     """Far above the ground, where ground effect is none."""
     c = 2 * SOURCE.drag_coefficient / hj.IRIS.mass if drag is None else drag
-    field = CorrectedBody(BODY, jnp.log(jnp.array([efficiency, 1, 1, 1])), jnp.full(3, c))
+    field = changed((efficiency, 1, 1, 1), c)
     with jax.enable_x64(True):
         x, u = moving().astype(float), U.astype(float)
         after = domain.quadrotor().step(x, u, jnp.zeros(()), 1e-4)
