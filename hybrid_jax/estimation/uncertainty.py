@@ -5,6 +5,7 @@ too narrow. It contains no bias: effects that the model cannot express, such as 
 amount that no interval shows; `experiments/coverage.py` measures both.
 """
 
+from functools import partial
 from typing import Literal, NamedTuple
 
 import equinox as eqx
@@ -19,13 +20,12 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
     physics_of,
+    sized,
     with_disturbance,
-    with_physics,
-    without_disturbance,
 )
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation import least_squares
-from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_least_squares, ravel_parameters
+from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_free, ravel_parameters
 from hybrid_jax.estimation.normal_equations import (
     CHUNK,
     ErrorLoss,
@@ -222,9 +222,18 @@ def select_disturbance(
     Pure; raises and arguments as of `fit_least_squares`, but `windows` must be independent. `indices` are the disturbed
     states, see `with_disturbance`.
     """
-    starts = with_disturbance(field, indices), without_disturbance(field)
-    fits = [fit_least_squares(start, windows, solver, max_steps, scale) for start in starts]
+    larger = sized(with_disturbance(field, indices), windows.x0.shape[-1])
+    parameters, _ = ravel_parameters(larger)
+    own = parameters.size - disturbance_of(larger).value.size  # pyright: ignore[reportOptionalMemberAccess]
+    none = eqx.tree_at(disturbance_of, larger, replace_fn=partial(jax.tree.map, jnp.zeros_like))
+    # Both are fits of the larger field, so that one program serves them.
+    least_squares.check_windows(field, windows)
+    checks.count("max_steps", max_steps)
+    every = np.ones(parameters.size, bool), np.arange(parameters.size) < own
+    options = windows, solver, max_steps, scale
+    fits = [fit_free(start, *options, jnp.asarray(free)) for start, free in zip((larger, none), every, strict=True)]
     equations = [normal_equations(fit.field, windows, solver, CHUNK, None, scale) for fit in fits]
+    equations[1] = masked(equations[1], every[1])
     return _selection(fits, equations, windows.horizon)
 
 
@@ -234,8 +243,5 @@ def _selection(fits: list[LeastSquaresFit], equations: list[NormalEquations], ho
     gains = left_out(equations[1], horizon) - left_out(equations[0], horizon)
     gain, error = jnp.mean(gains), jnp.std(gains, ddof=1) / jnp.sqrt(len(gains))
     needed = gain > error  # False where one of them is not finite
-    zero = jax.tree.map(jnp.zeros_like, disturbance_of(disturbed.field))
-    padded = with_physics(plain.field, Hybrid(physics_of(plain.field), zero))
-    plain = eqx.tree_at(lambda fit: fit.field, plain, padded)
     kept = jax.tree.map(lambda a, b: jnp.where(needed, a, b) if eqx.is_array(a) else a, disturbed, plain)
     return DisturbanceSelection(kept, needed, gain, error)
