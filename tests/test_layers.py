@@ -14,7 +14,7 @@ ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
     *("state", "rotation", "matrices", "chunks", "runtime", "native", "checks", "vehicle", "trajectories"),
-    *("extrapolation", "dynamics", "integrate", "networks", "rollout_kernels", "rollouts", "metrics", "io"),
+    *("status", "extrapolation", "dynamics", "integrate", "networks", "rollout_kernels", "rollouts", "metrics", "io"),
     *("estimation", "training", "adaptation", "online", "sweep", "sim", "flights", "control", "export"),
     *("planning", "identification"),
 )

@@ -25,6 +25,7 @@ from hybrid_jax.export import casadi_function, casadi_step, export_field, export
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import SplitSpec, fly
+from hybrid_jax.status import Status
 from hybrid_jax.training.loss import residual_norm
 from hybrid_jax.trajectories import check, concatenate, split, windows_of
 
@@ -124,7 +125,7 @@ def test_windows_that_pass_the_check_are_whole(found):
 def test_a_fit_leaves_a_finite_field_or_is_refused(train, validation, rate, rules, key, field):
     rules = {"max_epochs": 2, "settings": hj.Settings(4)} | rules
     found = outcome(hj.fit, field, train, validation, key, rates=rate, **rules)
-    assert found is None or (is_finite(found.best) and (found.status == "diverged" or np.isfinite(found.best_mse)))
+    assert found is None or (is_finite(found.best) and (found.status == Status.DIVERGED or np.isfinite(found.best_mse)))
 
 
 @pytest.mark.parametrize("rates", [(1, 2), hj.Hybrid(1.0, "fast"), hj.Hybrid(np.nan, 1.0), {"physics": 1.0}])

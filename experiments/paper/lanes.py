@@ -15,8 +15,9 @@ from experiments.reporting.names import HYBRID, SOURCE_ONLY, label
 from experiments.reporting.results import Results, Row
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.sim.flight import DT
+from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import lane
-from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED, FitState
+from hybrid_jax.training.fitting import FitState
 from hybrid_jax.trajectories import Trajectories
 
 THETA = ("Ix", "Iy", "k")
@@ -95,7 +96,7 @@ def lanes_of(
             "rho": None,  # see `with_rho`
             "val_mse": float(fit.val_mse[i]),
             "epochs": int(fit.epochs[i]),
-            "status": STATUS_NAMES.get(int(fit.status[i]), STATUS_NAMES[STOPPED]),
+            "status": str(Status(int(fit.status[i]))),
             "theta": {name: float(value[i]) for name, value in theta.items()} or None,
             "theta_interval": bounds or None,
             **{name: float(values[i]) for name, values in (more or {}).items()},

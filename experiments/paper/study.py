@@ -31,10 +31,10 @@ from hybrid_jax.runtime import FAST_COMPILE, cores, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
+from hybrid_jax.status import Status
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
-from hybrid_jax.training.fitting import STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
@@ -243,7 +243,7 @@ def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     if config.validation != "own":
         jobs.append((adaptation(model, TARGET_ONLY, fresh, config, config.sizes), target))
     for (states, plans), windows in jobs:
-        stopped = replace(states, status=np.full_like(states.status, STOPPED))
+        stopped = replace(states, status=np.full_like(states.status, Status.OK))
         sweep(stopped, plans, windows["train"], windows["validation"], shared, min_capacity=capacity(config))
     evaluate(before[0].best, target["test"], EVERY, shared, capacity(config)[0])
 

@@ -28,9 +28,9 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.flights.scores import FlightErrors, flight_errors
+from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import lane, stack
 from hybrid_jax.training.channels import ChannelLoss
-from hybrid_jax.training.fitting import STATUS_NAMES, STOPPED
 from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories
 
@@ -100,7 +100,7 @@ def score_model(scoring: Callable[..., Test], trained: TrainedModel, theta: Sequ
     for run in range(len(trained)):
         columns = {"model": trained.model, "mode": trained.mode, "recipe": trained.recipe, **theta[run]}
         columns |= {"n_train": trained.size(run), "seed": trained.seeds[run], "epochs": int(trained.epochs[run])}
-        status = STATUS_NAMES.get(int(trained.status[run]), STATUS_NAMES[STOPPED])
+        status = str(Status(int(trained.status[run])))
         yield scoring(trained.run(run), **columns, val_loss=trained.val_loss[run], status=status)
 
 

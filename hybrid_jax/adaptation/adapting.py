@@ -1,5 +1,6 @@
 """`adapt`: one call that adapts any field to windows of a changed system, by any method; one result for all methods."""
 
+import math
 import warnings
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
@@ -29,14 +30,13 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with, load_lapack
+from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories, check_dt, check_like
 
 HELD_OUT = 5  # one in so many windows validates
 NAMED = 50  # physics with more parameters is a network, and its weights are not listed
-STATUS = {STOPPED: "converged", CAPPED: "stopped at the limit of steps", DIVERGED: "diverged"}
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; are dt and all units right?"
 NOT_FITTED = "no parameter was fitted"
@@ -63,15 +63,27 @@ UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w
 
 @dataclass(frozen=True)
 class Parameter:
-    """A physical parameter and its confidence interval; low and high are None where there is no valid one."""
+    """A physical parameter and its confidence interval.
+
+    Attributes:
+        value: the estimate, in `unit`.
+        low: the lower end of the interval in `unit`: NaN without a valid one, −∞ or 0 where the windows tell nothing.
+        high: the upper end in `unit`: NaN without a valid interval, ∞ where the windows tell nothing.
+        unit: a text such as "kg m²"; None if it is not known.
+    """
 
     value: float
-    low: float | None = None
-    high: float | None = None
+    low: float = math.nan
+    high: float = math.nan
     unit: str | None = None
 
+    @property
+    def has_interval(self) -> bool:
+        """Whether there is a valid interval, be it infinite."""
+        return not math.isnan(self.low)
+
     def __str__(self) -> str:
-        around = "" if self.low is None or self.high is None else f"  ({self.low:.4g} to {self.high:.4g})"
+        around = f"  ({self.low:.4g} to {self.high:.4g})" if self.has_interval else ""
         return f"{self.value:.4g}{f' {self.unit}' if self.unit else ''}{around}"
 
 
@@ -87,7 +99,7 @@ class Adaptation:
     mse_after: float  # and of the adapted one
     windows: int  # their number
     steps: int  # epochs, or evaluations of the Jacobian; 0 for a closed form
-    status: str  # one of `STATUS`
+    status: Status
     level: float  # confidence level of the intervals
     without_intervals: str | None  # why there are none, if so
     covariance: Float[np.ndarray, "p p"] | None = None  # of the parameters as the physics holds them
@@ -101,13 +113,13 @@ class Adaptation:
     @property
     def converged(self) -> bool:
         """Whether the method stopped by itself, at a finite error."""
-        return self.status == STATUS[STOPPED]
+        return self.status == Status.OK
 
     def report(self) -> str:
         """A summary in plain text, a few lines."""
         after = f" after {self.steps} steps" if self.steps else ""
         lines = [
-            f"Adapted to {self.windows} windows by {self.method}: {self.status}{after}.",
+            f"Adapted to {self.windows} windows by {self.method}: {self.status.message}{after}.",
             f"Mean squared prediction error: {self.mse_before:.3g} before, {self.mse_after:.3g} after.",
         ]
         if self.chosen is not None:
@@ -142,7 +154,7 @@ class Adaptation:
     def to_dict(self) -> dict[str, Any]:
         """Everything but the field, as JSON values: None for a number that is not finite."""
         parameters = {name: asdict(parameter) for name, parameter in self.parameters.items()}
-        found = vars(self) | {"converged": self.converged, "parameters": parameters}
+        found = vars(self) | {"status": str(self.status), "converged": self.converged, "parameters": parameters}
         return json_value({name: value for name, value in found.items() if name != "field"})
 
 
@@ -209,8 +221,9 @@ def adapt(
         adapted = uncorrected(without_zeros(adapted))  # what windows need
     rigid = moves_a_rigid_body(field)
     choice = {} if solution.choice is None else _chosen(solution.choice, train, rigid)
+    status = Status(int(solution.status))
     without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
-    without = NOT_FINITE if int(solution.status) == DIVERGED else without
+    without = NOT_FINITE if status == Status.DIVERGED else without
     free = None if solution.choice is None else _fitted(solution.choice, adapted)
     found = disturbance_of(adapted)
     return Adaptation(
@@ -221,7 +234,7 @@ def adapt(
         mse_after=float(mse(adapted, windows)),
         windows=len(windows),
         steps=int(solution.steps),
-        status=STATUS[int(solution.status)],
+        status=status,
         level=level,
         outside={} if learned_from is None else shares_outside(*(motion_of(w, rigid) for w in (learned_from, windows))),
         **choice,

@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.rigid_body import corrected, moves_a_rigid_body
 from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, STOPPED
+from hybrid_jax.status import ended
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
@@ -93,8 +93,7 @@ class Auto:
         choice = Choice((*fitted,), fits.errors, own, (*named_parameters(larger),), jnp.asarray(free), fits.theta, None)
         if self.networks and has_network(larger):
             choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks)
-        finite = jnp.isfinite(fits.errors.mse[own]).all()
-        status = jnp.where(fits.converged[own], STOPPED, jnp.where(finite, CAPPED, DIVERGED))
+        status = ended(fits.converged[own], fits.converged[own] | jnp.isfinite(fits.errors.mse[own]).all())
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
 

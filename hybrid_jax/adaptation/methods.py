@@ -17,18 +17,19 @@ from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, traina
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.estimation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import select_disturbance
+from hybrid_jax.status import Status
 from hybrid_jax.training.channels import ChannelLoss
-from hybrid_jax.training.fitting import ADAM, CAPPED, DIVERGED, STOPPED, make_run_config, run, start
+from hybrid_jax.training.fitting import ADAM, make_run_config, run, start
 from hybrid_jax.training.objective import Objective, Settings
 from hybrid_jax.trajectories import Trajectories
 
 
 class Solution(NamedTuple):
-    """The adapted field, the steps that it took, and STOPPED (converged), CAPPED or DIVERGED of training.fitting."""
+    """The adapted field, the steps that it took, and how it ended, a `Status`."""
 
     field: AbstractVectorField
     steps: Int[Array, ""] | int = 0
-    status: Int[Array, ""] | int = STOPPED
+    status: Int[Array, ""] | int = Status.OK
     choice: Any = None  # of `Auto`
 
 
@@ -83,8 +84,7 @@ class LeastSquares:
             found = select_disturbance(field, train, *options, indices).fit
         else:
             found = fit_least_squares(start, train, *options)
-        status = jnp.where(found.converged, STOPPED, jnp.where(jnp.isfinite(found.mse), CAPPED, DIVERGED))
-        return Solution(found.field, found.steps, status)
+        return Solution(found.field, found.steps, found.status)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parame
     for i, result in enumerate(results):
         if result.covariance is None:
             raise ValueError(f"results[{i}] has no intervals: {result.without_intervals}")
-    fitted = [{name for name, one in result.parameters.items() if one.low is not None} for result in results]
+    fitted = [{name for name, one in result.parameters.items() if one.has_interval} for result in results]
     estimates = [_estimates(result) for result in results]
     found = {}
     for name in (name for name in results[0].parameters if all(name in own for own in fitted)):

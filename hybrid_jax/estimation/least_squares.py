@@ -19,6 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.status import Status, ended
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
 DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
@@ -31,12 +32,24 @@ Theta = Float[Array, " p"]
 
 
 class LeastSquaresFit(eqx.Module):
-    """The result of `fit_least_squares`."""
+    """The result of `fit_least_squares`.
 
-    field: AbstractVectorField  # with the fitted θ_p; the start if no finite L_MSE was reached
-    mse: Float[Array, ""]  # L_MSE on the windows, of errors over `scale`
-    steps: Int[Array, ""]  # evaluations of the residuals and their Jacobian
-    converged: Bool[Array, ""]  # whether it stopped before `max_steps`, at a finite L_MSE
+    Attributes:
+        field: with the fitted θ_p; the start if no finite L_MSE was reached.
+        mse: L_MSE on the windows, of errors over `scale`.
+        steps: evaluations of the residuals and their Jacobian.
+        status: how it ended, a `Status`.
+    """
+
+    field: AbstractVectorField
+    mse: Float[Array, ""]
+    steps: Int[Array, ""]
+    status: Int[Array, ""]
+
+    @property
+    def converged(self) -> Bool[Array, ""]:
+        """Whether it stopped before `max_steps`, at a finite L_MSE."""
+        return self.status == Status.OK
 
 
 def fit_least_squares(
@@ -139,7 +152,7 @@ def fit_and_linearise(
     mse = jnp.mean(jnp.sum(jnp.square(end.errors), axis=-1))
     finite = jnp.isfinite(mse)
     theta = jnp.where(finite, theta_at(end.z, end.units[0]), start)
-    return LeastSquaresFit(unravel(theta), mse, end.steps, end.converged & finite), end.jacobian, end.errors
+    return LeastSquaresFit(unravel(theta), mse, end.steps, ended(end.converged, finite)), end.jacobian, end.errors
 
 
 def _units(jacobian, errors, windows: Trajectories, scale: Scale, free) -> tuple[Theta, Float[Array, ""]]:

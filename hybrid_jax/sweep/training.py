@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.metrics import window_mse
 from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.status import Status
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
 from hybrid_jax.training import fitting
@@ -84,7 +85,7 @@ def sweep(
     none = np.zeros(len(costs), np.int32)
     block((states, plans, none), shared, costs, range(len(costs)))  # compiles, trains nothing
     more, began = FIRST_BLOCK, time.perf_counter()
-    while len(active := np.flatnonzero(states.status == fitting.RUNNING)):
+    while len(active := np.flatnonzero(states.status == Status.RUNNING)):
         start = time.perf_counter()
         # A device with less work than the busiest trains its lanes for more epochs, so that none is idle.
         shards, chunk, _ = block.schedule(len(costs), costs, active)
@@ -163,7 +164,7 @@ def _merge(states: FitState, active: np.ndarray, after: PyTree) -> FitState:
 
 
 def _progress(states: FitState, plans: RunConfig, seconds: float) -> Progress:
-    running = np.asarray(states.status == fitting.RUNNING)
+    running = np.asarray(states.status == Status.RUNNING)
     at_most = plans.max_epochs - states.epoch
     at_least = np.maximum(plans.min_epochs, states.best_epoch + plans.patience) - states.epoch
     return Progress(

@@ -21,8 +21,9 @@ from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
+from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import ADAM, RUNNING, FitState, Optimiser, RunConfig, make_run_config
+from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes, check_dt
 
@@ -49,7 +50,7 @@ class FitResult(eqx.Module):
     best_epoch: int  # counted from 1; 0 if it is the initial field
     field: Learner  # after the last epoch
     epochs: int
-    status: str  # "ok" (stopped early), "capped" (by max_epochs), "diverged", or "running" if it was interrupted
+    status: Status  # OK if it stopped early, RUNNING if it was interrupted
     history: History
     state: FitState  # the final state of the run
 
@@ -183,7 +184,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
     train = _train_by_kernels if compiler_options(state.field, data, settings) else _train
     with _reporting(progress, int(plan.max_epochs)) as report:
         try:
-            while int(state.status) == RUNNING:
+            while int(state.status) == Status.RUNNING:
                 began, first = time.perf_counter(), int(state.epoch)
                 until = jnp.asarray(first + most, jnp.int32)  # an array, so that one program serves all blocks
                 after, rows = train(state, plan, data, validated_on, settings, until, losses=empty, **chosen)
@@ -192,7 +193,7 @@ def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progre
                 most = int(np.clip(most * BLOCK_SECONDS / (time.perf_counter() - began), 1, min(BLOCK, 4 * most)))
         except KeyboardInterrupt as error:
             interrupt = error
-    history, status = History(*np.concatenate(losses).T), fitting.STATUS_NAMES[int(state.status)]
+    history, status = History(*np.concatenate(losses).T), Status(int(state.status))
     best_epoch, epochs = int(state.best_epoch), int(state.epoch)
     result = FitResult(state.best, state.best_mse, best_epoch, state.field, epochs, status, history, state)
     if interrupt is not None:

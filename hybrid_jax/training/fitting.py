@@ -11,13 +11,12 @@ from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
+from hybrid_jax.status import Status
 from hybrid_jax.training.objective import Learner, Settings
 
-RUNNING, STOPPED, CAPPED, DIVERGED = range(4)
 Optimiser = optax.GradientTransformation
 ADAM = optax.scale_by_adam()
 SHORTCUT = 8  # a run that uses at most 1 / SHORTCUT of its listed windows sorts only that part
-STATUS_NAMES = {RUNNING: "running", STOPPED: "ok", CAPPED: "capped", DIVERGED: "diverged"}
 
 
 class RunConfig(eqx.Module):
@@ -52,7 +51,7 @@ def start(field: Learner, key: PRNGKeyArray, optimiser: Optimiser = ADAM) -> Fit
     zero, infinity = jnp.zeros((), jnp.int32), jnp.array(jnp.inf)
     adam = optimiser.init(eqx.filter(field, trainable(field)))
     key = jax.random.key_data(key)  # an ordinary array: it can be stacked, moved to the host and saved
-    return FitState(field, adam, field, infinity, zero, zero, zero + RUNNING, infinity, key)
+    return FitState(field, adam, field, infinity, zero, zero, zero + Status.RUNNING, infinity, key)
 
 
 def run(
@@ -72,7 +71,7 @@ def run(
 
     def is_running(carry) -> Bool[Array, ""]:
         state = eqx.combine(carry[0], rest)
-        return (state.status == RUNNING) & (state.epoch < until)
+        return (state.status == Status.RUNNING) & (state.epoch < until)
 
     def one_epoch(carry):
         state, losses = eqx.combine(carry[0], rest), carry[1]
@@ -164,8 +163,8 @@ def _updated(state, plan, field, adam, key, train_loss, error) -> FitState:
     best = jax.tree.map(lambda new, old: jnp.where(better, new, old) if eqx.is_array(new) else new, field, state.best)
     best_epoch = jnp.where(better, finished, state.best_epoch)
     patient = (finished < plan.min_epochs) | (finished - best_epoch < plan.patience)
-    status = jnp.where(patient, jnp.where(finished >= plan.max_epochs, CAPPED, RUNNING), STOPPED)
+    status = jnp.where(patient, jnp.where(finished >= plan.max_epochs, Status.CAPPED, Status.RUNNING), Status.OK)
     # Python integers become 64 bit in double precision, but the loop carries 32 bit.
-    status = jnp.where(finite, status, DIVERGED).astype(jnp.int32)
+    status = jnp.where(finite, status, Status.DIVERGED).astype(jnp.int32)
     best_mse = jnp.where(better, error, state.best_mse)
     return FitState(field, adam, best, best_mse, best_epoch, finished, status, train_loss, key)

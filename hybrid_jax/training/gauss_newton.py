@@ -20,6 +20,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
+from hybrid_jax.status import Status, ended
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.sensitivities import with_sensitivities
 from hybrid_jax.trajectories import Trajectories, check
@@ -34,23 +35,30 @@ Rows = Callable[[Hybrid, Float[Array, "t d"], Trajectories, Solver], Float[Array
 
 
 class GaussNewtonFit(eqx.Module):
-    """The result of `fit_gauss_newton`."""
+    """The result of `fit_gauss_newton`.
+
+    Attributes:
+        field: the best one that was found.
+        loss: L_MSE on the windows plus λ times the penalty.
+        steps: evaluations of J.
+        status: how it ended; OK if it stopped before `max_steps`, at a finite loss.
+    """
 
     field: AbstractVectorField
-    loss: float  # L_MSE on the windows plus λ times the penalty
-    steps: int  # evaluations of J
-    converged: bool  # whether it stopped before `max_steps`, at a finite loss
+    loss: float
+    steps: int
+    status: Status
 
 
-def least_action(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """f_d along the predicted trajectory: its mean square is `residual_norm` of loss.py (Yin et al. 2021)."""
+def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
+    """f_d along the predicted trajectory: its mean square is that of loss.py (Yin et al. 2021)."""
     x, u = jnp.concatenate([window.x0[None], predicted[:-1]]), window.u
     parts = jax.vmap(field.residual)(x, jnp.asarray(u))
     return parts.ravel() / len(u) ** 0.5
 
 
-def correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2: its square is `trajectory_correlation` of loss.py (Osaka et al. 2025, Eq. 7)."""
+def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
+    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2: its square is that of loss.py (Osaka et al. 2025, Eq. 7)."""
     physics = integrate(field.physics, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, solver)
     a, b = (y.ravel() / jnp.sqrt(jnp.sum(jnp.square(y)) + 1e-12) for y in (physics, predicted))
     return (a - b) / 2**0.5
@@ -71,9 +79,7 @@ def _is_grid(node) -> bool:
 
 
 PENALTIES: dict[str, Rows] = {
-    "residual_norm": least_action,
-    "trajectory_correlation": correlation,
-    "neighbour_weights": neighbour_weights,
+    rule.__name__: rule for rule in (residual_norm, trajectory_correlation, neighbour_weights)
 }
 
 
@@ -107,7 +113,9 @@ def fit_gauss_newton(
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)
-    if penalty is not None and ([penalty] != [n for n in PENALTIES if n == penalty] or not isinstance(field, Hybrid)):
+    if penalty is not None and (
+        not isinstance(penalty, str) or penalty not in PENALTIES or not isinstance(field, Hybrid)
+    ):
         known = ", ".join(PENALTIES)
         raise ValueError(f"penalty must be one of {known}, of a Hybrid, got {penalty!r} of {type(field).__name__}")
     size = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(field, trainable(field))))
@@ -192,7 +200,8 @@ def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussN
         slow = 0 if better and found[best] < (1 - SLOW) * loss else slow + 1
         damping = dampings[best] if better else min(damping * TRIALS[-1] * 10, LARGEST)
         theta, loss = (tried[best], float(found[best])) if better else (theta, loss)
-    return GaussNewtonFit(problem.field(theta), loss, steps, bool(np.isfinite(loss)) and (slow >= 2 or loss == 0))
+    status = Status(int(ended(np.array(slow >= 2 or loss == 0), np.isfinite(loss))))
+    return GaussNewtonFit(problem.field(theta), loss, steps, status)
 
 
 def _normal_equations(

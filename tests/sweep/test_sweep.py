@@ -15,10 +15,11 @@ from pendulum import DAMPING, pendulum, swings
 from smoke import script
 
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import LaneMap, lane, stack
 from hybrid_jax.sweep.training import evaluate, evaluate_windows, sweep
 from hybrid_jax.training import fitting
-from hybrid_jax.training.fitting import CAPPED, DIVERGED, RUNNING, STOPPED, make_run_config, start
+from hybrid_jax.training.fitting import make_run_config, start
 from hybrid_jax.training.objective import Settings
 
 BATCH = 10
@@ -89,8 +90,8 @@ def test_lanes_that_share_a_chunk_are_the_same_runs(width, final):
 
 
 def test_every_lane_comes_to_its_own_end(final):
-    assert set(final.status) <= {STOPPED, CAPPED}
-    assert (final.epoch[2], final.status[2]) == (6, CAPPED)
+    assert set(final.status) <= {Status.OK, Status.CAPPED}
+    assert (final.epoch[2], final.status[2]) == (6, Status.CAPPED)
     assert (final.epoch <= 12).all()
 
 
@@ -150,7 +151,7 @@ def test_a_diverged_lane_changes_no_bit_of_another(width, final):
     tame = final if width == 1 else swept(starts(), PLANS, width=width)
     for i in (0, 2):
         assert same(lane(wild, i), lane(tame, i))
-    assert wild.status[1] == DIVERGED
+    assert wild.status[1] == Status.DIVERGED
     assert np.isfinite(wild.best.log_length).all()
 
 
@@ -181,7 +182,7 @@ def test_progress_says_what_is_left():
     swept(starts(), [plan(cap=12, minimum=12)] * 3, width=1, block_seconds=1e-9,
           on_block=lambda states, progress: reports.append((states, progress)))  # fmt: skip
     for states, progress in reports:
-        running = states.status == RUNNING
+        running = states.status == Status.RUNNING
         assert (progress.active, progress.lanes, progress.epochs) == (running.sum(), 3, states.epoch.max())
         assert progress.best == states.best_mse.min()
         assert progress.at_most == (12 - states.epoch[running]).max(initial=0)

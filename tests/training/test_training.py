@@ -16,10 +16,11 @@ from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import InputScaling, zero_output
 from hybrid_jax.state import VELOCITY
+from hybrid_jax.status import Status
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep
 from hybrid_jax.training.driver import FitInterrupted
-from hybrid_jax.training.fitting import DIVERGED, make_run_config, run, start
+from hybrid_jax.training.fitting import make_run_config, run, start
 from hybrid_jax.training.loss import residual_norm, trajectory_correlation
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -145,11 +146,11 @@ def test_the_best_epoch_is_the_best_that_validation_saw():
 
 def test_it_stops_when_patience_is_spent_and_not_before_the_minimum(damped):
     for state, minimum, patience in ((damped, 10, 10), (trained(pendulum(LENGTH, DAMPING), 0.0, patience=5), 10, 5)):
-        assert state.status == "ok"
+        assert state.status == Status.OK
         assert state.epochs == max(minimum, state.best_epoch + patience)
     # With a rate of zero the first epoch is the best for ever; no later one is better.
     assert state.best_epoch == 1
-    for rules, ended in (({"min_epochs": 0, "patience": 7}, ("ok", 8)), ({"max_epochs": 7}, ("capped", 7))):
+    for rules, ended in (({"min_epochs": 0, "patience": 7}, (Status.OK, 8)), ({"max_epochs": 7}, (Status.CAPPED, 7))):
         state = trained(pendulum(LENGTH, DAMPING), 0.0, **rules)
         assert (state.status, state.epochs) == ended
 
@@ -189,7 +190,7 @@ def test_a_field_with_leaves_that_are_no_arrays_trains():
 
 def test_a_huge_rate_ends_the_run_as_diverged_with_a_finite_field(hybrid):
     state = trained(hybrid[0], Hybrid(0.0, 1e30), max_epochs=30)
-    assert state.status == "diverged"
+    assert state.status == Status.DIVERGED
     assert state.epochs < 30
     assert jnp.isfinite(state.best_mse) == (state.best_epoch > 0)
     assert all(jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(eqx.filter(state.best, eqx.is_array)))
@@ -203,7 +204,7 @@ def test_double_precision_trains_alone_and_in_a_sweep():
         alone = trained(field, train=train, validation=validation, max_epochs=3)
         plans = stack([make_run_config(rate, jnp.arange(60), 60, 10, 10, 3, 1e-3) for rate in (0.01, 0.03)])
         lanes = sweep(stack([start(field, KEY)] * 2), plans, train, validation, SETTINGS, width=1)
-    assert (alone.state.status.dtype, alone.status) == (np.int32, "capped")
+    assert (alone.state.status.dtype, alone.status) == (np.int32, Status.CAPPED)
     assert alone.best.log_length.dtype == alone.best_mse.dtype == np.float64
     # Another program for the same sums, in the round-off of double precision.
     np.testing.assert_allclose(lanes.field.log_length[1], alone.field.log_length, rtol=0, atol=1e-12)
@@ -237,7 +238,7 @@ def test_windows_that_turn_bad_after_a_good_epoch_leave_that_epoch():
     good, _ = _run(start(pendulum(0.8, DAMPING), KEY), plan, TRAIN, VALIDATION, SETTINGS, jnp.asarray(3))
     spoiled = eqx.tree_at(lambda w: w.x, TRAIN, TRAIN.x * jnp.nan)
     bad, _ = _run(good, plan, spoiled, VALIDATION, SETTINGS, jnp.asarray(20))
-    assert (int(bad.status), int(bad.epoch)) == (DIVERGED, 4)
+    assert (int(bad.status), int(bad.epoch)) == (Status.DIVERGED, 4)
     assert eqx.tree_equal(bad.best, good.best)
     assert bad.best_mse == good.best_mse
 
@@ -270,7 +271,7 @@ def test_ctrl_c_between_blocks_keeps_the_run_so_far():
     with pytest.raises(FitInterrupted) as stopped:
         trained(pendulum(0.8, DAMPING), progress=stop)
     result = stopped.value.result
-    assert (result.status, len(result.history.validation)) == ("running", result.epochs)
+    assert (result.status, len(result.history.validation)) == (Status.RUNNING, result.epochs)
     assert result.best_mse == np.float32(result.history.validation.min())
 
 

@@ -1,0 +1,40 @@
+"""How a fit ended: one enumeration for all that iterate."""
+
+from enum import IntEnum
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Int
+
+
+class Status(IntEnum):
+    """How a fit ended. Compiled programs carry it as an integer, `Status(int(number))` reads it; its text is its name.
+
+    Attributes:
+        message: the same in words.
+    """
+
+    RUNNING = 0, "interrupted"
+    OK = 1, "converged"
+    CAPPED = 2, "stopped at the limit of steps"
+    DIVERGED = 3, "diverged"
+
+    message: str
+
+    def __new__(cls, value: int, message: str):
+        status = int.__new__(cls, value)
+        status._value_, status.message = value, message
+        return status
+
+    def __str__(self) -> str:
+        return self.name.lower()
+
+    def __format__(self, form: str) -> str:
+        return format(str(self), form)
+
+
+def ended(
+    converged: Bool[Array | np.ndarray, "*runs"], finite: Bool[Array | np.ndarray, "*runs"]
+) -> Int[Array, "*runs"]:
+    """The status of fits that have ended; those that have not converged were stopped by their limit of steps."""
+    return jnp.where(finite, jnp.where(converged, Status.OK, Status.CAPPED), Status.DIVERGED).astype(jnp.int32)
