@@ -26,8 +26,6 @@ from hybrid_jax.sweep import hosts
 
 Options = TypeVar("Options")
 BAD_INPUT, FAILED_CHECKS = 2, 3  # exit codes; that of a signal is 128 + its number
-# How options begin, old → new. Old names are accepted for one version; --help does not list them.
-RENAMED = {"--guess-off": "--perturbed-by", "--safe-": "--invariant-", "--no-safe-": "--no-invariant-"}
 
 
 def run(
@@ -100,7 +98,6 @@ def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
     """The configuration given by a command line: a preset, changed by the other options."""
-    arguments = [_renamed(argument) for argument in arguments]
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--preset", nargs="?", default=Run.preset, const="")
     chosen = parser.parse_known_args(arguments)[0].preset
@@ -140,18 +137,6 @@ def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         print(f"{name}: {interrupted}", file=sys.stderr)
         sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
-
-
-def _renamed(argument: str) -> str:
-    """An argument under its new name, with a line on stderr if it was given under an old one."""
-    option, equals, value = argument.partition("=")
-    name = option.replace("_", "-")
-    for old, new in RENAMED.items():
-        if name.startswith(old):
-            now = new + name.removeprefix(old)
-            print(f"{option} is now {now}; the old name will be removed in the next version", file=sys.stderr)
-            return f"{now}{equals}{value}"
-    return argument
 
 
 def _message(box: str) -> str:

@@ -5,11 +5,7 @@ from dataclasses import replace
 
 import pytest
 
-from experiments.ablation import PRESETS as ABLATION
-from experiments.closed_loop.config import PRESETS as CLOSED_LOOP
-from experiments.comparison import PRESETS as COMPARISON
-from experiments.paper.config import PRESETS, SMOKE
-from experiments.runner.command import read
+from experiments.paper.config import SMOKE
 from experiments.runner.run_record import FILE, ChecksFailed, OtherRun, recorded
 
 
@@ -93,20 +89,6 @@ def test_fresh_moves_all_aside_but_the_lock(tmp_path):
     first = min(tmp_path.glob("out.before-*"), key=lambda path: (len(path.name), path.name))
     assert record(first) == before
     assert (first / "models" / "one.npz").read_bytes() == b"mine"
-
-
-@pytest.mark.parametrize("presets", [PRESETS, COMPARISON, ABLATION, CLOSED_LOOP])
-def test_old_option_names_are_accepted_but_not_listed(presets, capsys):
-    assert read("name", "about", ["--preset", "smoke", "--guess_off=0.2"], presets).perturbed_by == 0.2
-    assert capsys.readouterr().err.startswith("--guess_off is now --perturbed-by; ")
-    with pytest.raises(SystemExit):
-        read("name", "about", ["--help"], presets)
-    assert "guess-off" not in capsys.readouterr().out
-
-
-def test_old_option_names_of_the_closed_loop_are_accepted():
-    found = read("name", "about", ["--preset", "smoke", "--safe-hidden", "9", "--no-safe-linear"], CLOSED_LOOP)
-    assert (found.invariant_hidden, found.invariant_linear) == (9, False)
 
 
 @pytest.mark.parametrize("error", [ValueError, ChecksFailed])
