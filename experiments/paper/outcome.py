@@ -14,7 +14,7 @@ from experiments.paper.figures import scores, theta
 from experiments.paper.flight_figures import example_flight, predictions
 from experiments.paper.lanes import BAND_EDGES, BANDS, BASELINES, by_domain, lowest_altitude, save_models
 from experiments.paper.study import Study, study
-from experiments.paper.tables import altitudes, by_size, conclusion, parameters, ranking, run_notes
+from experiments.paper.tables import altitudes, by_size, conclusion, meaning, parameters, ranking, run_notes
 from experiments.reporting import names
 from experiments.reporting.claims import verdict_table
 from experiments.reporting.names import FINE_TUNED, NO_PHYSICS, PHYSICS_ONLY, label
@@ -60,8 +60,8 @@ ABOUT = {
     "as in Neural-Fly",
     names.LEAST_SQUARES: "the source's hybrid, of which only θ_p is refitted, by nonlinear least squares "
     "(Levenberg–Marquardt)",
-    names.CONSTANT_DISTURBANCE: "the source's hybrid, of which θ_p and a constant disturbance (six accelerations) are "
-    "fitted by nonlinear least squares",
+    names.CONSTANT_DISTURBANCE: "the source's hybrid, of which `hj.adapt` fits θ_p and a constant disturbance "
+    "(six accelerations) by nonlinear least squares",
     names.LINEAR_RESIDUAL: "the source's hybrid, unchanged, plus a linear map fitted to its errors",
     names.FINE_TUNED: "trained on many flights from before the change, then on N trajectories from after it",
     names.TARGET_ONLY: "trained on the N trajectories from after the change only",
@@ -115,7 +115,7 @@ def paper_report(
         notes=[*run_notes(rows), *notes, *rate, *([sine] if floor else [])],
         extra={"truth_theta": truth, **(extra or {}), **({FLOOR: floor} if floor else {})},
         head=introduction(experiment, rows),
-        conclusion=conclusion(rows),
+        conclusion=[*conclusion(rows), *meaning(verdicts)],
         tables=[*headline(rows), verdict_table(verdicts, "Claims of the paper"), *altitude, *parameters(rows, truth)],
     )
 

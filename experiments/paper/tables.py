@@ -1,13 +1,14 @@
 """The tables of the paper's experiments: errors and ρ by N, the ranking with Table 2, θ_p, ablations; notes."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from experiments.paper.claims import FEW
 from experiments.paper.lanes import BANDS, MODELS, THETA, adapted_sizes, by_domain, cells, gain, method_label, ranked
 from experiments.reporting import names
-from experiments.reporting.names import FINE_TUNED, HYBRID, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
+from experiments.reporting.claims import Verdict
+from experiments.reporting.names import FINE_TUNED, HYBRID, NO_PHYSICS, PHYSICS_ONLY, SOURCE_ONLY, TARGET_ONLY, label
 from experiments.reporting.results import Results, Row
 from experiments.reporting.statistics import spread
 from experiments.reporting.tables import (
@@ -31,8 +32,8 @@ PAPER: Mapping[str, Mapping[tuple[str, str, int], tuple[float, float | None]]] =
 
 
 def error_text(rows: Results) -> str:
-    """0.0123 ± 0.0004, or ∞ with the count of seeds that make it so and the median of all."""
-    return spread_text(rows.spread("test_mse"))
+    """0.0123 ± 0.0004, or ∞ with the count of seeds that make it so and the median of all; a star marks capped runs."""
+    return spread_text(rows.spread("test_mse")) + " *" * ("capped" in rows.unique("status"))
 
 
 def rho_text(rows: Results) -> str:
@@ -56,8 +57,9 @@ def by_size(rows: Results) -> list[Table]:
             for mode, seen in modes.items()
             if len((trained or group).where(model=model, mode=seen))
         }
+        capped = "; *: the cap on epochs ended a run" * ("capped" in group.unique("status"))
         for own, title, text in (
-            (group, f"Test error L^T_MSE{place} ({of}; less is better)", error_text),
+            (group, f"Test error L^T_MSE{place} ({of}; less is better{capped})", error_text),
             (trained, f"Improvement ρ over source-only{place} ({of}; 1 is perfect)", rho_text),
         ):
             sizes = own.sort(n_train=None).group("n_train")
@@ -82,7 +84,25 @@ def conclusion(rows: Results) -> list[str]:
         )
         source = found.get((HYBRID, SOURCE_ONLY, 0))
         sentences.append(sentence + (f"; without adaptation it is {spread_text(source)}." if source else "."))
+        gone = {model: cells(group).get((model, FINE_TUNED, n)) for model in (HYBRID, NO_PHYSICS)}
+        words = [f"{label(model)} {100 * own.spread(gain).mean:.0f} %" for model, own in gone.items() if own]
+        sentences += [f"Of the source's error, fine-tuning removes: {', '.join(words)}."] * (len(words) == 2)
     return sentences
+
+
+def meaning(verdicts: Sequence[Verdict]) -> list[str]:
+    """What the verdicts on C1, C2 and C6 say to a reader, in one sentence."""
+    holds = {each.holds for each in verdicts if each.id in ("C1", "C2", "C6")}
+    if not holds:
+        return []
+    if holds == {True}:
+        return [
+            "A model with physics in it, adapted to a little flight, predicts better than before the change and better "
+            "than a network without physics: what the paper claims holds (C1, C2, C6)."
+        ]
+    if False in holds:
+        return ["What the paper claims of the fine-tuned hybrid (C1, C2, C6) does not hold in these runs."]
+    return ["These runs do not decide what the paper claims of the fine-tuned hybrid (C1, C2, C6)."]
 
 
 def altitudes(rows: Results) -> list[Table]:

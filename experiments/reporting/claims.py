@@ -64,6 +64,11 @@ def verdict_table(verdicts: Sequence[Verdict], title: str) -> Table:
     return Table(title, ("", "claim", "verdict", "measured"), lines, verdicts=True)
 
 
+def decided(table: Table) -> Table:
+    """A `verdict_table` without the hypotheses that are undecided."""
+    return table._replace(lines=[line for line in table.lines if OUTCOMES[None] not in line])
+
+
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
     """One sentence: how many hypotheses hold, and which fail or are undecided."""
     if not verdicts:

@@ -39,3 +39,8 @@ class Report:
     def shown(self) -> list[Table]:
         """The tables of the page; numbers that mean nothing have no verdicts."""
         return [table for table in self.tables if not (self.meaningless and table.verdicts)]
+
+    def printed(self) -> list[Table]:
+        """The tables of the terminal: of the hypotheses those alone that a quick run decides."""
+        quick = self.config.get("preset") == "quick"
+        return [claims.decided(table) if quick and table.verdicts else table for table in self.shown()]

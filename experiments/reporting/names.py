@@ -17,7 +17,7 @@ LABELS = {
     THETA_D_ONLY: "θ_d only",
     LAST_LAYER: "last layer (ridge)",
     LEAST_SQUARES: "least squares on θ_p",
-    CONSTANT_DISTURBANCE: "least squares on θ_p + disturbance",
+    CONSTANT_DISTURBANCE: "hj.adapt (θ_p + disturbance)",
     LINEAR_RESIDUAL: "source + linear residual",
     THRUST: "thrust, rates frozen",
     HOLD: "hold the state",

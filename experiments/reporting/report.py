@@ -30,7 +30,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)
     if console is not None:
-        print_tables(console, report.shown())
+        print_tables(console, report.printed())
         for line in (*report.notes, *report.warnings, *report.conclusions()):
             console.print(Text(line))
         console.print(Text(f"Report: {out / HTML_NAME}"), soft_wrap=True)
