@@ -89,26 +89,47 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Adaptation:
-    """An adapted field and what is known about it."""
+    """An adapted field and what is known about it.
+
+    Attributes:
+        field: the adapted field.
+        method: its name, or its class if it was passed as a value.
+        parameters: of physics and disturbance, by the names of `uncertainty.named_parameters`.
+        disturbance: the constant part of ẋ in the units of ẋ; None if there is none.
+        mse_before: L_MSE of the source field on all windows, in squared units of the states.
+        mse_after: the same of the adapted field.
+        windows: the number of windows.
+        steps: epochs, or evaluations of the Jacobian; 0 for a closed form.
+        status: how the method ended.
+        level: confidence level of the intervals, between 0 and 1.
+        without_intervals: why there are no intervals; None if there are.
+        covariance: of the parameters as the physics holds them; None without intervals.
+        degrees: degrees of freedom of the covariance, one less than the clusters of windows that touch, or None.
+        candidates: of "auto": the error on left-out windows, without unit, by name.
+        chosen: of "auto": the name of the candidate that was taken.
+        expected: of "auto": errors on a flight that was not seen, by horizon and quantity: value, low, high.
+        rigid: whether the states are those of a rigid body.
+        outside: by quantity the share of samples, 0 to 1, unlike those that the source learned from.
+    """
 
     field: AbstractVectorField
-    method: str  # its name, or its class if it was passed as a value
-    parameters: dict[str, Parameter]  # of physics and disturbance; see `uncertainty.named_parameters`
-    disturbance: Float[np.ndarray, " d"] | None  # the constant part of ẋ, if there is one
-    mse_before: float  # L_MSE of the source field on all windows
-    mse_after: float  # and of the adapted one
-    windows: int  # their number
-    steps: int  # epochs, or evaluations of the Jacobian; 0 for a closed form
+    method: str
+    parameters: dict[str, Parameter]
+    disturbance: Float[np.ndarray, " d"] | None
+    mse_before: float
+    mse_after: float
+    windows: int
+    steps: int
     status: Status
-    level: float  # confidence level of the intervals
-    without_intervals: str | None  # why there are none, if so
-    covariance: Float[np.ndarray, "p p"] | None = None  # of the parameters as the physics holds them
-    degrees: int | None = None  # of freedom of the covariance, one less than the clusters of windows that touch
-    candidates: dict[str, float] = attribute(default_factory=dict)  # of "auto": error on left-out windows, by name
-    chosen: str | None = None  # of these
-    expected: Expected = attribute(default_factory=dict)  # of "auto": errors on a flight that was not seen
-    rigid: bool = False  # whether the states are those of a rigid body
-    outside: dict[str, float] = attribute(default_factory=dict)  # share of samples unlike those learned from
+    level: float
+    without_intervals: str | None
+    covariance: Float[np.ndarray, "p p"] | None = None
+    degrees: int | None = None
+    candidates: dict[str, float] = attribute(default_factory=dict)
+    chosen: str | None = None
+    expected: Expected = attribute(default_factory=dict)
+    rigid: bool = False
+    outside: dict[str, float] = attribute(default_factory=dict)
 
     @property
     def converged(self) -> bool:

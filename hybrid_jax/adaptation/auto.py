@@ -66,11 +66,16 @@ class Auto:
     Of a rigid body: the source as it is; θ_p; with them steady forces and torques, drag and the rotors' efficiencies.
     Of another system: the source, θ_p, θ_p and a constant disturbance. Then, starting from the one that was taken, the
     output layer of the network, and the whole network, both held at the source's weights.
+
+    Attributes:
+        networks: whether the network may change.
+        blocks: how many blocks of windows are left out in turn.
+        max_steps: the most steps of each fit.
     """
 
-    networks: bool = True  # whether the network may change
+    networks: bool = True
     blocks: int = BLOCKS
-    max_steps: int = 100  # of each fit
+    max_steps: int = 100
     uses_validation: ClassVar[bool] = False
     has_intervals: ClassVar[bool] = True
 

@@ -59,11 +59,17 @@ class Method(Protocol):
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """Least squares on θ_p and a constant disturbance; the residual stays as it is."""
+    """Least squares on θ_p and a constant disturbance; the residual stays as it is.
 
-    disturbance: Literal["auto"] | bool = "auto"  # "auto": if the windows need one, see `select_disturbance`
-    indices: tuple[int, ...] | None = None  # the disturbed states, see `with_disturbance`
-    max_steps: int = 100  # of each fit
+    Attributes:
+        disturbance: whether one is fitted; "auto" if the windows need one, see `select_disturbance`.
+        indices: the disturbed states, see `with_disturbance`.
+        max_steps: the most steps of each fit.
+    """
+
+    disturbance: Literal["auto"] | bool = "auto"
+    indices: tuple[int, ...] | None = None
+    max_steps: int = 100
     uses_validation: ClassVar[bool] = False
     has_intervals: ClassVar[bool] = True
 
@@ -89,16 +95,27 @@ class LeastSquares:
 
 @dataclass(frozen=True)
 class FineTune:
-    """Adam from the source's parameters, with early stopping on the validation windows."""
+    """Adam from the source's parameters, with early stopping on the validation windows.
 
-    rates: PyTree = None  # a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual
-    frozen: Literal["physics", "residual"] | None = None  # the part that stays as it is
+    Attributes:
+        rates: a tree prefix of the field; by default 1e-2 for physics and 1e-3 for the residual.
+        frozen: the part that stays as it is, or None.
+        min_epochs: no early stop before.
+        patience: stop after so many epochs without a better validation loss.
+        max_epochs: stop after so many epochs.
+        regulariser_weight: λ of `settings.regulariser`, if there is one.
+        l2_sp: weight of half the squared distance from the source's parameters, see `held_at_start`.
+        seed: of the order of minibatches.
+    """
+
+    rates: PyTree = None
+    frozen: Literal["physics", "residual"] | None = None
     min_epochs: int = 100
     patience: int = 20
     max_epochs: int = 2000
-    regulariser_weight: float = 1e-3  # λ of `settings.regulariser`, if there is one
-    l2_sp: float = 0.0  # weight of half the squared distance from the source's parameters, see `held_at_start`
-    seed: int = 0  # of the order of minibatches
+    regulariser_weight: float = 1e-3
+    l2_sp: float = 0.0
+    seed: int = 0
 
     def __post_init__(self):
         if self.frozen not in (None, "physics", "residual"):
@@ -140,9 +157,14 @@ def held_at_start(weight: float) -> optax.GradientTransformation:
 
 @dataclass(frozen=True)
 class Ridge:
-    """A linear correction by ridge regression, with the penalty that predicts the validation windows best."""
+    """A linear correction by ridge regression, with the penalty that predicts the validation windows best.
 
-    update: ridge.Update  # `ridge.last_layer`, `ridge.linear_residual` or a function like them
+    Attributes:
+        update: `ridge.last_layer`, `ridge.linear_residual` or a function like them.
+        penalties: the penalties that are tried.
+    """
+
+    update: ridge.Update
     penalties: tuple[float, ...] = ridge.PENALTIES
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
