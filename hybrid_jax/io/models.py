@@ -21,7 +21,6 @@ from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archi
 from hybrid_jax.io.structure import Structure, decode, static_values
 
 FORMAT = "hybrid_jax model 2"
-FORMAT_1 = "hybrid_jax model 1"  # still read: see `_RENAMED` in structure.py
 
 
 @dataclass(frozen=True)
@@ -87,7 +86,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
         ValueError: the file is missing, damaged or not a model; it refers to a class or function that is not known; or
             it does not fit `like`.
     """
-    metadata, arrays = load_archive(path, FORMAT, FORMAT_1)
+    metadata, arrays = load_archive(path, FORMAT)
     try:
         about, tree = dict(metadata["about"]), metadata["field"]
         field = decode(tree, arrays) if like is None else _filled(like, tree, arrays)

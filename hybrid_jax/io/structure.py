@@ -20,15 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from hybrid_jax import dynamics, networks
+from hybrid_jax import dynamics, networks  # noqa: F401  a file may name their classes
 from hybrid_jax.checks import short_repr
-from hybrid_jax.dynamics.base import RunningStats
-from hybrid_jax.dynamics.baselines import Kinematics
 from hybrid_jax.io.archive import Arrays, array_type, from_numpy
-from hybrid_jax.networks import views
-from hybrid_jax.networks.mlp import FusedNetwork
-from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.networks import views  # noqa: F401
 
 _ACTIVATIONS = """celu elu gelu glu hard_sigmoid hard_silu hard_swish hard_tanh identity leaky_relu log1mexp log_sigmoid
     log_softmax mish relu relu6 selu sigmoid silu soft_sign softmax softplus sparse_plus sparse_sigmoid squareplus
@@ -49,27 +44,8 @@ _ALLOWED: dict[str, Any] = {
 _ALLOWED["equinox.identity"] = inspect.signature(eqx.nn.MLP).parameters["final_activation"].default
 _PORTABLE: dict[str, Any] = {}  # "@name" → class or function
 
-# Format 1 names a class by its bare name; format 2 by "module:qualname". A class that moves or is renamed gets an entry
-# here: the class today, or a function from the saved fields (name → value) to the object.
-_FORMAT_1 = (Kinematics, Vehicle, views.Accelerations, views.BodyFrame, views.BodyMotion, views.Motion)
-_RENAMED: dict[str, type | Callable[[dict[str, Any]], Any]] = {
-    **{name: item for name, item in (vars(dynamics) | vars(networks)).items() if isinstance(item, type)},
-    **{item.__name__: item for item in _FORMAT_1},
-    "hybrid_jax.dynamics.kinematics:Kinematics": Kinematics,
-    "hybrid_jax.networks.fused:FusedNetwork": FusedNetwork,
-    "hybrid_jax.networks.rotor_thrust:RotorThrust": views.RotorThrust,
-    "hybrid_jax.networks.scaling:ChannelScaling": ChannelScaling,
-    "hybrid_jax.networks.scaling:InputScaling": InputScaling,
-    "ConstantDisturbance": lambda fields: dynamics.ConstantDisturbance(fields["acceleration"]),
-    "DeployedNetwork": FusedNetwork,
-    "LinearPath": networks.LinearSkip,
-    "NearGround": views.GroundDistance,
-    "Placeless": views.DropXY,
-    "Statistics": RunningStats,
-    "TiltOnly": views.DropXYYaw,
-}
 # Keys of JSON objects: names of things, and content.
-_NAMES = {"class", "kind", "named", "unknown", "array", "static", "key", "dtype"}
+_NAMES = {"class", "named", "unknown", "array", "static", "key", "dtype"}
 _CONTENT = {"fields", "items", "tuple", "list", "float", "complex"}
 Item = TypeVar("Item", bound=Callable)
 
@@ -171,15 +147,14 @@ def decode(value: Any, arrays: Arrays) -> Any:
     match value:
         case None | bool() | int() | float() | str():
             return value
-        case {"class": str() as name, "fields": dict() as parts} | {"kind": str() as name, "fields": dict() as parts}:
+        case {"class": str() as name, "fields": dict() as parts}:
             return _rebuild(name, {key: decode(part, arrays) for key, part in parts.items()})
         case {"array": str() as path, **kind}:
             return jnp.asarray(from_numpy(arrays[path], kind))
         case {"static": str() as path, **kind}:
             return from_numpy(arrays[path], kind)[()]
-        case {"items": dict() | list() as items}:  # a dictionary in format 1
-            pairs = items.items() if isinstance(items, dict) else items
-            return {key: decode(item, arrays) for key, item in pairs}
+        case {"items": list() as items}:
+            return {key: decode(item, arrays) for key, item in items}
         case {"tuple": list() as items}:
             return tuple(decode(item, arrays) for item in items)
         case {"list": list() as items}:
@@ -228,10 +203,7 @@ def find_class(name: str) -> type:
 
 def _rebuild(name: str, parts: dict[str, Any]) -> Any:
     """An object with these fields, made without its `__init__`; but the checks of this library's own classes run."""
-    in_format_1 = ":" not in name and not name.startswith("@")
-    cls: Any = _RENAMED.get(name) or find_class(f"@{name}" if in_format_1 else name)
-    if not isinstance(cls, type):
-        return cls(parts)
+    cls: Any = find_class(name)
     made, known = object.__new__(cls), dataclasses.fields(cls)
     values = {f.name: f.default for f in known if f.default is not dataclasses.MISSING} | parts
     if values.keys() != {f.name for f in known}:

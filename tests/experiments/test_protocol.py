@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from functools import partial
+from unittest import mock
 
 import equinox as eqx
 import jax
@@ -134,12 +135,16 @@ def test_programs_compiled_ahead_are_those_that_solve(model, monkeypatch):
         leaves, structure = jax.tree.flatten(arguments)
         return structure, [(leaf.shape, leaf.dtype) if eqx.is_array(leaf) else leaf for leaf in leaves]
 
-    def found(*arguments):
-        ran.append(kind(*arguments))
-        return np.zeros(config.seeds)
+    class Found:
+        def __call__(self, *arguments):
+            ran.append(kind(*arguments))
+            return np.zeros(config.seeds)
 
-    monkeypatch.setattr(study, "_solved", found)
-    monkeypatch.setattr(study, "prepare", lambda kept, *arguments: asked.append(kind(*arguments)))
+        def lower(self, *arguments):
+            asked.append(kind(*arguments))
+            return mock.Mock()
+
+    monkeypatch.setattr(study, "_solved", Found())
     study._compile_solved(model, IRIS, config)
     start = study.source_of(model)
     learned = fit_of(pretraining(start, fresh_fields(start, IRIS, config), config)[0])

@@ -1,6 +1,5 @@
 """Laws of views: what a network cannot see changes nothing, what it may not write stays zero."""
 
-import json
 from dataclasses import replace
 
 import equinox as eqx
@@ -12,14 +11,9 @@ from choices import PAIRS, mostly_slow, slow
 
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.dynamics import base
-from hybrid_jax.dynamics.baselines import Kinematics
-from hybrid_jax.io.archive import load_archive, save_archive
-from hybrid_jax.io.models import FORMAT
-from hybrid_jax.io.structure import _RENAMED
 from hybrid_jax.networks import factory, views
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
-from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.networks.views import BodyFrame, BodyMotion
 from hybrid_jax.sim.forces import parameters_of, rotor_altitudes
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
@@ -240,18 +234,3 @@ def test_a_view_beside_physics_survives_a_file(inputs, outputs, tmp_path):
     np.testing.assert_array_equal(deployed(loaded, x, u), deployed(field, x, u))
     # θ_p (3), the network's weights, gain, shift and bias (5); not its running statistics.
     assert sum(jax.tree.leaves(base.trainable(field))) == 8
-
-
-def test_files_that_name_the_former_modules_are_loaded(tmp_path):
-    path, moved = tmp_path / "model.npz", {name: cls for name, cls in _RENAMED.items() if ":" in name}
-    residual = view("near_ground", "rotors", scaling=ChannelScaling())
-    field = Hybrid(Hybrid(Kinematics(), base.fuse_for_inference(view(norm="none"))), residual)
-    save(path, field)
-    metadata, arrays = load_archive(path, FORMAT)
-    text = json.dumps(metadata)
-    for name, cls in moved.items():
-        today = f"{cls.__module__}:{cls.__qualname__}"
-        assert today in text
-        text = text.replace(today, name)
-    save_archive(path, FORMAT, json.loads(text), arrays)
-    assert eqx.tree_equal(load(path).field, field)
