@@ -2,7 +2,7 @@
 
 import subprocess
 import sys
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Literal, get_args
@@ -10,47 +10,37 @@ from typing import Any, Literal, get_args
 import tyro
 from rich.console import Console
 
-from benchmarks import history
 from benchmarks.timing import BAD_INPUT, Ratio, check_file, ratio_table
 from hybrid_jax.io.files import json_text, read_json, write_atomic
 
-Benchmark = Literal[
-    "training_step", "rollout", "sweep", "environment", "compilation", "scaling", "growth", "ingest", "grids"
-]  # fmt: skip
-PEERS = "training_peers", "environment_peers", "grid_peers"
+Benchmark = Literal["training_step", "rollout", "sweep", "grids"]
+PEERS = "training_peers"
 
 
 @dataclass(frozen=True)
 class Options:
-    """Run every benchmark in its own process and print one table of ratios: about eleven minutes on two idle cores.
+    """Run every benchmark in its own process and print one table of ratios: a few minutes on two idle cores.
     `python -m benchmarks.rollout --help` describes what a benchmark measures.
     """
 
     preset: Literal["full", "smoke"] = "full"
     """full: the reported numbers. smoke: a functional check; its numbers mean nothing."""
     out: Path | None = None
-    """Also write the numbers of all benchmarks to this file as JSON, and figures beside it."""
-    history: Path | None = None
-    """Also append the ratios to this file, one JSON object a line with the machine and the commit, and draw all of its
-    entries beside it."""
+    """Also write the numbers of all benchmarks to this file as JSON."""
     only: tuple[Benchmark, ...] = get_args(Benchmark)
     """Which benchmarks to run."""
     peers: bool = False
-    """Also run training_peers, environment_peers and grid_peers, which compare with other libraries on one core: about
-    eight minutes more, mostly in `torch.compile`. Libraries that are not installed are skipped:
-    pip install -e '.[peers]'."""
+    """Also run training_peers, which compares with PyTorch on one core: some five minutes more, mostly in
+    `torch.compile`. Libraries that are not installed are skipped: pip install -e '.[peers]'."""
 
 
-def measured(name: str, preset: str, out: Path | None) -> dict[str, Any]:
-    """Run one benchmark and return its report. Tables go to stderr, figures beside `out`."""
+def measured(name: str, preset: str) -> dict[str, Any]:
+    """Run one benchmark and return its report. Tables go to stderr."""
     with TemporaryDirectory() as folder:
         report = Path(folder) / f"{name}.json"
         command = [sys.executable, "-m", f"benchmarks.{name}", "--preset", preset, "--out", str(report)]
         if subprocess.run(command, stdout=sys.stderr, check=False).returncode:
             raise RuntimeError(f"benchmark {name} failed; see its output above")
-        for figure in report.parent.glob(f"{name}.[!j]*"):
-            if out is not None:
-                write_atomic(out.with_name(f"{out.stem}-{figure.name}"), figure.read_bytes())
         return read_json(report)
 
 
@@ -59,11 +49,8 @@ def main() -> None:
     options = tyro.cli(Options, prog="python -m benchmarks", description=Options.__doc__)
     try:
         check_file("--out", options.out)
-        check_file("--history", options.history)
-        if options.history is not None and options.history.exists():
-            history.read(options.history)  # refused before hours of work, not after
-        names = options.only + (PEERS if options.peers else ())
-        reports = [measured(name, options.preset, options.out) for name in names]
+        names = options.only + ((PEERS,) if options.peers else ())
+        reports = [measured(name, options.preset) for name in names]
     except (ValueError, RuntimeError) as error:
         print(f"benchmarks: {error}", file=sys.stderr)
         sys.exit(BAD_INPUT if isinstance(error, ValueError) else 1)
@@ -78,10 +65,6 @@ def main() -> None:
         for row in report["rows"]:
             if "skipped" in row:
                 console.print(f"{report['benchmark']}: {row['rival']}: {row['skipped']}", markup=False)
-    if options.history is not None:
-        drawn = history.figure(history.append(options.history, {ratio.what: asdict(ratio) for ratio in ratios}))
-        for suffix in (".png", ".svg"):
-            drawn.savefig(options.history.with_suffix(suffix), dpi=150)
     if options.out is not None:
         write_atomic(options.out, json_text({"benchmarks": reports}))
 

@@ -7,7 +7,6 @@ of two calls is the median of the ratios within each turn. Set the cores with ta
 import math
 import os
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -21,7 +20,6 @@ import jax
 import numpy as np
 import tyro
 from jaxtyping import PyTree
-from matplotlib.figure import Figure
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
@@ -47,7 +45,7 @@ class Options:
     preset: str = "full"
     """full: the reported numbers. smoke: a functional check in seconds; its numbers mean nothing."""
     out: Path | None = None
-    """Also write the numbers to this file as JSON, and a figure, if there is one, beside it."""
+    """Also write the numbers to this file as JSON."""
 
 
 @dataclass(frozen=True)
@@ -70,12 +68,11 @@ class Ratio:
 
 @dataclass(frozen=True)
 class Findings:
-    """The results of a benchmark: rows of JSON values, tables of the same, ratios, and a figure."""
+    """The results of a benchmark: rows of JSON values, tables of the same, and ratios."""
 
     rows: list[dict[str, Any]]
     tables: list[Table]
     ratios: list[Ratio] = field(default_factory=list)
-    figure: Figure | None = None
 
 
 @dataclass(frozen=True)
@@ -140,15 +137,6 @@ def compile_all(
     return {name: call for name, (call, _) in programs.items()}, {name: taken for name, (_, taken) in programs.items()}
 
 
-def repeated(call: Call, turns: int, budget: float) -> float:
-    """The median seconds of a call, after a warm-up: up to `turns` times, but at least 3, within a budget [s]."""
-    call()
-    taken: list[float] = []
-    while len(taken) < turns and (len(taken) < 3 or sum(taken) < budget):
-        taken.append(stopwatch(call)[1])
-    return statistics.median(taken)
-
-
 def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     """The largest difference of any two arrays, relative to the largest number in the second.
 
@@ -161,21 +149,6 @@ def agree(what: str, ours: PyTree, theirs: PyTree, tolerance: float) -> float:
     if not worst <= tolerance:
         raise Disagreement(f"{what} differ by {worst:.1e}, allowed {tolerance:.0e}")
     return worst
-
-
-def run_together(what: str, commands: Sequence[Sequence[str]], variables: Mapping[str, str] | None = None) -> list[str]:
-    """Run Python processes, given their arguments, at the same time; the standard output of each.
-
-    Raises:
-        RuntimeError: a process failed; the end of its standard error.
-    """
-    pipes: Any = {"stdout": subprocess.PIPE, "stderr": subprocess.PIPE, "text": True, "env": variables}
-    started = [subprocess.Popen([sys.executable, *command], **pipes) for command in commands]
-    outputs = [process.communicate() for process in started]
-    for process, (_, error) in zip(started, outputs, strict=True):
-        if process.returncode:
-            raise RuntimeError(f"{what} failed: {error[-500:]}")
-    return [output for output, _ in outputs]
 
 
 def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Callable[[Any], Findings]) -> None:
@@ -215,9 +188,6 @@ def run(name: str, about: str | None, presets: Mapping[str, Any], measure: Calla
         "ratios": [asdict(ratio) | {"holds": ratio.holds} for ratio in findings.ratios],
     }
     write_atomic(options.out, json_text(report))
-    if findings.figure is not None:
-        findings.figure.savefig(options.out.with_suffix(".png"), dpi=150)
-        findings.figure.savefig(options.out.with_suffix(".svg"), metadata={"Date": None})
 
 
 def check_file(option: str, file: Path | None) -> None:

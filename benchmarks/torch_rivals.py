@@ -116,37 +116,6 @@ class Hybrid(nn.Module):
         return self.physics(x, u) + self.network(x, u)
 
 
-class GridHybrid(nn.Module):
-    """Diffusion and a network on a periodic grid, from a hybrid of ours: ẋ (b, c, n, n) for x (b, c, n, n)."""
-
-    def __init__(self, field: OurHybrid):
-        super().__init__()
-        physics: Any = field.physics
-        network, self.kernel = field.residual.network, field.residual.kernel  # pyright: ignore[reportAttributeAccessIssue]
-        hidden, read = network.weight_in.shape
-        # One row for each hidden unit: for each neighbour its components.
-        filters = np.reshape(network.weight_in, (hidden, self.kernel, self.kernel, read // self.kernel**2))
-        self.spacing = physics.grid.spacing
-        self.log_diffusivity = nn.Parameter(tensor(physics.log_diffusivity))
-        self.weight_in = nn.Parameter(tensor(np.moveaxis(filters, -1, 1)))
-        self.bias_in, self.bias_out = nn.Parameter(tensor(network.norm.shift)), nn.Parameter(tensor(network.bias_out))
-        self.weight_out = nn.Parameter(tensor(network.weight_out)[:, :, None, None])
-
-    def forward(self, t: torch.Tensor, x: torch.Tensor) -> torch.Tensor:
-        around = sum(torch.roll(x, step, axis) for axis in (2, 3) for step in (1, -1)) - 4 * x
-        spread = self.log_diffusivity.exp()[:, None, None] * around / self.spacing**2
-        wrapped = functional.pad(x, (self.kernel // 2,) * 4, mode="circular")
-        hidden = torch.tanh(functional.conv2d(wrapped, self.weight_in, self.bias_in))
-        return spread + functional.conv2d(hidden, self.weight_out, self.bias_out)
-
-    def moments(self, adam: torch.optim.Adam) -> dict[str, np.ndarray]:
-        """Adam's first moment of each parameter, in our shapes."""
-        found = {name: np.array(adam.state[value]["exp_avg"]) for name, value in self.named_parameters()}
-        found["weight_in"] = np.moveaxis(found["weight_in"], 1, -1).reshape(len(found["bias_in"]), -1)
-        found["weight_out"] = found["weight_out"][..., 0, 0]
-        return found
-
-
 Integrator = Callable[[nn.Module, torch.Tensor, torch.Tensor, float], torch.Tensor]
 
 
