@@ -24,8 +24,7 @@ from hybrid_jax.export import (
     casadi_step,
     export_adaptation_c,
     export_c,
-    export_field,
-    export_step,
+    export_program,
 )
 from hybrid_jax.export.program import sizes_of, vehicle_in
 from hybrid_jax.io.datasets import load_dataset
@@ -187,8 +186,8 @@ def _programs(config: Config, model: Model, dt: float, out: Path, own: dict[str,
     checks.writable_folder("--out", out)
     options = own | {"batched": config.batched, "platforms": config.platforms, "about": model.about}
     written = [out / "field.npz", out / "step.npz"]
-    export_field(written[0], model.field, **options)
-    export_step(written[1], model.field, dt, **options)
+    export_program(written[0], model.field, **options)
+    export_program(written[1], model.field, dt, **options)
     if config.casadi:
         functions = casadi_function(model.field, **own), casadi_step(model.field, dt, **own)
         for path, function in zip([path.with_suffix(".casadi") for path in written], functions, strict=True):

@@ -21,7 +21,7 @@ from pendulum import pendulum, swings
 from surface import cases, is_finite, outcome, spoiled
 
 import hybrid_jax as hj
-from hybrid_jax.export import Program, export_field, load_program
+from hybrid_jax.export import Program, export_program, load_program
 from hybrid_jax.export.stablehlo import FORMAT as PROGRAM
 from hybrid_jax.io.archive import named_leaves, save_archive
 from hybrid_jax.io.datasets import FORMAT as DATASET
@@ -104,7 +104,7 @@ def files(folder):
     """Loader → the bytes of a sound file."""
     hj.save(folder / "model.npz", MIXED, {"n": 1})
     save_dataset(folder / "set.npz", Dataset({"train": WINDOWS}, {"config": {"seed": 1}}))
-    export_field(folder / "program.npz", MIXED, state_size=2, input_size=1)
+    export_program(folder / "program.npz", MIXED, state_size=2, input_size=1)
     names = {hj.load: "model", load_dataset: "set", load_program: "program"}
     return {load: (folder / f"{name}.npz").read_bytes() for load, name in names.items()}
 

@@ -21,7 +21,7 @@ from hybrid_jax.adaptation import ridge
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.export import casadi_function, casadi_step, export_field, export_step, load_program
+from hybrid_jax.export import casadi_function, casadi_step, export_program, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import SplitSpec, fly
@@ -244,7 +244,7 @@ def folder(tmp_path_factory):
 def programs(folder):
     """Whether it is of a batch → a program of a step."""
     for batched in (False, True):
-        export_step(folder / f"{batched}.npz", SWING, 0.05, state_size=2, input_size=1, batched=batched)
+        export_program(folder / f"{batched}.npz", SWING, 0.05, state_size=2, input_size=1, batched=batched)
     return {batched: load_program(folder / f"{batched}.npz") for batched in (False, True)}
 
 
@@ -270,7 +270,7 @@ SIZES = {"state_size": odd(2), "input_size": odd(1)}
     st.sampled_from([SWING, BODY, None, "field"]),
 )
 def test_a_program_is_written_whole_or_refused(folder, options, dt, field):
-    for export in (export_field, lambda path, field, **options: export_step(path, field, dt, **options)):
+    for export in (export_program, lambda path, field, **options: export_program(path, field, dt, **options)):
         path = folder / "written.npz"
         path.unlink(missing_ok=True)
         outcome(export, path, field, **options)

@@ -27,8 +27,10 @@ def casadi_function(
     CasADi differentiates it, saves it (`.save`) and translates it to C (`.generate`).
 
     Args:
-        state_size: d; by default what the field knows (see `sizes_of`).
+        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
         input_size: m; likewise.
+        name: of the function, as CasADi accepts it.
         smooth: β of ½ (z + √(z² + 1/β²)), to take the place of the ReLU of networks (see `smoothed`). Solvers that use
             second derivatives, such as IPOPT, need it.
 
@@ -49,7 +51,16 @@ def casadi_step(
     name: str = "F",
     smooth: float | None = None,
 ) -> "casadi.Function":
-    """x⁺ = F(x, u), one step of RK4 over dt [s] with u held; its output is xnext. Otherwise as `casadi_function`."""
+    """x⁺ = F(x, u), one step of RK4 with u held; its output is xnext. Otherwise as `casadi_function`.
+
+    Args:
+        field: as of `casadi_function`, like `state_size`, `input_size` and `smooth`.
+        dt: length of the step [s].
+        state_size: d.
+        input_size: m.
+        name: of the function.
+        smooth: β of a smooth ReLU.
+    """
     checks.positive("dt", dt, "a positive number of seconds")
     return _function(field, float(dt), state_size, input_size, name, smooth, "xnext")
 
@@ -65,8 +76,15 @@ def acados_model(
     """The attributes of an `AcadosModel` of acados: name, x, u, xdot, p, f_expl_expr and f_impl_expr = xdot − f(x, u).
 
     Set them one by one: `model = AcadosModel(); [setattr(model, *one) for one in acados_model(field).items()]`. acados
-    integrates by itself, so there is no step; p is empty, as the parameters are numbers. Arguments and errors as of
+    integrates by itself, so there is no step; p is empty, as the parameters are numbers. Errors as of
     `casadi_function`.
+
+    Args:
+        field: as of `casadi_function`, like `state_size`, `input_size` and `smooth`.
+        state_size: d.
+        input_size: m.
+        name: of the model.
+        smooth: β of a smooth ReLU.
     """
     function = casadi_function(field, state_size=state_size, input_size=input_size, name=name, smooth=smooth)
     import casadi as ca
@@ -90,7 +108,7 @@ def _function(
     if sizes[0] > MOST_STATES:
         raise ValueError(
             f"state_size must be at most {MOST_STATES}, got {sizes[0]}: CasADi would write every number out, as of a "
-            "grid; use export_field"
+            "grid; use export_program"
         )
     if not isinstance(name, str) or not ca.Function.check_name(name):
         raise ValueError(f"name must be one that CasADi accepts for a function, got {checks.short_repr(name)}")

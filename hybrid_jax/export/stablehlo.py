@@ -30,20 +30,34 @@ BATCH = "b"  # name of the batch axis, whose length is symbolic
 
 @dataclass(frozen=True)
 class Program:
-    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`."""
+    """ẋ = f(x, u), or x⁺ = F(x, u), read from a file; it works under `jax.jit`, not under `jax.vmap` or `jax.grad`.
 
-    dt: float | None  # length of a step [s]; None for a field
-    state_size: int  # d
-    input_size: int  # m
-    batched: bool  # whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,)
-    platforms: tuple[str, ...]  # on which it runs
-    about: Mapping[str, Any]  # JSON values that describe the model
+    Attributes:
+        dt: length of a step [s]; None for a field.
+        state_size: d.
+        input_size: m.
+        batched: whether it takes x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
+        platforms: on which it runs.
+        about: JSON values that describe the model.
+    """
+
+    dt: float | None
+    state_size: int
+    input_size: int
+    batched: bool
+    platforms: tuple[str, ...]
+    about: Mapping[str, Any]
     _call: Callable[[Array, Array], Array] = field(repr=False)
 
     def __call__(
         self, x: Float[Array | np.ndarray, "*b d"], u: Float[Array | np.ndarray, "*b m"]
     ) -> Float[Array, "*b d"]:
-        """ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays."""
+        """ẋ, or the state dt later with the input held, in single precision; ValueError for other arrays.
+
+        Args:
+            x: state (d,), or states (b, d).
+            u: input (m,), or inputs (b, m).
+        """
         x, u = (checks.floating(name, value).astype(jnp.float32) for name, value in (("x", x), ("u", u)))
         batch = x.shape[:1] if self.batched else ()
         if x.shape != (*batch, self.state_size) or u.shape != (*batch, self.input_size) or 0 in batch:
@@ -53,9 +67,10 @@ class Program:
         return self._call(x, u)
 
 
-def export_field(
+def export_program(
     path: str | Path,
     field: AbstractVectorField,
+    dt: float | None = None,
     *,
     state_size: int | None = None,
     input_size: int | None = None,
@@ -64,10 +79,13 @@ def export_field(
     smooth: float | None = None,
     about: Mapping[str, Any] | None = None,
 ) -> None:
-    """Write ẋ = f(x, u) of a field in inference mode, in single precision, to a file that `load_program` reads.
+    """Write a field, or a step of it, in inference mode and single precision, to a file that `load_program` reads.
 
     Args:
-        state_size: d; by default what the field knows (see `sizes_of`).
+        path: of the file.
+        field: ẋ = f(x, u), of one state x (d,) and one input u (m,).
+        dt: length of a step of RK4 with the input held [s], x⁺ = F(x, u); without it ẋ is written.
+        state_size: d; by default that of the field's vehicle or, failing that, its attribute of this name.
         input_size: m; likewise.
         batched: take x (b, d) and u (b, m), for any b of at least 1; else x (d,) and u (m,).
         platforms: a subset of PLATFORMS; each makes the file longer.
@@ -80,28 +98,25 @@ def export_field(
         ImportError: flatbuffers is not installed (extra `export`).
         OSError: the folder cannot be written.
     """
-    _export(path, field, None, state_size, input_size, batched, platforms, smooth, about)
-
-
-def export_step(
-    path: str | Path,
-    field: AbstractVectorField,
-    dt: float,
-    *,
-    state_size: int | None = None,
-    input_size: int | None = None,
-    batched: bool = False,
-    platforms: tuple[str, ...] = ("cpu",),
-    smooth: float | None = None,
-    about: Mapping[str, Any] | None = None,
-) -> None:
-    """Write x⁺ = F(x, u), one step of RK4 over dt [s] with the input held. Otherwise as `export_field`."""
-    checks.positive("dt", dt, "a positive number of seconds")
-    _export(path, field, float(dt), state_size, input_size, batched, platforms, smooth, about)
+    if dt is not None:
+        checks.positive("dt", dt, "a positive number of seconds")
+        dt = float(dt)
+    _need_flatbuffers()
+    sizes = sizes_of(field, state_size, input_size)
+    if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
+        known = ", ".join(PLATFORMS)
+        raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
+    exported = _exported(field, dt, sizes, batched, platforms, smooth)
+    _check_calls(exported)
+    metadata = {"dt": dt, "about": dict(about or {})}
+    save_archive(path, FORMAT, metadata, {"exported": np.frombuffer(exported.serialize(), np.uint8)})
 
 
 def load_program(path: str | Path) -> Program:
-    """Read a file of `export_field` or `export_step`; no Python of the file is run.
+    """Read a file of `export_program`; no Python of the file is run.
+
+    Args:
+        path: of the file.
 
     Raises:
         ValueError: the file is missing, damaged, not a program, or a program with an external call; one line.
@@ -121,21 +136,13 @@ def load_program(path: str | Path) -> Program:
     return Program(dt, state_size, input_size, batched, exported.platforms, about, jax.jit(exported.call))
 
 
-def _export(path, field, dt: float | None, state_size, input_size, batched, platforms, smooth, about) -> None:
-    _need_flatbuffers()
-    sizes = sizes_of(field, state_size, input_size)
-    if not isinstance(platforms, tuple) or not platforms or any(one not in PLATFORMS for one in platforms):
-        known = ", ".join(PLATFORMS)
-        raise ValueError(f"platforms must be a tuple of some of {known}, got {checks.short_repr(platforms)}")
+def _exported(field, dt: float | None, sizes, batched: bool, platforms, smooth) -> jax.export.Exported:
     with jax.enable_x64(False), _without_source_locations():
         likes = [jax.ShapeDtypeStruct((size,), jnp.float32) for size in sizes]
         program = program_of(field, likes, dt, smooth, batched)
         batch = jax.export.symbolic_shape(BATCH) if batched else ()
         x, u = (jax.ShapeDtypeStruct((*batch, size), jnp.float32) for size in sizes)
-        exported = jax.export.export(jax.jit(program), platforms=platforms)(x, u)
-    _check_calls(exported)
-    metadata = {"dt": dt, "about": dict(about or {})}
-    save_archive(path, FORMAT, metadata, {"exported": np.frombuffer(exported.serialize(), np.uint8)})
+        return jax.export.export(jax.jit(program), platforms=platforms)(x, u)
 
 
 @contextmanager

@@ -13,7 +13,7 @@ import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS
 from hybrid_jax.dynamics.base import train_batch
 from hybrid_jax.dynamics.disturbance import disturbance_of, with_disturbance
-from hybrid_jax.export import casadi_function, export_field, load_program
+from hybrid_jax.export import casadi_function, export_program, load_program
 from hybrid_jax.training.channels import scaled_loss
 
 KEY = jax.random.key(0)
@@ -130,7 +130,7 @@ def test_batch_norm_runs_over_points():
 def test_programs_of_grids_are_the_field(kernel, tmp_path):
     pytest.importorskip("flatbuffers")
     field = hj.with_scaling(hybrid(kernel), decays())
-    export_field(tmp_path / "f.bin", field, state_size=GRID.size, input_size=0)
+    export_program(tmp_path / "f.bin", field, state_size=GRID.size, input_size=0)
     x = jax.random.normal(KEY, (GRID.size,))
     np.testing.assert_allclose(load_program(tmp_path / "f.bin")(x, jnp.zeros(0)), field(x, jnp.zeros(0)), atol=1e-5)
 

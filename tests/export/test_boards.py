@@ -7,6 +7,7 @@ QEMU counts instructions and knows nothing of cycles.
 import shutil
 from pathlib import Path
 
+import jax
 import numpy as np
 import pytest
 from compiled import C99, Library, needs_compiler, run
@@ -14,6 +15,7 @@ from fields import KEY, samples
 
 import hybrid_jax as hj
 from hybrid_jax.export import export_adaptation_c, export_c
+from hybrid_jax.export.program import program_of
 
 BOARD = Path(__file__).parent / "board"
 TOOLS = ("arm-none-eabi-gcc", "qemu-system-arm")
@@ -23,16 +25,16 @@ pytestmark = [needs_compiler, pytest.mark.skipif(bool(MISSING), reason=f"not ins
 # Processor → its FPU, and the board that has it in QEMU.
 BOARDS = {"cortex-m7": ("fpv5-sp-d16", "mps2-an500"), "cortex-m4": ("fpv4-sp-d16", "mps2-an386")}
 FLASH = 64 * 1024  # bytes
+HYBRID = hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, KEY))
 SAME = 1e-5  # of the largest entry: single precision, and another order of rounding if any
 
 
 @pytest.fixture(scope="module")
 def paper(tmp_path_factory):
     """Header and source of the paper's hybrid, 17 → 64 → 13."""
-    field = hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, KEY))
     folder = tmp_path_factory.mktemp("paper")
     (folder / "samples.h").write_text(header(*samples()))
-    return export_c(folder, field, 0.01, name="paper")
+    return export_c(folder, HYBRID, 0.01, name="paper")
 
 
 def header(x, u):
@@ -47,14 +49,49 @@ def header(x, u):
     return f"enum {{ SAMPLES = {len(x)} }};\n" + "".join(tables)
 
 
+def target(processor):
+    """What GCC is told of a processor."""
+    return (f"-mcpu={processor}", f"-mfpu={BOARDS[processor][0]}", "-mfloat-abi=hard", "-mthumb", "-O2")
+
+
+def flash_of(compiled):
+    """Bytes of flash."""
+    return int(run("arm-none-eabi-size", compiled).splitlines()[1].split()[0])
+
+
+@pytest.mark.slow
+def test_casadis_generator_needs_more_flash(tmp_path, monkeypatch):
+    """Its matrix graph of a step and its Jacobians, beside all that we write; it generates into the working folder."""
+    ca = pytest.importorskip("casadi", reason="casadi is an extra")
+    from hybrid_jax.export.casadi_operations import CasadiTranslation
+
+    with jax.enable_x64(True):
+        likes = [jax.ShapeDtypeStruct((size,), float) for size in (13, 4)]
+        program = jax.make_jaxpr(program_of(HYBRID, likes, 0.01, None))(*likes)
+    x, u = ca.MX.sym("x", 13), ca.MX.sym("u", 4)
+    (step,) = map(ca.densify, CasadiTranslation().run(program, [x, u], [13, 4]))
+    monkeypatch.chdir(tmp_path)
+    flash = {}
+    for name, results in {"step": [step], "both": [step, ca.jacobian(step, x), ca.jacobian(step, u)]}.items():
+        generator = ca.CodeGenerator(name, {"casadi_real": "float", "casadi_int": "int"})
+        generator.add(ca.Function(name, [x, u], results))
+        generator.generate()
+        run("arm-none-eabi-gcc", "-std=c99", *target("cortex-m4"), "-c", f"{name}.c", "-o", f"{name}.o")
+        flash[name] = flash_of(f"{name}.o")
+    source = export_c(tmp_path, HYBRID, 0.01, name="ours")[1]
+    run("arm-none-eabi-gcc", *C99, *target("cortex-m4"), "-c", source, "-o", "ours.o")
+    flash["ours"] = flash_of("ours.o")
+    print(f"\nflash [B]: {flash}")
+    assert flash["ours"] < flash["both"] / 2
+
+
 @pytest.mark.parametrize("processor", BOARDS)
 def test_it_fits_and_finds_the_same(processor, paper):
-    (fpu, board), (_, source) = BOARDS[processor], paper
-    target = (f"-mcpu={processor}", f"-mfpu={fpu}", "-mfloat-abi=hard", "-mthumb", "-O2")
+    (_, board), (_, source) = BOARDS[processor], paper
     compiled, program = (source.with_name(f"{processor}{ending}") for ending in (".o", ".elf"))
-    run("arm-none-eabi-gcc", *C99, *target, "-c", source, "-o", compiled)
+    run("arm-none-eabi-gcc", *C99, *target(processor), "-c", source, "-o", compiled)
     link = ("-T", BOARD / "board.ld", "--specs=rdimon.specs", "-lm", "-o", program)
-    run("arm-none-eabi-gcc", *target, "-I", source.parent, BOARD / "main.c", compiled, *link)
+    run("arm-none-eabi-gcc", *target(processor), "-I", source.parent, BOARD / "main.c", compiled, *link)
 
     sections = run("arm-none-eabi-size", compiled).splitlines()[1].split()
     flash, *ram = (int(one) for one in sections[:3])
@@ -82,9 +119,8 @@ def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
     """Its covariance is corrected 13 times; with an array for each it would take 130 KB."""
     adaptation = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, 1e-3, disturbance=2.0)
     source = export_adaptation_c(tmp_path, adaptation)[1]
-    target = ("-mcpu=cortex-m4", f"-mfpu={BOARDS['cortex-m4'][0]}", "-mfloat-abi=hard", "-mthumb", "-O2")
     compiled = tmp_path / "filter.o"
-    run("arm-none-eabi-gcc", *C99, *target, "-fstack-usage", "-c", source, "-o", compiled)
+    run("arm-none-eabi-gcc", *C99, *target("cortex-m4"), "-fstack-usage", "-c", source, "-o", compiled)
     flash, *ram = (int(one) for one in run("arm-none-eabi-size", compiled).splitlines()[1].split()[:3])
     stack = max(int(line.split("\t")[1]) for line in compiled.with_suffix(".su").read_text().splitlines())
     print(f"\nfilter of physics: flash {flash} B, static RAM {sum(ram)} B, {stack} B of stack")

@@ -9,7 +9,7 @@ import surface
 from fields import KEY, SIZES, body, field_of, samples
 
 from hybrid_jax import residual_network, rollout_batch, save
-from hybrid_jax.export import export_field, export_step, load_program
+from hybrid_jax.export import export_program, load_program
 from hybrid_jax.export.stablehlo import FORMAT
 from hybrid_jax.io.archive import save_archive
 
@@ -34,7 +34,7 @@ def close(found, expected):
 
 @pytest.mark.parametrize("name", KINDS)
 def test_a_program_is_the_field(name, path):
-    export_field(path, field_of(name), **SIZES, about={"seed": 3})
+    export_program(path, field_of(name), **SIZES, about={"seed": 3})
     program = load_program(path)
     for x, u in zip(*samples(2), strict=True):
         close(program(x, u), field_of(name)(jnp.asarray(x, jnp.float32), jnp.asarray(u, jnp.float32)))
@@ -44,7 +44,7 @@ def test_a_program_is_the_field(name, path):
 
 @pytest.mark.parametrize("name", ["multirotor, per rotor", "hybrid, norm batch"])
 def test_a_program_of_steps_is_an_interval_of_a_rollout_for_a_batch_of_any_length(name, path):
-    export_step(path, field_of(name), 0.02, batched=True)
+    export_program(path, field_of(name), 0.02, batched=True)
     program = load_program(path)
     assert (program.dt, program.batched) == (0.02, True)
     for count in (1, 3):
@@ -53,7 +53,7 @@ def test_a_program_of_steps_is_an_interval_of_a_rollout_for_a_batch_of_any_lengt
 
 
 def test_it_may_be_part_of_a_compiled_program(path):
-    export_field(path, body())
+    export_program(path, body())
     program, (x, u) = load_program(path), (part[0] for part in samples())
     close(jax.jit(lambda x, u: 2 * program(x, u))(x, u), 2 * program(x, u))
 
@@ -61,18 +61,18 @@ def test_it_may_be_part_of_a_compiled_program(path):
 def test_in_double_precision_it_stays_single(path):
     single, (x, u) = body(), (part[0] for part in samples())
     with jax.enable_x64(True):
-        export_field(path, jax.tree.map(lambda leaf: jnp.asarray(leaf, float), single))
+        export_program(path, jax.tree.map(lambda leaf: jnp.asarray(leaf, float), single))
         close(load_program(path)(x, u), single(*(jnp.asarray(a, jnp.float32) for a in (x, u))))
 
 
 def test_a_file_for_two_platforms_says_so(path):
-    export_step(path, field_of(HYBRID), 0.01, platforms=("cpu", "cuda"))
+    export_program(path, field_of(HYBRID), 0.01, platforms=("cpu", "cuda"))
     assert load_program(path).platforms == ("cpu", "cuda")
 
 
 def test_equal_fields_are_equal_files_that_name_no_file_of_the_writer(path, tmp_path):
     for name in ("one.npz", "two.npz"):
-        export_step(tmp_path / name, field_of(HYBRID), 0.01, batched=True)
+        export_program(tmp_path / name, field_of(HYBRID), 0.01, batched=True)
     content = (tmp_path / "one.npz").read_bytes()
     assert content == (tmp_path / "two.npz").read_bytes()
     assert b".py" not in content.replace(b"exported.npy", b"")
@@ -80,7 +80,7 @@ def test_equal_fields_are_equal_files_that_name_no_file_of_the_writer(path, tmp_
 
 def test_another_system_has_other_sizes(path):
     field = residual_network(2, 1, KEY, hidden=4)
-    export_field(path, field, state_size=2, input_size=1)
+    export_program(path, field, state_size=2, input_size=1)
     close(load_program(path)(np.ones(2), np.ones(1)), field(jnp.ones(2), jnp.ones(1)))
 
 
@@ -92,7 +92,7 @@ def test_another_system_has_other_sizes(path):
     ],
 )
 def test_shapes_that_are_not_the_program_s_are_refused(batched, shapes, said, path):
-    export_field(path, body(), batched=batched)
+    export_program(path, body(), batched=batched)
     for x, u in shapes:
         with pytest.raises(ValueError, match=f"{said}, got"):
             load_program(path)(np.ones(x), np.ones(u))
@@ -111,8 +111,8 @@ def test_shapes_that_are_not_the_program_s_are_refused(batched, shapes, said, pa
     ids=str,
 )
 def test_what_makes_no_program_is_refused(options, said, path):
-    assert said in refusal(path, lambda path: export_field(path, body(), **options))
-    assert "dt must be a positive" in refusal(path, lambda path: export_step(path, body(), -0.1))
+    assert said in refusal(path, lambda path: export_program(path, body(), **options))
+    assert "dt must be a positive" in refusal(path, lambda path: export_program(path, body(), -0.1))
     assert not path.exists()
 
 
@@ -121,11 +121,11 @@ def solved(x, u):
 
 
 def test_sizes_are_given_or_known_by_the_field(path):
-    assert "input_size must be given" in refusal(path, lambda path: export_field(path, solved, state_size=13))
+    assert "input_size must be given" in refusal(path, lambda path: export_program(path, solved, state_size=13))
 
 
 def test_a_program_that_calls_a_library_is_not_written(path):
-    assert "calls lapack" in refusal(path, lambda path: export_field(path, solved, **SIZES))
+    assert "calls lapack" in refusal(path, lambda path: export_program(path, solved, **SIZES))
 
 
 def forged(path, function, *shapes, **metadata):
@@ -157,7 +157,7 @@ def test_a_forged_program_is_refused(path):
 
 
 def test_a_truncated_or_altered_program_is_refused(path):
-    export_field(path, body())
+    export_program(path, body())
     content = path.read_bytes()
     path.write_bytes(content[:-100])
     assert "truncated" in refusal(path)
