@@ -33,7 +33,7 @@ from .integrate import RK4, SOLVERS, rollout, rollout_batch
 from .io import Model, check_savable, load, portable, save
 from .networks import grid_network, residual_network
 from .networks.standardise import with_scaling
-from .online import Cause, OnlineAdaptation
+from .online import Hypothesis, OnlineAdaptation
 from .planning import Excitation, FlightBounds, InputBounds, excitation
 from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
 from .trajectories import Trajectories
@@ -50,5 +50,5 @@ __all__ += ["RK4", "SOLVERS", "residual_network", "rollout", "rollout_batch", "w
 __all__ += ["Model", "check_savable", "load", "portable", "save"]
 __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
-__all__ += ["Cause", "Excitation", "FlightBounds", "InputBounds", "OnlineAdaptation", "excitation"]
+__all__ += ["Excitation", "FlightBounds", "Hypothesis", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]

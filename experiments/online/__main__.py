@@ -32,8 +32,8 @@ which it and all estimators predict. Everything but the change and the agent is 
 - **least squares after 10 s on the ground**: all parameters and a disturbance fitted to ten seconds of random flight
   after the change, with the same noise, known from the moment of the change on
 - **online adaptation**: `hj.OnlineAdaptation`, which does not know when and what: inertia (3), centre of mass (2),
-  efficiency of each rotor (4), added drag (3) and a constant force and torque (6). It is told which of these may change
-  together (`hj.Cause`): inertia; a load (mass, inertia and centre of mass); each rotor; drag; a force that may vary
+  efficiency of each rotor (4), added drag (3) and a constant force and torque (6). It knows which may change together
+  (`hj.Hypothesis`): inertia; a load (mass, inertia and centre of mass); each rotor; drag; a force that may vary
 - **oracle**: the true parameters from the moment of the change on, and the wind at each moment
 
 No agent knows the ground effect, which the low pass meets. A flight crashes below the ground or 10 m off; its error

@@ -18,7 +18,7 @@ from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.dynamics.terms import Terms, units_of
 from hybrid_jax.online.estimator import OnlineAdaptation
-from hybrid_jax.online.hypotheses import Cause
+from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.changes import DOUBLED_DRAG, OFF_CENTRE_LOAD, WEAK_ROTOR
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
@@ -61,12 +61,12 @@ INERTIA = {"Ix": 0.3, "Iy": 0.3, "Iz": 0.3}
 # One e-fold of mass, which the model does not have, is one less of all accelerations.
 MASS = {"efficiency": -1.0, "Ix": -1.0, "Iy": -1.0, "Iz": -1.0, "added_drag": -DRAG_COEFFICIENT / IRIS.mass}
 FORCES = ("disturbance[vx]", "disturbance[vy]", "disturbance[vz]")
-CAUSES = (
-    Cause("inertia", INERTIA),
-    Cause("load", INERTIA | {"centre_of_mass": 0.05}, ({name: 0.2 * size for name, size in MASS.items()},)),
-    *(Cause(f"rotor {i}", {f"efficiency[{i}]": 0.2}) for i in range(IRIS.rotors)),
-    Cause("drag", {"added_drag": 0.3}),
-    Cause("wind", dict.fromkeys(FORCES, 3.0), rates=dict.fromkeys(FORCES, 1.5), lead=0.1),
+HYPOTHESES = (
+    Hypothesis("inertia", INERTIA),
+    Hypothesis("load", INERTIA | {"centre_of_mass": 0.05}, ({name: 0.2 * size for name, size in MASS.items()},)),
+    *(Hypothesis(f"rotor {i}", {f"efficiency[{i}]": 0.2}) for i in range(IRIS.rotors)),
+    Hypothesis("drag", {"added_drag": 0.3}),
+    Hypothesis("wind", dict.fromkeys(FORCES, 3.0), rates=dict.fromkeys(FORCES, 1.5), lead=0.1),
 )
 
 
@@ -168,7 +168,14 @@ def told(field: AbstractVectorField, period: float, clock: float, bandwidth: flo
 def online(hardware: Hardware, period: float) -> OnlineAdaptation:
     sizes = np.maximum(hardware.sizes(), 1e-4)
     return OnlineAdaptation(
-        nominal(), period, tuple(sizes.tolist()), PRIOR, DISTURBANCE, process=PROCESS, initial=INITIAL, causes=CAUSES
+        nominal(),
+        period,
+        tuple(sizes.tolist()),
+        PRIOR,
+        DISTURBANCE,
+        process=PROCESS,
+        initial=INITIAL,
+        hypotheses=HYPOTHESES,
     )
 
 

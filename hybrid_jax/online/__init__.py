@@ -4,8 +4,8 @@
 """
 
 from hybrid_jax.online.estimator import OnlineAdaptation
-from hybrid_jax.online.hypotheses import Cause
+from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.online.state import Flags, OnlineState
 from hybrid_jax.online.tuning import Tuning
 
-__all__ = ["Cause", "Flags", "OnlineAdaptation", "OnlineState", "Tuning"]
+__all__ = ["Flags", "Hypothesis", "OnlineAdaptation", "OnlineState", "Tuning"]

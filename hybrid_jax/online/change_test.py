@@ -15,11 +15,17 @@ from hybrid_jax.online.tuning import Tuning
 
 
 class ChangeTest(eqx.Module):
-    """Its sums for p parameters, over two spans of time."""
+    """Its sums for p parameters, over two spans of time.
 
-    pull: Float[Array, "*n 2 p"]  # weighted sums of the corrections of θ
-    spread: Float[Array, "*n 2 p"]  # their variances if nothing has changed
-    quiet: Float[Array, "*n"]  # time since the last alarm [s]
+    Attributes:
+        pull: weighted sums of the corrections of θ.
+        spread: their variances if nothing has changed.
+        quiet: time since the last alarm [s].
+    """
+
+    pull: Float[Array, "*n 2 p"]
+    spread: Float[Array, "*n 2 p"]
+    quiet: Float[Array, "*n"]
 
     @property
     def squares(self) -> Float[Array, "2 p"]:

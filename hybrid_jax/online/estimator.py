@@ -5,9 +5,9 @@ and θ, all parameters of the physics and the disturbance.
 
 - A test of the innovations finds a change (`change_test`). An alarm opens the covariance.
 - Forgetting: θ is a slow random walk, and the disturbance, such as a gust, walks faster while it is pulled. Parameters
-  of a vehicle are constant between two changes; they do so only where no disturbance is estimated, or beside causes, as
-  the filter of all parameters then matters where the model is wrong in a way that no cause explains.
-- Causes: with these, filters of a few parameters compete with that of all (`causes_bank`).
+  of a vehicle are constant between two changes; they do so only where no disturbance is estimated, or beside
+  hypotheses, as the filter of all parameters then matters where the model is wrong in a way that none explains.
+- Hypotheses: with these, filters of a few parameters compete with that of all (`multiple_model`).
 - Consistency: while the mean of the normalised innovations squared (NIS) is far too large, what the filter says is not
   used (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the
   last good estimate is.
@@ -19,7 +19,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -29,16 +29,19 @@ from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable
-from hybrid_jax.online import change_test, hypothesis_bank, kalman
-from hybrid_jax.online.hypotheses import Bank, Cause, Directions, bank_of, directions
-from hybrid_jax.online.kalman import Belief, Each, Plant
-from hybrid_jax.online.samples import HUGE, Heard, Sample, nearer, sampled
+from hybrid_jax.online import change_test, kalman, multiple_model
+from hybrid_jax.online.change_test import ChangeTest
+from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
+from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
+from hybrid_jax.online.multiple_model import Verdict
+from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify, nearer
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, named_priors
 from hybrid_jax.online.tuning import Tuning
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION
 
 FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
+Judged = tuple[ChangeTest, Bool[Array, ""], Verdict]
 UNEXCITED = 0.5  # share of its variance without data, above which the data have said nothing on a parameter
 
 
@@ -63,8 +66,11 @@ class OnlineAdaptation(AbstractEstimator):
         indices: of the disturbed states; by default those that the field has, or v̇ and ω̇ of a rigid body.
         process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
         initial: share of the prior that is uncertain at the start, before a change.
-        causes: of which one may change at a time, each of a few parameters, found by how well it explains the samples.
-            With causes the model stays the field's own until a change is found.
+        hypotheses: of which one may hold at a time, each on a change of a few parameters, found by how well it
+            explains the samples. With hypotheses the model stays the field's own until a change is found.
+        tuning: how fast it forgets, and what it calls a change.
+        names: of the parameters, in the order of θ.
+        scales: the prior standard deviation of each, in that order.
 
     Raises:
         ValueError: a number out of range, an unknown name, or physics without parameters.
@@ -72,12 +78,12 @@ class OnlineAdaptation(AbstractEstimator):
 
     field: AbstractVectorField
     dt: float = eqx.field(static=True)
-    noise: tuple[float, ...] = eqx.field(static=True)  # one for each state, or one for all
+    noise: tuple[float, ...] = eqx.field(static=True)
     process: tuple[float, ...] = eqx.field(static=True)
-    names: tuple[str, ...] = eqx.field(static=True)  # of the parameters, in the order of θ
-    scales: tuple[float, ...] = eqx.field(static=True)  # the prior standard deviation of each
+    names: tuple[str, ...] = eqx.field(static=True)
+    scales: tuple[float, ...] = eqx.field(static=True)
     initial: float = eqx.field(static=True)
-    causes: tuple[Directions, ...] = eqx.field(static=True)
+    hypotheses: tuple[Subspace, ...] = eqx.field(static=True)
     tuning: Tuning = eqx.field(static=True)
 
     def __init__(
@@ -90,7 +96,7 @@ class OnlineAdaptation(AbstractEstimator):
         indices: tuple[int, ...] | None = None,
         process: Numbers = 0.0,
         initial: float = 1.0,
-        causes: tuple[Cause, ...] = (),
+        hypotheses: tuple[Hypothesis, ...] = (),
         tuning: Tuning | None = None,
     ):
         checks.positive("dt", dt, "a positive number of seconds")
@@ -111,9 +117,8 @@ class OnlineAdaptation(AbstractEstimator):
         self.field, self.dt, self.initial = field, float(dt), float(initial)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
         self.names, self.scales = named_priors(field, prior, disturbance)
-        self.causes = tuple(
-            directions(cause, self.names, self.scales) for cause in checks.list_of("causes", causes, Cause)
-        )
+        given = checks.list_of("hypotheses", hypotheses, Hypothesis)
+        self.hypotheses = tuple(subspace_of(hypothesis, self.names, self.scales) for hypothesis in given)
 
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
         """Before the first sample x, at the field's own parameters."""
@@ -122,8 +127,8 @@ class OnlineAdaptation(AbstractEstimator):
         p, none = ravel_parameters(self.field)[0].size, jnp.zeros_like(x)
         zero, theta, start = jnp.zeros((), x.dtype), jnp.zeros(p, x.dtype), jnp.full(p, self.initial**2, x.dtype)
         variances, mixture = self._variances(x), None
-        if self.causes:
-            mixture = hypothesis_bank.begun(self._bank(), x, variances, self.tuning.floor)
+        if self.hypotheses:
+            mixture = multiple_model.initial(self._models(), x, variances, self.tuning.floor)
         return OnlineState(
             x=x,
             theta=theta,
@@ -133,10 +138,7 @@ class OnlineAdaptation(AbstractEstimator):
             mixture=mixture,
             trusted=theta,
             nis=zero + 1,
-            silent=zero,
-            last=x,
-            equal=none,
-            unseen=none,
+            history=SampleHistory(x, none, zero, none),
             changes=zero,
             restarts=zero,
         )
@@ -156,58 +158,27 @@ class OnlineAdaptation(AbstractEstimator):
             u: the mean input over the period, as it acted: delayed and lagged, not as it was commanded.
             elapsed: periods since the last update. Over more than one nothing is learned of the input, and the state is
                 taken from the sample.
-            each: turns a function of the filter of one cause into one of arrays of all.
+            each: turns a function of the filter of one hypothesis into one of arrays of all.
         """
-        tuning, d = self.tuning, len(state.x)
         checks.not_negative("elapsed", elapsed)
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
         if x.shape != state.x.shape:
             raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
         x = nearer(x, state.x) if moves_a_rigid_body(self.field) else x
-        heard = Heard(state.last, state.equal, state.silent)
-        sample, heard = sampled(x, u, elapsed, heard, self.dt, tuning.gap)
-        plant = self._plant(sample, each)
-        belief, free = self._predicted(state, plant, sample)
-        belief = kalman.restarted(belief, sample, sample.anew, plant.variances)
-        belief, correction = kalman.correct(belief, sample, plant)
-        white, gains, _ = correction
-        test, changed = change_test.after_sample(state.test, white, gains, sample, self.dt, tuning, tuning.pause)
-        mean, squares, mixture, found = belief.z[d:], jnp.square(white), None, changed
-        if state.mixture is not None:
-            verdict = hypothesis_bank.after_sample(state.mixture, self._bank(), plant, sample, belief, correction)
-            mixture, mean, squares, found, lost = verdict
-            lost = lost & (test.quiet > tuning.hold)
-            test, changed = change_test.reset(test, lost, 0.0), changed | lost
-        # The state, too, has followed the wrong model since the change.
-        belief = kalman.restarted(belief, sample, changed, plant.variances)
-        ones = jnp.ones_like(state.theta)
-        open_up = jnp.concatenate([jnp.zeros(d, x.dtype), jnp.where(changed, ones, 0.0)])
-        nis = self._mean_square(state.nis, squares, sample)
-        new = OnlineState(
-            x=belief.z[:d],
-            theta=belief.z[d:],
-            covariance=belief.covariance + jnp.diag(open_up),
-            free=jnp.where(changed, ones, free),
-            test=test,
-            mixture=mixture,
-            trusted=jnp.where(nis < tuning.reject, mean, state.trusted),
-            nis=nis,
-            silent=heard.silent,
-            last=jnp.where(jnp.abs(sample.x) < HUGE, sample.x, state.last),
-            equal=heard.equal,
-            unseen=jnp.where(sample.seen, 0.0, 1.0),
-            changes=state.changes + jnp.where(found, 1.0, 0.0),
-            restarts=state.restarts,
-        )
-        return self._sound(new, state)
+        sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
+        model = self._filter_model(sample, each)
+        belief, free = self._predicted(state, model, sample)
+        belief, correction = kalman.correct(belief, sample, model)
+        judged = self._judged(state, model, sample, belief, correction)
+        return self._sound(self._merged(state, belief, free, judged, sample, history), state)
 
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
         """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation."""
         scales, d = jnp.asarray(self.scales, state.x.dtype), len(state.x)
         covariance = state.covariance[d:, d:]
         if state.mixture is not None:
-            joint, tuning = self._joint(state), self.tuning
-            covariance = hypothesis_bank.covariance(state.mixture, self._bank(), joint, tuning.least)
+            joint, tuning = state.joint, self.tuning
+            covariance = multiple_model.covariance(state.mixture, self._models(), joint, tuning.least)
         return scales * state.trusted, scales[:, None] * covariance * scales
 
     def model(self, state: OnlineState) -> AbstractVectorField:
@@ -226,9 +197,9 @@ class OnlineAdaptation(AbstractEstimator):
         if state.mixture is not None:
             test = state.mixture.test
         return Flags(
-            missing=state.unseen > 0,
-            frozen=state.equal >= tuning.frozen,
-            gap=state.silent > tuning.gap,
+            missing=state.history.unseen > 0,
+            frozen=state.history.equal >= tuning.frozen,
+            gap=state.history.silent > tuning.gap,
             changed=test.quiet < 1,
             inconsistent=state.nis >= tuning.reject,
             unexcited=variance > UNEXCITED * free,
@@ -251,47 +222,82 @@ class OnlineAdaptation(AbstractEstimator):
 
         return rates
 
-    def _joint(self, state: OnlineState) -> Belief:
-        return Belief(jnp.concatenate([state.x, state.theta]), state.covariance)
-
-    def _plant(self, sample: Sample, each: Each) -> Plant:
+    def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
         x = sample.x
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
-        return Plant(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning, each)
+        return FilterModel(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning, each)
 
-    def _predicted(self, state: OnlineState, plant: Plant, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
+    def _predicted(self, state: OnlineState, model: FilterModel, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
         """The filter of all parameters before the sample, and the variances without data."""
         tuning, ones = self.tuning, jnp.ones_like(state.theta)
         pulled = jnp.max(state.test.squares, axis=0)
         varies = np.array([name.startswith(DISTURBANCE) for name in self.names])
-        all_vary = bool(self.causes) or not varies.any()
+        all_vary = bool(self.hypotheses) or not varies.any()
         forgotten = np.where(varies | all_vary, tuning.forgetting, 0.0)
         faster = 1 + jnp.asarray(forgotten, ones.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
-        walked = self.dt * sample.elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
-        belief = kalman.predict(self._joint(state), plant, plant.field, None, walked, sample.acted)
-        return kalman.capped(belief, ones), jnp.minimum(state.free + walked, 1.0)
+        diffusion = self.dt * sample.elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
+        belief = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
+        belief, free = kalman.limit_covariance(belief, ones), jnp.minimum(state.free + diffusion, 1.0)
+        return kalman.reset_state(belief, sample, sample.restart, model.variances), free
+
+    def _judged(
+        self, state: OnlineState, model: FilterModel, sample: Sample, belief: Belief, correction: Correction
+    ) -> Judged:
+        """The test of the filter of all parameters, whether that filter opens to its prior, and what is believed."""
+        tuning, (white, gains, _) = self.tuning, correction
+        test, opens = change_test.after_sample(state.test, white, gains, sample, self.dt, tuning, tuning.pause)
+        if state.mixture is None:
+            return test, opens, Verdict(None, belief.z[len(state.x) :], jnp.square(white), opens, opens)
+        verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction)
+        unexplained = verdict.unexplained & (test.quiet > tuning.hold)
+        return change_test.reset(test, unexplained, 0.0), opens | unexplained, verdict
+
+    def _merged(
+        self, state: OnlineState, belief: Belief, free: Array, judged: Judged, sample: Sample, history: SampleHistory
+    ) -> OnlineState:
+        """The next state: opened to the prior after a change, and believed if it is consistent."""
+        test, opens, verdict = judged
+        # The state, too, has followed the wrong model since the change.
+        belief = kalman.reset_state(belief, sample, opens, self._variances(state.x))
+        d, ones = len(state.x), jnp.ones_like(state.theta)
+        opened = jnp.concatenate([jnp.zeros(d, state.x.dtype), jnp.where(opens, ones, 0.0)])
+        nis = self._mean_square(state.nis, verdict.squares, sample)
+        return OnlineState(
+            x=belief.z[:d],
+            theta=belief.z[d:],
+            covariance=belief.covariance + jnp.diag(opened),
+            free=jnp.where(opens, ones, free),
+            test=test,
+            mixture=verdict.mixture,
+            trusted=jnp.where(nis < self.tuning.reject, verdict.theta, state.trusted),
+            nis=nis,
+            history=history,
+            changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
+            restarts=state.restarts,
+        )
 
     def _mean_square(self, nis, squares, sample: Sample):
         """The mean NIS with another sample."""
         share = jnp.sum(squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
         return nis + jnp.where(sample.measured, -jnp.expm1(-self.dt / self.tuning.window), 0.0) * (share - nis)
 
-    def _bank(self) -> Bank:
-        return bank_of(self.causes, len(self.names), self.dt)
+    def _models(self) -> ModelSet:
+        return model_set(self.hypotheses, len(self.names), self.dt)
 
     def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
         """The new state, or a beginning at the last good θ if a number of it is not finite."""
         parts = [new.covariance, new.x, new.theta, new.nis]
         if new.mixture is not None:
-            parts += [new.mixture.z, new.mixture.covariance, new.mixture.odds]
+            parts += [new.mixture.z, new.mixture.covariance, new.mixture.log_weights]
         total = sum(jnp.sum(jnp.abs(part)) for part in parts)
         sound = (total < HUGE) & (jnp.min(kalman.diagonal(new.covariance)) > 0)
-        x, ones = jnp.where(jnp.abs(new.last) < HUGE, new.last, 0.0), jnp.ones_like(old.theta)
+        x, ones = jnp.where(jnp.abs(new.history.last) < HUGE, new.history.last, 0.0), jnp.ones_like(old.theta)
         covariance = jnp.diag(jnp.concatenate([self._variances(x), ones]))
         values = old.trusted, old.trusted, covariance, ones, old.changes, old.restarts + 1
         again = eqx.tree_at(
             lambda s: (s.theta, s.trusted, s.covariance, s.free, s.changes, s.restarts), self.begin(x), values
         )
         if (mixture := again.mixture) is not None:
-            again = eqx.tree_at(lambda s: s.mixture.odds, again, mixture.odds[::-1])  # it is for all parameters now
+            # It is for all parameters now.
+            again = eqx.tree_at(lambda s: s.mixture.log_weights, again, mixture.log_weights[::-1])
         return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, again)

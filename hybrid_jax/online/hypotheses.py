@@ -1,4 +1,4 @@
-"""Causes: the few parameters that change together, as named by a user and as the filters of `causes_bank` have them."""
+"""Hypotheses on a change: its few parameters, as a user names them and as the filters of `multiple_model` have them."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -11,15 +11,15 @@ from hybrid_jax import checks
 
 
 @dataclass(frozen=True)
-class Cause:
+class Hypothesis:
     """A few parameters that may change together, such as those of a load.
 
-        Cause("inertia", {"Ix": 0.3, "Iy": 0.3})
-        Cause("mass", together=({"efficiency": -0.2, "Ix": -0.2, "Iy": -0.2},))
-        Cause("wind", {"disturbance[vx]": 3.0, "disturbance[vy]": 3.0}, rates={"disturbance[vx]": 1.5}, lead=0.1)
+        Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3})
+        Hypothesis("mass", together=({"efficiency": -0.2, "Ix": -0.2, "Iy": -0.2},))
+        Hypothesis("wind", {"disturbance[vx]": 3.0, "disturbance[vy]": 3.0}, rates={"disturbance[vx]": 1.5}, lead=0.1)
 
     Attributes:
-        name: of the cause, in messages.
+        name: of the hypothesis, in messages.
         parameters: standard deviation of the change of each, independent of the others, in the physics' own
             parametrisation; by name, of one entry, efficiency[0], or of all of an array, efficiency.
         together: each a number of standard deviation one, times which several parameters change, such as a mass.
@@ -39,60 +39,79 @@ class Cause:
 
     def __post_init__(self):
         if not self.parameters and not self.together:
-            raise ValueError(f"cause {self.name}: it must have a parameter")
+            raise ValueError(f"hypothesis {self.name}: it must have a parameter")
         for name, size in (*self.parameters.items(), *self.rates.items()):
-            checks.positive(f"cause {self.name}: {name}", size)
+            checks.positive(f"hypothesis {self.name}: {name}", size)
         if unknown := sorted(self.rates.keys() - self.parameters.keys()):
-            raise ValueError(f"cause {self.name}: rates of {', '.join(unknown)}, which are not among its parameters")
-        checks.not_negative(f"cause {self.name}: lead", self.lead)
+            raise ValueError(
+                f"hypothesis {self.name}: rates of {', '.join(unknown)}, which are not among its parameters"
+            )
+        checks.not_negative(f"hypothesis {self.name}: lead", self.lead)
 
 
 @dataclass(frozen=True)
-class Directions:
-    """A cause in the order of θ, of p parameters in their prior standard deviations: numbers a of which θ = S a."""
+class Subspace:
+    """A hypothesis in the order of θ, of p parameters in their prior standard deviations: numbers a of which θ = S a.
+
+    Attributes:
+        name: of the hypothesis.
+        effects: the k rows of Sᵀ.
+        own: of each parameter, whether a number moves it alone.
+        rates: of each number, the deviation of its rate over its own [1/s]; 0 for none.
+        lead: how far ahead the delivered model is [s].
+    """
 
     name: str
-    effects: tuple[tuple[float, ...], ...]  # k rows, of Sᵀ
-    own: tuple[bool, ...]  # whether it has a number for a parameter alone
-    rates: tuple[float, ...]  # of each number, the deviation of its rate over its own; 0 for none
+    effects: tuple[tuple[float, ...], ...]
+    own: tuple[bool, ...]
+    rates: tuple[float, ...]
     lead: float
 
 
-class Bank(NamedTuple):
-    """h hypotheses of as many numbers each: the parameters are the field's own, then the causes."""
+class ModelSet(NamedTuple):
+    """h hypotheses of as many numbers each: the parameters are the field's own, then those of the user.
 
-    effects: Float[np.ndarray, "h p k"]  # S
-    ahead: Float[np.ndarray, "h p k"]  # S of the delivered model, which knows rates
-    turned: Float[np.ndarray, "h k k"]  # the numbers of the next period by those of this
-    prior: Float[np.ndarray, "h k"]  # variances after a change; 0 for numbers that only fill up
-    walked: Float[np.ndarray, "h k"]  # variance per second of rates
-    untold: Float[np.ndarray, "h p"]  # 1 for parameters that have no number of their own, else 0
+    Attributes:
+        effects: S.
+        ahead: S of the delivered model, which knows rates.
+        transition: the numbers of the next period by those of this.
+        prior: variances after a change; 0 for numbers that only fill up.
+        diffusion: variance of rates [1/s].
+        outside: 1 for parameters that have no number of their own, else 0.
+    """
+
+    effects: Float[np.ndarray, "h p k"]
+    ahead: Float[np.ndarray, "h p k"]
+    transition: Float[np.ndarray, "h k k"]
+    prior: Float[np.ndarray, "h k"]
+    diffusion: Float[np.ndarray, "h k"]
+    outside: Float[np.ndarray, "h p"]
 
 
-def directions(cause: Cause, names: tuple[str, ...], scales: tuple[float, ...]) -> Directions:
-    """The cause among parameters of these names and prior standard deviations.
+def subspace_of(hypothesis: Hypothesis, names: tuple[str, ...], scales: tuple[float, ...]) -> Subspace:
+    """The hypothesis among parameters of these names and prior standard deviations.
 
     Raises:
         ValueError: a name that is unknown, or of a parameter that is held, with a prior of zero.
     """
     names, rows, rates = tuple(name if scale else "" for name, scale in zip(names, scales, strict=True)), [], []
-    for name, size in cause.parameters.items():
-        for i in _places(cause, name, names):
+    for name, size in hypothesis.parameters.items():
+        for i in _places(hypothesis, name, names):
             rows.append(_row({i: size}, scales))
-            rates.append(cause.rates.get(name, 0.0) / size)
+            rates.append(hypothesis.rates.get(name, 0.0) / size)
     own = np.any(rows, axis=0) if rows else np.zeros(len(names), bool)
-    for mapping in cause.together:
-        sizes = {i: size for name, size in mapping.items() for i in _places(cause, name, names)}
+    for mapping in hypothesis.together:
+        sizes = {i: size for name, size in mapping.items() for i in _places(hypothesis, name, names)}
         rows.append(_row(sizes, scales))
         rates.append(0.0)
-    return Directions(cause.name, tuple(rows), tuple(own.tolist()), tuple(rates), cause.lead)
+    return Subspace(hypothesis.name, tuple(rows), tuple(own.tolist()), tuple(rates), hypothesis.lead)
 
 
-def _places(cause: Cause, name: str, names: tuple[str, ...]) -> list[int]:
+def _places(hypothesis: Hypothesis, name: str, names: tuple[str, ...]) -> list[int]:
     """Where a parameter, or the entries of an array, stand in θ."""
     found = [i for i, each in enumerate(names) if name in (each, each.partition("[")[0])]
     if not found:
-        raise ValueError(f"cause {cause.name}: {name} must be among {', '.join(filter(None, names))}")
+        raise ValueError(f"hypothesis {hypothesis.name}: {name} must be among {', '.join(filter(None, names))}")
     return found
 
 
@@ -100,20 +119,20 @@ def _row(sizes: Mapping[int, float], scales: tuple[float, ...]) -> tuple[float, 
     return tuple(sizes.get(i, 0.0) / (scale or 1.0) for i, scale in enumerate(scales))
 
 
-def bank_of(causes: tuple[Directions, ...], p: int, dt: float) -> Bank:
+def model_set(hypotheses: tuple[Subspace, ...], p: int, dt: float) -> ModelSet:
     """Arrays of all hypotheses, filled up with numbers that move nothing."""
-    sizes = [len(cause.effects) + int(np.count_nonzero(cause.rates)) for cause in causes]
-    h, k = len(causes) + 1, max(sizes)
-    effects, prior, walked = np.zeros((h, p, k)), np.zeros((h, k)), np.zeros((h, k))
-    ahead, turned = np.zeros((h, p, k)), np.tile(np.eye(k), (h, 1, 1))
-    for i, cause in enumerate(causes, 1):
-        own = len(cause.effects)
-        effects[i, :, :own] = ahead[i, :, :own] = np.transpose(cause.effects)
+    sizes = [len(hypothesis.effects) + int(np.count_nonzero(hypothesis.rates)) for hypothesis in hypotheses]
+    h, k = len(hypotheses) + 1, max(sizes)
+    effects, prior, diffusion = np.zeros((h, p, k)), np.zeros((h, k)), np.zeros((h, k))
+    ahead, transition = np.zeros((h, p, k)), np.tile(np.eye(k), (h, 1, 1))
+    for i, hypothesis in enumerate(hypotheses, 1):
+        own = len(hypothesis.effects)
+        effects[i, :, :own] = ahead[i, :, :own] = np.transpose(hypothesis.effects)
         prior[i, :own] = 1
-        for j, number in enumerate(np.flatnonzero(cause.rates), own):
-            rate = cause.rates[number]  # the number at j is in units of it
-            turned[i, number, j] = dt * rate
-            ahead[i, :, j] = cause.lead * rate * effects[i, :, number]
-            prior[i, j], walked[i, j] = 1, 2
-    untold = np.array([np.ones(p), *(~np.array(cause.own) for cause in causes)], float)
-    return Bank(effects, ahead, turned, prior, walked, untold)
+        for j, number in enumerate(np.flatnonzero(hypothesis.rates), own):
+            rate = hypothesis.rates[number]  # the number at j is in units of it
+            transition[i, number, j] = dt * rate
+            ahead[i, :, j] = hypothesis.lead * rate * effects[i, :, number]
+            prior[i, j], diffusion[i, j] = 1, 2
+    outside = np.array([np.ones(p), *(~np.array(hypothesis.own) for hypothesis in hypotheses)], float)
+    return ModelSet(effects, ahead, transition, prior, diffusion, outside)

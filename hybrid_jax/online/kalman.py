@@ -26,16 +26,26 @@ class Belief(NamedTuple):
     covariance: Float[Array, "n n"]
 
 
-class Plant(NamedTuple):
-    """What all filters have in common in a period."""
+class FilterModel(NamedTuple):
+    """What all filters have in common in a period.
+
+    Attributes:
+        field: ẋ as a function of x and θ, under the input of the period.
+        unit: makes of x one with a unit quaternion.
+        variances: of a sample.
+        process_noise: variance that a period adds to x.
+        dt: length of a period [s].
+        tuning: of the filters.
+        each: turns a function of one filter into one of arrays of several.
+    """
 
     field: Field
-    unit: Callable[[Array], Array]  # x with a unit quaternion
-    variances: Float[Array, " d"]  # of a sample
-    added: Float[Array, " d"]  # variance that a period adds to x
+    unit: Callable[[Array], Array]
+    variances: Float[Array, " d"]
+    process_noise: Float[Array, " d"]
     dt: float
     tuning: Tuning
-    each: Each  # does the same for several filters
+    each: Each
 
     def tidy(self, belief: Belief) -> Belief:
         """With a unit quaternion, and a within its bounds."""
@@ -44,67 +54,77 @@ class Plant(NamedTuple):
 
 
 class Correction(NamedTuple):
-    """What a sample did."""
+    """What a sample did.
 
-    white: Float[Array, " d"]  # innovations over their standard deviations
-    gains: Float[Array, "d k"]  # of the numbers a by these
-    likelihood: Float[Array, ""]  # logarithm, but for a constant
+    Attributes:
+        white: innovations over their standard deviations.
+        gains: of the numbers a by these.
+        log_likelihood: of the sample, but for a constant.
+    """
+
+    white: Float[Array, " d"]
+    gains: Float[Array, "d k"]
+    log_likelihood: Float[Array, ""]
 
 
-def slope_of(plant: Plant, field: Field, x: Float[Array, " d"], a: Float[Array, " k"]) -> tuple[Array, Array]:
+def step_with_jacobian(
+    model: FilterModel, field: Field, x: Float[Array, " d"], a: Float[Array, " k"]
+) -> tuple[Array, Array]:
     """The next x by RK4, and its Jacobian in x and a, which one Jacobian of ẋ midway gives up to O(dt³)."""
-    moved = plant.unit(rk4_step(field, x, a, plant.dt))
+    moved = model.unit(rk4_step(field, x, a, model.dt))
     push = jax.linearize(field, (x + moved) / 2, a)[1]
     d, eye = len(x), jnp.eye(len(x) + len(a), dtype=x.dtype)
     rates = jax.vmap(push, out_axes=1)(eye[:, :d], eye[:, d:])
-    slope = eye[:d] + plant.dt * (rates + plant.dt / 2 * rates[:, :d] @ rates)
-    return moved, jax.vmap(jax.linearize(plant.unit, moved)[1], 1, 1)(slope)
+    slope = eye[:d] + model.dt * (rates + model.dt / 2 * rates[:, :d] @ rates)
+    return moved, jax.vmap(jax.linearize(model.unit, moved)[1], 1, 1)(slope)
 
 
 def predict(
     belief: Belief,
-    plant: Plant,
+    model: FilterModel,
     field: Field,
-    turned: Float[Array, "k k"] | None,
-    walked: Float[Array, " k"],
+    transition: Float[Array, "k k"] | None,
+    diffusion: Float[Array, " k"],
     acted: Bool[Array, ""],
 ) -> Belief:
     """One period later, if a known input acted in it.
 
     Args:
         field: ẋ as a function of x and a.
-        turned: the next a as a matrix times a; None if it stays.
-        walked: variance that the period adds to a.
+        transition: the next a as a matrix times a; None if it stays.
+        diffusion: variance that the period adds to a.
     """
     z, covariance = belief
-    d = len(plant.variances)
-    moved, slope = slope_of(plant, field, z[:d], z[d:])
+    d = len(model.variances)
+    moved, slope = step_with_jacobian(model, field, z[:d], z[d:])
     top, own = slope @ covariance, covariance[d:, d:]
     inner, beside, a = top @ slope.T, top[:, d:], z[d:]
     by_a = slope[:, d:]
     # Products of errors of a and of x, which a linear filter leaves out, move the state while a is uncertain.
-    noise = plant.added + plant.tuning.caution**2 * jnp.sum((by_a @ own) * by_a, axis=1)
-    if turned is not None:
-        beside, own, a = beside @ turned.T, turned @ own @ turned.T, turned @ a
+    noise = model.process_noise + model.tuning.caution**2 * jnp.sum((by_a @ own) * by_a, axis=1)
+    if transition is not None:
+        beside, own, a = beside @ transition.T, transition @ own @ transition.T, transition @ a
     later = jnp.block([[inner, beside], [beside.T, own]])
-    later = jnp.where(acted, (later + later.T) / 2, covariance) + jnp.diag(jnp.concatenate([noise, walked]))
+    later = jnp.where(acted, (later + later.T) / 2, covariance) + jnp.diag(jnp.concatenate([noise, diffusion]))
     return Belief(jnp.where(acted, jnp.concatenate([moved, a]), z), later)
 
 
-def restarted(belief: Belief, sample: Sample, anew: Bool[Array, ""] | bool, variances: Float[Array, " d"]) -> Belief:
-    """With x as the sample has it, if `anew`; a stays."""
+def reset_state(
+    belief: Belief, sample: Sample, restart: Bool[Array, ""] | bool, variances: Float[Array, " d"]
+) -> Belief:
+    """With x as the sample has it, if `restart`; a stays."""
     z, covariance = belief
     d, k = len(variances), len(z) - len(variances)
-    kept = jnp.concatenate([jnp.full(d, jnp.where(anew, 0.0, 1.0), z.dtype), jnp.ones(k, z.dtype)])
+    kept = jnp.concatenate([jnp.full(d, jnp.where(restart, 0.0, 1.0), z.dtype), jnp.ones(k, z.dtype)])
     variance = jnp.where(sample.seen, variances, 1e4 * variances)
-    added = jnp.concatenate([jnp.where(anew, variance, 0.0), jnp.zeros(k, z.dtype)])
-    z = jnp.concatenate([jnp.where(anew & sample.seen, sample.x, z[:d]), z[d:]])
+    added = jnp.concatenate([jnp.where(restart, variance, 0.0), jnp.zeros(k, z.dtype)])
+    z = jnp.concatenate([jnp.where(restart & sample.seen, sample.x, z[:d]), z[d:]])
     return Belief(z, kept[:, None] * covariance * kept + jnp.diag(added))
 
 
-def correct(belief: Belief, sample: Sample, plant: Plant) -> tuple[Belief, Correction]:
+def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief, Correction]:
     """With one measured number after the other; innovations are cut off at some standard deviations."""
-    (z, covariance), variances, clip = belief, plant.variances, plant.tuning.clip
+    (z, covariance), variances, clip = belief, model.variances, model.tuning.clip
     d = len(variances)
     white, gains, likelihood = [], [], jnp.zeros((), z.dtype)
     for i in range(d):
@@ -117,10 +137,10 @@ def correct(belief: Belief, sample: Sample, plant: Plant) -> tuple[Belief, Corre
         likelihood = likelihood - jnp.where(used, jnp.square(error) + jnp.log(variance), 0.0) / 2
         white.append(error)
         gains.append(gain[d:])
-    return plant.tidy(Belief(z, covariance)), Correction(jnp.stack(white), jnp.stack(gains), likelihood)
+    return model.tidy(Belief(z, covariance)), Correction(jnp.stack(white), jnp.stack(gains), likelihood)
 
 
-def capped(belief: Belief, prior: Float[Array, " k"]) -> Belief:
+def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:
     """No number a becomes less certain than the prior, also if nothing excites it for long."""
     z, covariance = belief
     variance = diagonal(covariance)[len(z) - len(prior) :]

@@ -11,19 +11,28 @@ HUGE = 1e15  # a number beyond it, or NaN, was not measured
 
 
 class Sample(NamedTuple):
-    """What was measured at the end of a period, and what acted in it."""
+    """What was measured at the end of a period, and what acted in it.
+
+    Attributes:
+        x: the sample.
+        u: the input; zero where it is unknown.
+        seen: what was measured.
+        acted: whether one period has passed, with a known input.
+        restart: whether the state is taken from the sample.
+        elapsed: periods since the last sample.
+    """
 
     x: Float[Array, " d"]
-    u: Float[Array, " m"]  # zero where it is unknown
-    seen: Bool[Array, " d"]  # measured
-    acted: Bool[Array, ""]  # one period has passed, with a known input
-    anew: Bool[Array, ""]  # the state is taken from the sample
-    elapsed: Float[Array, ""]  # periods
+    u: Float[Array, " m"]
+    seen: Bool[Array, " d"]
+    acted: Bool[Array, ""]
+    restart: Bool[Array, ""]
+    elapsed: Float[Array, ""]
 
     @property
     def used(self) -> Bool[Array, " d"]:
         """What corrects the estimate."""
-        return self.seen & ~self.anew
+        return self.seen & ~self.restart
 
     @property
     def measured(self) -> Bool[Array, ""]:
@@ -31,26 +40,36 @@ class Sample(NamedTuple):
         return jnp.sum(jnp.where(self.used, 1.0, 0.0)) > 0
 
 
-class Heard(NamedTuple):
-    """What samples were like until now."""
+class SampleHistory(NamedTuple):
+    """What samples were like until now.
 
-    last: Float[Array, " d"]  # the last sample
-    equal: Float[Array, " d"]  # how many in a row were equal
-    silent: Float[Array, ""]  # time since something was measured [s]
+    Attributes:
+        last: the last sample; of a number that was not measured, the last that was.
+        equal: how many samples in a row were equal.
+        silent: time since something was measured [s].
+        unseen: 1 where the last sample was not used, else 0.
+    """
+
+    last: Float[Array, "*n d"]
+    equal: Float[Array, "*n d"]
+    silent: Float[Array, "*n"]
+    unseen: Float[Array, "*n d"]
 
 
-def sampled(x, u, elapsed, heard: Heard, dt: float, gap: float) -> tuple[Sample, Heard]:
-    """The sample x after some periods of dt [s], and what they were like; after a gap [s] it begins anew."""
-    equal = jnp.where(x == heard.last, heard.equal + 1, 0.0)
+def classify(x, u, elapsed, history: SampleHistory, dt: float, gap: float) -> tuple[Sample, SampleHistory]:
+    """The sample x after some periods of dt [s], and what they were like; after a gap [s] it begins restart."""
+    equal = jnp.where(x == history.last, history.equal + 1, 0.0)
     seen = (jnp.abs(x) < HUGE) & (equal == 0)
     # Sums in place of `all` and `any`, which the export to C does not know.
     acted = (jnp.sum(jnp.where(jnp.abs(u) < HUGE, 0.0, 1.0)) == 0) & (elapsed < 1.5)
     any_seen = jnp.sum(jnp.where(seen, 1.0, 0.0)) > 0
-    waited = heard.silent + dt * (elapsed - 1)
+    waited = history.silent + dt * (elapsed - 1)
     silent = jnp.where(any_seen, dt * (elapsed - 1), waited + dt)
-    anew = any_seen & (~acted | (waited > gap))
+    restart = any_seen & (~acted | (waited > gap))
     held = jnp.where(jnp.abs(u) < HUGE, u, 0.0)
-    return Sample(x, held, seen, acted, anew, jnp.asarray(elapsed, x.dtype)), Heard(x, equal, silent)
+    last, unseen = jnp.where(jnp.abs(x) < HUGE, x, history.last), jnp.where(seen, 0.0, 1.0)
+    sample = Sample(x, held, seen, acted, restart, jnp.asarray(elapsed, x.dtype))
+    return sample, SampleHistory(last, equal, silent, unseen)
 
 
 def nearer(x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:

@@ -14,41 +14,69 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.online.change_test import ChangeTest
-from hybrid_jax.online.hypothesis_bank import Mixture
+from hybrid_jax.online.kalman import Belief
+from hybrid_jax.online.multiple_model import Mixture
+from hybrid_jax.online.samples import SampleHistory
 
 DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
 
 
 class OnlineState(eqx.Module):
-    """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold."""
+    """State of an `OnlineAdaptation` of d states and p parameters; all of it numbers, which a C program can hold.
 
-    x: Float[Array, "*n d"]  # estimated state
-    theta: Float[Array, "*n p"]  # change of θ in prior standard deviations, as the filter of all parameters has it
-    covariance: Float[Array, "*n d+p d+p"]  # of both, in these units
-    free: Float[Array, "*n p"]  # variances that θ would have, had nothing been measured since the last alarm
-    test: ChangeTest  # of the filter of x and θ
-    mixture: Mixture | None  # of the causes, if there are
-    trusted: Float[Array, "*n p"]  # the last θ that was consistent, which the model has
-    nis: Float[Array, "*n"]  # mean normalised innovation squared, 1 if noise and model are as stated
-    silent: Float[Array, "*n"]  # time since something was measured [s]
-    last: Float[Array, "*n d"]  # the last sample
-    equal: Float[Array, "*n d"]  # how many samples in a row were equal
-    unseen: Float[Array, "*n d"]  # 1 where the last sample was not used
-    changes: Float[Array, "*n"]  # how many alarms there were
-    restarts: Float[Array, "*n"]  # how often the filter had to begin anew, since a number was not finite
+    Attributes:
+        x: estimated state.
+        theta: change of θ in prior standard deviations, as the filter of all parameters has it.
+        covariance: of both, in these units.
+        free: variances that θ would have, had nothing been measured since the last alarm.
+        test: the change test of the filter of all parameters.
+        mixture: the filters of the hypotheses and their weights; None without hypotheses.
+        trusted: the last θ that was consistent, which the model has.
+        nis: mean normalised innovation squared, 1 if noise and model are as stated.
+        history: what samples were like until now.
+        changes: how many alarms there were.
+        restarts: how often the filter had to begin anew, since a number was not finite.
+    """
+
+    x: Float[Array, "*n d"]
+    theta: Float[Array, "*n p"]
+    covariance: Float[Array, "*n d+p d+p"]
+    free: Float[Array, "*n p"]
+    test: ChangeTest
+    mixture: Mixture | None
+    trusted: Float[Array, "*n p"]
+    nis: Float[Array, "*n"]
+    history: SampleHistory
+    changes: Float[Array, "*n"]
+    restarts: Float[Array, "*n"]
+
+    @property
+    def joint(self) -> Belief:
+        """z = [x, θ] of the filter of all parameters."""
+        return Belief(jnp.concatenate([self.x, self.theta]), self.covariance)
 
 
 class Flags(NamedTuple):
-    """What is wrong, or was found."""
+    """What is wrong, or was found.
 
-    missing: Bool[Array, " d"]  # not measured in the last sample: NaN, or equal to the one before
-    frozen: Bool[Array, " d"]  # sensors that repeat their last value
-    gap: Bool[Array, ""]  # nothing was measured for longer than `Tuning.gap`
-    changed: Bool[Array, ""]  # an alarm in the last second
-    inconsistent: Bool[Array, ""]  # errors are too large for the model at any θ: the last good estimate is used
-    unexcited: Bool[Array, " p"]  # parameters on which the data say nothing
-    at_bound: Bool[Array, " p"]  # parameters at the end of their range
+    Attributes:
+        missing: of each state, not measured in the last sample: NaN, or equal to the one before.
+        frozen: of each state, a sensor that repeats its last value.
+        gap: nothing was measured for longer than `Tuning.gap`.
+        changed: an alarm in the last second.
+        inconsistent: errors are too large for the model at any θ: the last good estimate is used.
+        unexcited: parameters on which the data say nothing.
+        at_bound: parameters at the end of their range.
+    """
+
+    missing: Bool[Array, " d"]
+    frozen: Bool[Array, " d"]
+    gap: Bool[Array, ""]
+    changed: Bool[Array, ""]
+    inconsistent: Bool[Array, ""]
+    unexcited: Bool[Array, " p"]
+    at_bound: Bool[Array, " p"]
 
 
 def named_priors(

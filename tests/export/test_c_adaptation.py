@@ -23,11 +23,11 @@ pytestmark = needs_compiler
 DT = 0.01
 # θ, the last good θ and the sums of corrections are in standard deviations of the prior. An innovation is a difference
 # of two nearly equal numbers: a last digit of 2 m is 1e-4 of a noise of 1 mm, so θ near zero has few right digits.
-UNITS = {"theta": 1.0, "trusted": 1.0, "pull": 1.0, "nis": 1.0, "z": 1.0, "odds": 25.0}
-CAUSES = (
-    hj.Cause("inertia", {"Ix": 0.3, "Iy": 0.3}),
-    hj.Cause("thrust", {"k": 0.3}),
-    hj.Cause("wind", {"disturbance[vx]": 2.0}, rates={"disturbance[vx]": 1.0}, lead=0.1),
+UNITS = {"theta": 1.0, "trusted": 1.0, "pull": 1.0, "nis": 1.0, "z": 1.0, "log_weights": 25.0}
+HYPOTHESES = (
+    hj.Hypothesis("inertia", {"Ix": 0.3, "Iy": 0.3}),
+    hj.Hypothesis("thrust", {"k": 0.3}),
+    hj.Hypothesis("wind", {"disturbance[vx]": 2.0}, rates={"disturbance[vx]": 1.0}, lead=0.1),
 )
 
 
@@ -49,15 +49,15 @@ def flight(steps=36):
 
 
 @cache
-def in_double(causes):
+def in_double(hypotheses):
     """The filter in double precision, and one program of its update for both precisions of C."""
-    exact = double(filter_with(causes))
+    exact = double(filter_with(hypotheses))
     return exact, jax.jit(lambda *given: exact.update(*given))
 
 
-def filter_with(causes):
-    causes = CAUSES if causes else ()
-    return OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, process=1e-2, causes=causes)
+def filter_with(hypotheses):
+    hypotheses = HYPOTHESES if hypotheses else ()
+    return OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, process=1e-2, hypotheses=hypotheses)
 
 
 def compiled(folder, adaptation, precise, size):
@@ -89,12 +89,12 @@ def error(found, expected):
     return max(off.values())
 
 
-@pytest.mark.parametrize("causes", [False, True], ids=["alone", "causes"])
+@pytest.mark.parametrize("hypotheses", [False, True], ids=["alone", "hypotheses"])
 @pytest.mark.parametrize(("precise", "allowed"), [(True, 1e-12), (False, 1e-5)])
-def test_c_is_the_filter(precise, allowed, causes, tmp_path):
-    adaptation, ((first, *_), *samples) = filter_with(causes), flight()
+def test_c_is_the_filter(precise, allowed, hypotheses, tmp_path):
+    adaptation, ((first, *_), *samples) = filter_with(hypotheses), flight()
     with jax.enable_x64(True):
-        exact, update_of_jax = in_double(causes)
+        exact, update_of_jax = in_double(hypotheses)
         state = exact.begin(jnp.asarray(first, float))
         flat, unravel = ravel_pytree(state)
         begin, update = compiled(tmp_path, adaptation, precise, flat.size)
@@ -113,14 +113,14 @@ def test_c_is_the_filter(precise, allowed, causes, tmp_path):
 
 
 def test_c_hardly_grows_with_causes(tmp_path):
-    """One function for all hypotheses: three more causes add a few numbers, not their filters."""
-    more = tuple(hj.Cause(name, {name: 0.3}) for name in ("Ix", "Iy", "disturbance[wz]"))
+    """One function for all hypotheses: three more hypotheses add a few numbers, not their filters."""
+    more = tuple(hj.Hypothesis(name, {name: 0.3}) for name in ("Ix", "Iy", "disturbance[wz]"))
 
-    def size(name, causes):
-        adaptation = OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, causes=causes)
+    def size(name, hypotheses):
+        adaptation = OnlineAdaptation(hj.rigid_body(hj.IRIS), DT, 1e-3, disturbance=2.0, hypotheses=hypotheses)
         return export_adaptation_c(tmp_path, adaptation, name=name)[1].stat().st_size
 
-    assert size("six", CAUSES + more) < 1.2 * size("three", CAUSES)
+    assert size("six", HYPOTHESES + more) < 1.2 * size("three", HYPOTHESES)
 
 
 def test_names_of_a_model_cannot_leave_their_comment():

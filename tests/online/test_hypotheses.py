@@ -1,4 +1,4 @@
-"""Laws of the causes of a change: which one is found, what stays as it was, and what lies outside them."""
+"""Laws of the hypotheses of a change: which one is found, what stays as it was, and what lies outside them."""
 
 from functools import cache
 
@@ -28,11 +28,11 @@ class Cart(hj.AbstractVectorField):
 
 
 TRUTH = {"stiffness": 1.0, "friction": 0.5, "gain": 1.0, "push": 0.0}
-CAUSES = (
-    hj.Cause("spring", {"stiffness": 0.5}),
-    hj.Cause("damper", {"friction": 0.5}),
-    hj.Cause("load", together=({"stiffness": -0.3, "friction": -0.15, "gain": -0.3},)),
-    hj.Cause("wind", {"push": 1.0}, rates={"push": 0.5}, lead=0.2),
+HYPOTHESES = (
+    hj.Hypothesis("spring", {"stiffness": 0.5}),
+    hj.Hypothesis("damper", {"friction": 0.5}),
+    hj.Hypothesis("load", together=({"stiffness": -0.3, "friction": -0.15, "gain": -0.3},)),
+    hj.Hypothesis("wind", {"push": 1.0}, rates={"push": 0.5}, lead=0.2),
 )
 
 
@@ -41,8 +41,8 @@ def cart(**changes):
 
 
 @cache
-def adaptation(causes=True):
-    return OnlineAdaptation(cart(), DT, NOISE, prior=0.5, process=0.01, causes=CAUSES if causes else ())
+def adaptation(hypotheses=True):
+    return OnlineAdaptation(cart(), DT, NOISE, prior=0.5, process=0.01, hypotheses=HYPOTHESES if hypotheses else ())
 
 
 @jax.jit
@@ -63,9 +63,9 @@ def flown(after, key, rate=0.0):
 
 
 @cache
-def watch(causes):
+def watch(hypotheses):
     """One program for the runs of all tests."""
-    filter = adaptation(causes)
+    filter = adaptation(hypotheses)
 
     def run(samples, inputs):
         def step(state, given):
@@ -77,9 +77,9 @@ def watch(causes):
     return jax.jit(run)
 
 
-def watched(causes, after, seeds=6, rate=0.0):
+def watched(hypotheses, after, seeds=6, rate=0.0):
     """The last state of the filter of each run, and the θ of its model after each sample."""
-    runs = [watch(causes)(*flown(after, key, rate)) for key in jax.random.split(jax.random.key(3), seeds)]
+    runs = [watch(hypotheses)(*flown(after, key, rate)) for key in jax.random.split(jax.random.key(3), seeds)]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *runs)
 
 
@@ -106,8 +106,8 @@ def test_until_a_change_the_model_stays_exactly_as_it_was():
 def test_a_cause_is_found_and_told_better_than_by_all_parameters(name, after):
     found, theta = watched(True, cart(**after))
     assert (found.changes > 0).all()
-    place = 2 + [cause.name for cause in CAUSES].index(name)
-    kind = found.mixture.before + np.where(found.mixture.odds[:, 1:-1] == 0, 1.0, 0.0)
+    place = 2 + [hypothesis.name for hypothesis in HYPOTHESES].index(name)
+    kind = found.mixture.previous + np.where(found.mixture.log_weights[:, 1:-1] == 0, 1.0, 0.0)
     assert (kind[:, place - 1] > 0).mean() >= 0.8
     assert errors(theta, cart(**after)) < 0.8 * errors(watched(False, cart(**after))[1], cart(**after))
 
@@ -115,12 +115,12 @@ def test_a_cause_is_found_and_told_better_than_by_all_parameters(name, after):
 def test_what_is_outside_all_causes_is_found_no_worse_than_by_the_filter_of_all():
     """Two things at once, which only the filter of all parameters explains."""
     both = cart(stiffness=1.8, gain=0.5, push=0.6)
-    found, alone = (errors(watched(causes, both, seeds=24)[1], both) for causes in (True, False))
+    found, alone = (errors(watched(hypotheses, both, seeds=24)[1], both) for hypotheses in (True, False))
     assert found < 1.15 * alone
 
 
 def test_a_push_that_grows_is_delivered_ahead():
-    ahead, rate = CAUSES[-1].lead, 0.15
+    ahead, rate = HYPOTHESES[-1].lead, 0.15
     _, theta = watched(True, cart(push=0.5), rate=rate)
     push = adaptation().names.index("push")
     wanted = 0.5 + rate * (DT * (STEPS - 1 - CHANGE) + ahead)
@@ -145,7 +145,7 @@ def test_bad_samples_keep_the_model_and_its_weights():
     for _ in range(6):
         after = update(state, jnp.full(2, jnp.nan), jnp.zeros(1))
         np.testing.assert_allclose(after.trusted, state.trusted, atol=1e-3)
-        np.testing.assert_allclose(after.mixture.odds, state.mixture.odds, atol=1e-6)
+        np.testing.assert_allclose(after.mixture.log_weights, state.mixture.log_weights, atol=1e-6)
         state = after
     assert filter.flags(state).gap
     assert state.restarts == 0
@@ -153,10 +153,13 @@ def test_bad_samples_keep_the_model_and_its_weights():
 
 def test_causes_that_cannot_be_are_refused():
     for make, words in (
-        (lambda: hj.Cause("none"), "cause none: it must have a parameter"),
-        (lambda: hj.Cause("a", {"push": 0.0}), "cause a: push must be"),
-        (lambda: hj.Cause("a", {"push": 1.0}, rates={"gain": 1.0}), "cause a: rates of gain"),
-        (lambda: OnlineAdaptation(cart(), DT, NOISE, causes=(hj.Cause("a", {"pusch": 1.0}),)), "pusch must be among"),
+        (lambda: hj.Hypothesis("none"), "hypothesis none: it must have a parameter"),
+        (lambda: hj.Hypothesis("a", {"push": 0.0}), "hypothesis a: push must be"),
+        (lambda: hj.Hypothesis("a", {"push": 1.0}, rates={"gain": 1.0}), "hypothesis a: rates of gain"),
+        (
+            lambda: OnlineAdaptation(cart(), DT, NOISE, hypotheses=(hj.Hypothesis("a", {"pusch": 1}),)),
+            "pusch must be among",
+        ),
     ):
         with pytest.raises(ValueError, match=words):
             make()

@@ -208,11 +208,14 @@ def test_a_run_beside_others_is_the_run_alone():
         ({"initial": "a"}, "initial must be a share above 0 and at most 1, got 'a'"),
         ({"noise": 0.0}, "noise must be"),
         ({"tuning": "x"}, "tuning must be a Tuning, got 'x'"),
-        ({"causes": hj.Cause("a", {"friction": 0.3})}, "causes must be a list of Cause, got Cause"),
-        ({"causes": ("friction",)}, "causes must be a list of Cause, got"),
         (
-            {"prior": {"friction": 0.1, "idle": 0.0}, "causes": [hj.Cause("a", {"idle": 1})]},
-            "cause a: idle must be among",
+            {"hypotheses": hj.Hypothesis("a", {"friction": 0.3})},
+            "hypotheses must be a list of Hypothesis, got Hypothesis",
+        ),
+        ({"hypotheses": ("friction",)}, "hypotheses must be a list of Hypothesis, got"),
+        (
+            {"prior": {"friction": 0.1, "idle": 0.0}, "hypotheses": [hj.Hypothesis("a", {"idle": 1})]},
+            "hypothesis a: idle must be among",
         ),
         ({"field": hj.Model(SLIDE)}, "field: must be a function .* got Model; pass its .field"),
     ],
@@ -249,11 +252,13 @@ def test_a_sample_is_a_list_or_an_array_of_the_size_of_the_first():
         adaptation().update(state, [0.0], [0.0], elapsed=-1)
 
 
-@pytest.mark.parametrize("causes", [(), (hj.Cause("push", {"push": 1.0}),)], ids=["alone", "causes"])
-def test_a_parameter_with_a_prior_of_zero_is_held(causes):
+@pytest.mark.parametrize("hypotheses", [(), (hj.Hypothesis("push", {"push": 1.0}),)], ids=["alone", "hypotheses"])
+def test_a_parameter_with_a_prior_of_zero_is_held(hypotheses):
     field, prior = Towed(jnp.array(1.0), jnp.array(0.0)), {"friction": 0.0, "push": 1.0}
-    state = last(watch(OnlineAdaptation(field, DT, NOISE, prior, causes=causes), *run(Towed(field.friction, 0.7), 150)))
-    held = OnlineAdaptation(field, DT, NOISE, prior, causes=causes)
+    state = last(
+        watch(OnlineAdaptation(field, DT, NOISE, prior, hypotheses=hypotheses), *run(Towed(field.friction, 0.7), 150))
+    )
+    held = OnlineAdaptation(field, DT, NOISE, prior, hypotheses=hypotheses)
     found, intervals = held.model(state), held.intervals(state)
     assert found.friction == intervals["friction"].low == intervals["friction"].high == field.friction
     assert intervals["push"].low < 0.7 < intervals["push"].high

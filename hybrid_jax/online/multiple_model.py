@@ -1,0 +1,194 @@
+"""Which hypothesis explains the samples? A filter for each, weighed by the likelihood of its innovations.
+
+A change is mostly one of few parameters: those of a load, or the efficiency of one rotor. A filter of these alone knows
+them after a few samples, where a filter of all parameters has to tell them from each other first. Which one it was, the
+samples say: each filter predicts them, and Bayes' rule weighs the filters by how likely they were, as in the static
+multiple-model estimator (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001,
+ch. 11.6). The estimate is that of their mixture. The hypotheses are, in this order:
+
+- it is as it was before the last alarm,
+- the parameters are the field's own,
+- what one of the hypotheses of the user says has changed,
+- anything has changed: the filter of all parameters, which lies elsewhere.
+
+At the start the first is certain, so that the estimate stays as it is until a change is found. An alarm opens each
+hypothesis to its prior. Weights have a lower bound, so that a hypothesis may come back without an alarm.
+"""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax.online import change_test, kalman
+from hybrid_jax.online.change_test import ChangeTest, started
+from hybrid_jax.online.hypotheses import ModelSet
+from hybrid_jax.online.kalman import Belief, Correction, FilterModel
+from hybrid_jax.online.samples import Sample
+
+
+class Mixture(eqx.Module):
+    """The state of h hypotheses of as many numbers each, and the weight of one more; θ in prior standard deviations.
+
+    Attributes:
+        z: of each, x and the numbers that move θ.
+        covariance: of each z.
+        previous: 1 for the one of the others that the first was before the last alarm, else 0.
+        log_weights: logarithms of the weights, the largest 0; the last is that of the filter of all parameters.
+        test: the change test of the estimate.
+    """
+
+    z: Float[Array, "*n h d+k"]
+    covariance: Float[Array, "*n h d+k d+k"]
+    previous: Float[Array, "*n h-1"]
+    log_weights: Float[Array, "*n h+1"]
+    test: ChangeTest
+
+
+class Verdict(NamedTuple):
+    """What the hypotheses say after a sample.
+
+    Attributes:
+        mixture: their filters and weights; None without hypotheses.
+        theta: the mean of the mixture.
+        squares: of its innovations over their standard deviations.
+        changed: whether θ has changed.
+        unexplained: and no hypothesis says how, so that the filter of all parameters is to open.
+    """
+
+    mixture: Mixture | None
+    theta: Float[Array, " p"]
+    squares: Float[Array, " d"]
+    changed: Bool[Array, ""]
+    unexplained: Bool[Array, ""]
+
+
+def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d"], floor: float) -> Mixture:
+    """Before the first sample x."""
+    h, p, k = models.effects.shape
+    none = jnp.zeros(k, x.dtype)
+    z = jnp.tile(jnp.concatenate([x, none]), (h + 1, 1))
+    covariance = jnp.tile(jnp.diag(jnp.concatenate([variances, none])), (h + 1, 1, 1))
+    before = jnp.zeros(h, x.dtype).at[0].set(1)
+    log_weights = jnp.full(h + 2, -floor, x.dtype).at[0].set(0)
+    return Mixture(z, covariance, before, log_weights, started(p, x.dtype))
+
+
+def weights(mixture: Mixture, least: float) -> Float[Array, " h+1"]:
+    """Of the hypotheses; exactly zero for one that has less than `least` of the largest."""
+    found = jnp.maximum(jnp.exp(mixture.log_weights) - least, 0.0)
+    return found / jnp.sum(found)
+
+
+def with_previous(mixture: Mixture, own: Float[Array | np.ndarray, "h-1 ..."]) -> Float[Array, "h ..."]:
+    """Arrays of the models with those of the first hypothesis, which is one of the others as it was."""
+    own = jnp.asarray(own, mixture.z.dtype)
+    before = mixture.previous.reshape(-1, *(1,) * (own.ndim - 1))
+    return jnp.concatenate([jnp.sum(before * own, axis=0, keepdims=True), own])
+
+
+def mean(mixture: Mixture, models: ModelSet, joint: Belief, least: float) -> Float[Array, " p"]:
+    """θ of the mixture, as far ahead as hypotheses say."""
+    return weights(mixture, least) @ _means(mixture, models, joint)
+
+
+def covariance(mixture: Mixture, models: ModelSet, joint: Belief, least: float) -> Float[Array, "p p"]:
+    """Of θ in the mixture: that within its parts, and of these around the mean.
+
+    A parameter for which a hypothesis has no number of its own may have changed by as much as the samples would not
+    tell: its variance is that in the filter of all parameters.
+    """
+    share, means = weights(mixture, least), _means(mixture, models, joint)
+    effects = with_previous(mixture, models.ahead)
+    d = len(joint.z) - effects.shape[1]
+    outside = jax.vmap(jnp.diag)(with_previous(mixture, models.outside) * kalman.diagonal(joint.covariance)[d:])
+    within = jnp.einsum("hpk,hkl,hql->hpq", effects, mixture.covariance[:, d:, d:], effects) + outside
+    away = means - share @ means
+    parts = jnp.concatenate([within, joint.covariance[None, d:, d:]]) + away[:, :, None] * away[:, None, :]
+    return jnp.tensordot(share, parts, 1)
+
+
+def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h+1 p"]:
+    effects = with_previous(mixture, models.ahead)
+    d = len(joint.z) - effects.shape[1]
+    return jnp.concatenate([jnp.sum(effects * mixture.z[:, None, d:], axis=2), joint.z[None, d:]])
+
+
+def update(
+    mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, joint: Belief, correction: Correction
+) -> Verdict:
+    """After a sample, with the filter of all parameters as that sample corrected it."""
+    tuning, shares = model.tuning, weights(mixture, model.tuning.least)
+    mixture, white, likelihoods = filtered(mixture, models, model, sample)
+    white = jnp.concatenate([white, correction.white[None]])
+    pulled = shares @ white, correction.gains
+    test, changed = change_test.after_sample(mixture.test, *pulled, sample, model.dt, tuning, tuning.settle)
+    likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])
+    before, mixture = mixture.log_weights[-1], reweighted(mixture, likelihoods, tuning.floor)
+    # The filter of all parameters has found what the test has not.
+    taken = (mixture.log_weights[-1] == 0) & (before < 0) & (mixture.test.quiet > tuning.settle)
+    unexplained, changed = changed & (mixture.log_weights[-1] < 0), changed | taken
+    mixture = reinitialised(mixture, models, model, sample, changed)
+    mixture = eqx.tree_at(lambda m: m.test, mixture, change_test.reset(test, taken, 0.0))
+    theta, squares = mean(mixture, models, joint, tuning.least), shares @ jnp.square(white)
+    return Verdict(mixture, theta, squares, changed, unexplained)
+
+
+def filtered(
+    mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample
+) -> tuple[Mixture, Float[Array, "h d"], Float[Array, " h"]]:
+    """After a sample, in which all hypotheses learn; and of each the white innovations and their likelihood."""
+    prior = with_previous(mixture, models.prior)
+    diffusion = model.dt * sample.elapsed * (with_previous(mixture, models.diffusion) + model.tuning.drift**2 * prior)
+
+    def one(z, covariance, effects, transition, prior, diffusion):
+        def field(x, a):
+            return model.field(x, jnp.sum(effects * a, axis=1))
+
+        belief = kalman.predict(Belief(z, covariance), model, field, transition, diffusion, sample.acted)
+        belief = kalman.reset_state(kalman.limit_covariance(belief, prior), sample, sample.restart, model.variances)
+        belief, correction = kalman.correct(belief, sample, model)
+        return belief, correction.white, correction.log_likelihood
+
+    effects, transition = with_previous(mixture, models.effects), with_previous(mixture, models.transition)
+    belief, white, likelihood = model.each(one)(mixture.z, mixture.covariance, effects, transition, prior, diffusion)
+    return eqx.tree_at(lambda m: (m.z, m.covariance), mixture, tuple(belief)), white, likelihood
+
+
+def reweighted(mixture: Mixture, likelihoods: Float[Array, " h+1"], floor: float) -> Mixture:
+    """With Bayes' rule for the weights; what is at the floor stays there but for the filter of all parameters."""
+    stays = (mixture.log_weights <= -floor).at[-1].set(False)
+    log_weights = jnp.where(stays, -jnp.inf, mixture.log_weights + likelihoods)
+    return eqx.tree_at(lambda m: m.log_weights, mixture, jnp.maximum(log_weights - jnp.max(log_weights), -floor))
+
+
+def reinitialised(
+    mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, alarm: Bool[Array, ""]
+) -> Mixture:
+    """After an alarm: each hypothesis anew at its prior, and the likeliest hypothesis as it is beside them."""
+    d, h = len(sample.x), len(mixture.z)
+    likeliest = jnp.where(mixture.log_weights == 0, 1.0, 0.0)
+    likeliest = likeliest / jnp.sum(likeliest)
+    joint = likeliest[h]
+    # The filter of all parameters goes on by itself; the field's own parameters then take the first place.
+    first = jnp.concatenate([likeliest[:1], likeliest[1:2] + joint, likeliest[2:h]])
+    restart = jnp.concatenate([jnp.zeros_like(mixture.previous[:1]), jnp.ones_like(mixture.previous)])
+
+    def one(z, covariance, prior, restart):
+        none = jnp.concatenate([jnp.ones(d, z.dtype), jnp.full(len(prior), 1 - restart)])
+        covariance = none[:, None] * covariance * none + jnp.diag(
+            jnp.concatenate([jnp.zeros(d, z.dtype), prior]) * restart
+        )
+        return kalman.reset_state(Belief(none * z, covariance), sample, True, model.variances)
+
+    z = jnp.concatenate([(first @ mixture.z)[None], mixture.z[1:]])
+    covariance = jnp.concatenate([jnp.tensordot(first, mixture.covariance, 1)[None], mixture.covariance[1:]])
+    belief = model.each(one)(z, covariance, with_previous(mixture, models.prior), restart)
+    # What learns goes on with its weight.
+    least = jnp.full_like(mixture.log_weights, -model.tuning.change)
+    log_weights = least.at[0].set(least[0] * joint).at[-1].set(jnp.maximum(mixture.log_weights[-1], least[0]))
+    new = Mixture(belief.z, belief.covariance, first[0] * mixture.previous + first[1:], log_weights, mixture.test)
+    return jax.tree.map(lambda a, b: jnp.where(alarm, a, b), new, mixture)
