@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
+from hybrid_jax.rotation import tilt
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 from hybrid_jax.trajectories import Trajectories
 
@@ -19,10 +20,9 @@ def motion(x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"], rigid: bool
     tilt; of another system each state and input."""
     if not rigid:
         return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
-    tilt = np.arccos(np.clip(1 - 2 * np.square(x[:, QUATERNION][:, 1:3]).sum(axis=1), -1, 1))
     lengths = {"speed [m/s]": x[:, VELOCITY], "body rates [rad/s]": x[:, BODY_RATES]}
     norms = {name: np.linalg.norm(each, axis=1) for name, each in lengths.items()}
-    return norms | {"rotor speed [rad/s]": u.ravel(), "tilt [rad]": tilt}
+    return norms | {"rotor speed [rad/s]": u.ravel(), "tilt [rad]": tilt(x[:, QUATERNION])}
 
 
 def motion_of(windows: Trajectories, rigid: bool) -> Motion:

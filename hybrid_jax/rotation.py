@@ -4,6 +4,7 @@ Source: Solà, "Quaternion kinematics for the error-state Kalman filter", 2017 (
 """
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 Quaternion = Float[Array, "4"]
@@ -95,6 +96,11 @@ def canonicalize_quaternion(q: Quaternion) -> Quaternion:
     Both are the same rotation, but different inputs to a network, which was trained near w > 0.
     """
     return q * jnp.sign(q[jnp.argmax(q != 0)])
+
+
+def tilt(q: Float[np.ndarray, "*batch 4"]) -> Float[np.ndarray, "*batch"]:
+    """The angle [rad] of the body's z axis from the vertical, of unit quaternions."""
+    return np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))
 
 
 def heading(q: Float[Array, "*batch 4"]) -> Float[Array, "*batch"]:

@@ -7,6 +7,9 @@ from dataclasses import MISSING, dataclass, fields
 from pathlib import Path
 from typing import Any, TypeVar
 
+import numpy as np
+from jaxtyping import Float
+
 from hybrid_jax import checks
 
 T = TypeVar("T")
@@ -22,18 +25,31 @@ ROUNDING = 0.05  # share by which a moment may exceed the sum of the other two: 
 class Vehicle:
     """The constants of a multirotor, body frame x forward, y left, z up.
 
-    ValueError unless positive and finite, and of a body and in units that a vehicle can have.
+    Attributes:
+        mass: in kg.
+        inertia: principal moments (Ix, Iy, Iz) about the centre of mass [kg m²].
+        thrust_coefficient: k [N/(rad/s)²]; the thrust of a rotor is k u².
+        torque_coefficient: c_m [N m/(rad/s)²]; the reaction torque of a rotor is c_m u².
+        rotor_positions: (x, y) of each rotor from the centre of mass [m].
+        spin: the sign of each rotor's reaction torque about body z, ±1.
+        max_rotor_speed: the fastest that a rotor turns [rad/s].
+        rotor_radius: of a rotor [m]; 0 if it is not known.
+        gravity: the acceleration of free fall [m/s²].
+        name: what reports and messages call it.
+
+    Raises:
+        ValueError: numbers that are not positive and finite, or of a body or in units that no vehicle has.
     """
 
-    mass: float  # kg
-    inertia: tuple[float, float, float]  # principal moments (Ix, Iy, Iz), kg m²
-    thrust_coefficient: float  # k, thrust of a rotor is k u², N/(rad/s)²
-    torque_coefficient: float  # c_m, reaction torque of a rotor is c_m u², N m/(rad/s)²
-    rotor_positions: tuple[tuple[float, float], ...]  # (x, y) of each rotor, m
-    spin: tuple[float, ...]  # sign of each rotor's reaction torque about body z, ±1
-    max_rotor_speed: float  # rad/s
-    rotor_radius: float = 0.0  # m
-    gravity: float = 9.81  # m/s²
+    mass: float
+    inertia: tuple[float, float, float]
+    thrust_coefficient: float
+    torque_coefficient: float
+    rotor_positions: tuple[tuple[float, float], ...]
+    spin: tuple[float, ...]
+    max_rotor_speed: float
+    rotor_radius: float = 0.0
+    gravity: float = 9.81
     name: str = "vehicle"
 
     def __post_init__(self):
@@ -82,6 +98,12 @@ class Vehicle:
     def hover_speed(self) -> float:
         """The rotor speed [rad/s] at which equal rotors carry the weight."""
         return math.sqrt(self.mass * self.gravity / (self.rotors * self.thrust_coefficient))
+
+    @property
+    def mixer(self) -> Float[np.ndarray, "4 rotors"]:
+        """Thrust [N] and torque [N m, body] of the rotors per square of their speeds [(rad/s)²]."""
+        (x, y), k = np.array(self.rotor_positions).T, self.thrust_coefficient
+        return np.stack([np.full(self.rotors, k), k * y, -k * x, self.torque_coefficient * np.array(self.spin)])
 
 
 def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:

@@ -151,10 +151,7 @@ class L1(AbstractEstimator):
 
     def _added(self, u, accelerations):
         """The speeds that give these accelerations, along the thrust and about the three axes, beside those of u."""
-        px, py = np.array(IRIS.rotor_positions).T
-        k, c_m = IRIS.thrust_coefficient, IRIS.torque_coefficient
-        mixer = np.stack([k * np.ones(4), k * py, -k * px, c_m * np.array(IRIS.spin)])
-        mixer = mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
+        mixer = IRIS.mixer / np.array([IRIS.mass, *IRIS.inertia])[:, None]
         squares = jnp.square(u) + jnp.asarray(np.linalg.inv(mixer), u.dtype) @ accelerations
         return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
 

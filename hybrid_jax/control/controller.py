@@ -204,10 +204,8 @@ class Controller:
         acceleration = -ATTITUDE_GAIN * angle - RATE_GAIN * (x[BODY_RATES] - wanted[BODY_RATES])
         weight = jnp.asarray([vehicle.mass * vehicle.gravity], x.dtype)
         wrench = jnp.concatenate([weight, jnp.asarray(vehicle.inertia, x.dtype) * acceleration])
-        px, py = np.array(vehicle.rotor_positions).T
-        k, c_m = vehicle.thrust_coefficient, vehicle.torque_coefficient
-        mixer = np.stack([k * np.ones(len(px)), k * py, -k * px, c_m * np.array(vehicle.spin)])[: len(px)]
-        squares = jnp.asarray(np.linalg.pinv(mixer), x.dtype) @ wrench[: len(px)]  # three rotors leave yaw alone
+        rows = min(4, vehicle.rotors)  # three rotors leave yaw alone
+        squares = jnp.asarray(np.linalg.pinv(vehicle.mixer[:rows]), x.dtype) @ wrench[:rows]
         share = (jnp.sqrt(jnp.maximum(squares, 0.0)) - middle) / half
         return jnp.arctanh(jnp.clip(share, -math.tanh(VARIABLE_BOUND), math.tanh(VARIABLE_BOUND)))
 

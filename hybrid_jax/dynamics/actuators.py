@@ -32,14 +32,26 @@ QUICKEST = 1e-3  # s, least time constant that is learned
 
 @dataclass(frozen=True)
 class Actuator:
-    """What stands between command and rotor: the table `[actuator]` of a vehicle file. ValueError as the fields say."""
+    """What stands between command and rotor: the table `[actuator]` of a vehicle file.
 
-    curve: tuple[float, ...]  # c0, c1, …: the sum of ci command^i
-    gives: str = "speed"  # of a rotor [rad/s], or "thrust" [N]
-    time_constants: tuple[float, float] = (0.0, 0.0)  # speeding up and slowing down [s]; one number stands for both
-    nominal_voltage: float = 0.0  # V₀ [V]; 0 if the voltage does not matter
-    voltage_exponent: float = 0.0  # γ
-    delay: float = 0.0  # by which commands act later than the log says [s], one for a log
+    Attributes:
+        curve: coefficients c0, c1, … of Σ ci command^i, in the unit of what it gives.
+        gives: "speed" of a rotor [rad/s], or its "thrust" [N].
+        time_constants: speeding up and slowing down [s]; one number stands for both.
+        nominal_voltage: V₀ [V]; 0 if the voltage does not matter.
+        voltage_exponent: γ.
+        delay: by which commands act later than the log says [s], one for a log.
+
+    Raises:
+        ValueError: what a field is told to hold, and what it was given.
+    """
+
+    curve: tuple[float, ...]
+    gives: str = "speed"
+    time_constants: tuple[float, float] = (0.0, 0.0)
+    nominal_voltage: float = 0.0
+    voltage_exponent: float = 0.0
+    delay: float = 0.0
 
     def __post_init__(self):
         if not isinstance(self.curve, tuple) or not 2 <= len(self.curve) <= 6:

@@ -21,13 +21,19 @@ ACCELERATIONS = STATE_SIZE - VELOCITY.start  # v̇ and ω̇ of a rigid body; ṗ
 
 
 class ConstantDisturbance(AbstractVectorField):
-    """ẋ = d at the disturbed states and zero at the others, for all x and u."""
+    """ẋ = d at the disturbed states and zero at the others, for all x and u.
+
+    Attributes:
+        value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
+        indices: the disturbed states; by default the last k.
+        points: of a grid; each number is that of so many states in a row.
+    """
 
     accepts_batch: ClassVar[bool] = True
 
-    value: Float[Array, "*k"]  # one number for each disturbed state, or a scalar for every state
-    indices: tuple[int, ...] | None = eqx.field(static=True, default=None)  # by default the last `len(value)` states
-    points: int = eqx.field(static=True, default=1)  # of a grid: each number is that of so many states in a row
+    value: Float[Array, "*k"]
+    indices: tuple[int, ...] | None = eqx.field(static=True, default=None)
+    points: int = eqx.field(static=True, default=1)
 
     def __check_init__(self):
         if self.indices is not None and jnp.shape(self.value)[-1:] != (len(self.indices),):

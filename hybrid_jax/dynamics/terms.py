@@ -21,17 +21,32 @@ NONE = (0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class Terms:
-    """Nominal values of the terms beyond a rigid body, absent by default; body frame. ValueError for another shape."""
+    """Nominal values of the terms beyond a rigid body, absent by default; body frame. For equations see `RigidBody`.
 
-    torque_gain: Three = (1.0, 1.0, 1.0)  # factors G of the rotors' torque about x, y and z; 0 turns it off
-    centre_of_mass: tuple[float, float] = (0.0, 0.0)  # (x, y) in the frame of the rotors' positions, m
-    drag: Three = NONE  # D, N s/m
-    cable_pull: tuple[float, float] = (0.0, 0.0)  # C, one over how far below the centre of mass a cable pulls, 1/m
-    aerodynamic_moment: tuple[Three, Three, Three] = (NONE, NONE, NONE)  # A, one row for each of the moments, N s
-    rate_damping: Three = NONE  # B, N m s
-    velocity_gain: Three = (1.0, 1.0, 1.0)  # S, of the position's derivative over the velocity in a log
-    velocity_lag: float = 0.0  # λ, time constant of the estimated velocity for forces across the thrust, s
-    motor_time_constant: float = 0.0  # of the rotors behind a log's motor values, s; applied to logs, not by the field
+    Attributes:
+        torque_gain: factors G of the rotors' torque about x, y and z; 0 turns it off.
+        centre_of_mass: (x, y) in the frame of the rotors' positions [m].
+        drag: D along x, y and z [N s/m].
+        cable_pull: C, one over how far below the centre of mass a cable pulls, along x and y [1/m].
+        aerodynamic_moment: A, one row for each of the moments [N s].
+        rate_damping: B about x, y and z [N m s].
+        velocity_gain: S, of the position's derivative over the velocity in a log.
+        velocity_lag: λ, time constant of the estimated velocity for forces across the thrust [s].
+        motor_time_constant: of the rotors behind a log's motor values [s]; applied to logs, not by the field.
+
+    Raises:
+        ValueError: a term of another shape, or a number that is not finite.
+    """
+
+    torque_gain: Three = (1.0, 1.0, 1.0)
+    centre_of_mass: tuple[float, float] = (0.0, 0.0)
+    drag: Three = NONE
+    cable_pull: tuple[float, float] = (0.0, 0.0)
+    aerodynamic_moment: tuple[Three, Three, Three] = (NONE, NONE, NONE)
+    rate_damping: Three = NONE
+    velocity_gain: Three = (1.0, 1.0, 1.0)
+    velocity_lag: float = 0.0
+    motor_time_constant: float = 0.0
 
     def __post_init__(self):
         for name, shape in SIGNED.items():

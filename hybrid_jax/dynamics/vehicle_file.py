@@ -23,13 +23,21 @@ NEED_PURPOSE = ("cable_pull",)  # what a change alone explains; without one, the
 
 @dataclass(frozen=True)
 class VehicleModel:
-    """A vehicle, and what is to be learned of it; ValueError as of `check_learned`."""
+    """A vehicle, and what is to be learned of it; ValueError as of `check_learned`.
+
+    Attributes:
+        vehicle: its constants.
+        terms: nominal values of further terms.
+        actuator: what stands between command and rotor; None for logs of rotor speeds.
+        learn: names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs.
+        purpose: names of terms of which the file says what they are for.
+    """
 
     vehicle: Vehicle
     terms: Terms = field(default_factory=Terms)
     actuator: Actuator | None = None
-    learn: tuple[str, ...] = LEARNED  # names of `terms.SHAPES`, and "motor_time_constant" for the rotors' lag in logs
-    purpose: tuple[str, ...] = ()  # names of terms of which the file says what they are for
+    learn: tuple[str, ...] = LEARNED
+    purpose: tuple[str, ...] = ()
 
     def __post_init__(self):
         check_learned(self.learn, self.actuator)

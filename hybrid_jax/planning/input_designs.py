@@ -176,10 +176,7 @@ class FlatOutputs(eqx.Module):
         vehicle, inertia = self.vehicle, np.array(self.vehicle.inertia, np.float32)
         torque = inertia * turning + jnp.cross(rates, inertia * rates)
         thrust = vehicle.mass * jnp.linalg.norm(lift, axis=1, keepdims=True)
-        px, py = np.array(vehicle.rotor_positions).T
-        k, c_m = vehicle.thrust_coefficient, vehicle.torque_coefficient
-        mixer = np.stack([k * np.ones(len(px)), k * py, -k * px, c_m * np.array(vehicle.spin)])
-        return jnp.concatenate([thrust, torque], axis=1) @ jnp.asarray(np.linalg.pinv(mixer).T, lift.dtype)
+        return jnp.concatenate([thrust, torque], axis=1) @ jnp.asarray(np.linalg.pinv(vehicle.mixer).T, lift.dtype)
 
     def uses(self, x: Float[Array, "n+1 13"], u: Float[Array, "n rotors"]) -> Float[Array, "n limits"]:
         """How much of each limit of `names` is used over time; 1 is all of it."""

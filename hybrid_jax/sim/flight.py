@@ -19,6 +19,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray, UInt
 from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.io.datasets import Dataset, versions
+from hybrid_jax.rotation import tilt
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim import pilot
 from hybrid_jax.sim.domain import CHUNK, Domain, Quadrotor
@@ -219,7 +220,7 @@ def survey(windows: Trajectories) -> dict[str, float]:
     height = altitude.mean(axis=1)
     channels = {
         "speed [m/s]": np.linalg.norm(x[..., VELOCITY], axis=-1),
-        "tilt [deg]": np.degrees(np.arccos(np.clip(1 - 2 * (q[..., 1] ** 2 + q[..., 2] ** 2), -1, 1))),
+        "tilt [deg]": np.degrees(tilt(q)),
         "altitude [m]": altitude,
         "distance from home [m]": np.linalg.norm(x[..., POSITION][..., :2], axis=-1),
         **{f"|{axis} rate| [rad/s]": rates[..., i] for i, axis in enumerate(("roll", "pitch", "yaw"))},
