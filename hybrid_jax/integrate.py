@@ -170,6 +170,8 @@ def rollout(
     A trajectory that diverges continues as infinity or NaN, here as in compiled code; `Model.predict` raises.
 
     Args:
+        field: ẋ = f(x, u), a vector field or any function of a state (d,) and an input (m,).
+        x0: the state at the start (d,).
         dt: length of an interval [s].
         solver: a one-step method of diffrax for ODEs; by default `RK4`.
         substeps: solver steps of equal length in each interval.
@@ -195,7 +197,15 @@ def rollout_batch(
     solver: Solver | None = None,
     substeps: int = 1,
 ) -> Float[Array, "n t d"]:
-    """`rollout` of each of n windows."""
+    """`rollout` of each of n windows.
+
+    Args:
+        field: ẋ = f(x, u), as in `rollout`, like those that follow.
+        x0: the state at the start of each window (n, d).
+        dt: length of an interval [s].
+        solver: by default `RK4`.
+        substeps: solver steps of equal length in each interval.
+    """
     return _integrate_batch(field, *checked(field, x0, u, dt, solver, substeps, windows=True), dt, substeps)
 
 

@@ -15,7 +15,12 @@ CHUNK = 1000  # windows predicted at once
 
 
 def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Float[Array, "*n"]:
-    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError for arrays of different shapes, or without a state."""
+    """L_MSE = (1/T) Σ_t ‖x_t − x̂_t‖² of each window; ValueError for arrays of different shapes, or without a state.
+
+    Args:
+        predicted: x̂, predicted states (n, t, d), of one window also (t, d).
+        truth: x, the states that followed, of the same shape.
+    """
     if predicted.shape != truth.shape or predicted.ndim < 2 or 0 in predicted.shape[-2:]:
         raise ValueError(f"predicted and truth must both be (n, t, d), got shapes {predicted.shape} and {truth.shape}")
     return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
@@ -28,6 +33,13 @@ def rollout_mse(
 
     It is not finite if the field diverges. To predict `chunk` windows at a time bounds memory.
 
+    Args:
+        field: ẋ = f(x, u), evaluated in inference mode.
+        windows: the windows that are predicted from their first states.
+        every: count the state after each so many intervals.
+        solver: a one-step method of diffrax; by default `RK4`.
+        chunk: windows predicted at a time.
+
     Raises:
         ValueError: malformed windows, windows that do not match the field, or an `every` beyond their horizon.
     """
@@ -37,7 +49,15 @@ def rollout_mse(
 def window_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
 ) -> Float[Array, " n"]:
-    """L_MSE of each window; see `rollout_mse`."""
+    """L_MSE of each window; see `rollout_mse`.
+
+    Args:
+        field: as in `rollout_mse`, like those that follow.
+        windows: n windows.
+        every: intervals between two states that count.
+        solver: by default `RK4`.
+        chunk: windows predicted at a time.
+    """
     check(windows, "windows")
     checks.count("chunk", chunk)
     checks.count("every", every)

@@ -20,12 +20,19 @@ def _plain(dt):
 
 
 class Trajectories(eqx.Module):
-    """n windows of t equal intervals."""
+    """n windows of t equal intervals.
 
-    x0: Float[Array | np.ndarray, "*n d"]  # initial state of each window
-    u: Float[Array | np.ndarray, "*n t m"]  # input held over each interval
-    x: Float[Array | np.ndarray, "*n t d"]  # state at the end of each interval: x[:, i] is (i + 1) dt after x0
-    dt: float = eqx.field(static=True, converter=_plain)  # length of an interval [s]
+    Attributes:
+        x0: initial state of each window (n, d).
+        u: input held over each interval (n, t, m).
+        x: state at the end of each interval (n, t, d): x[:, i] is (i + 1) dt after x0.
+        dt: length of an interval [s].
+    """
+
+    x0: Float[Array | np.ndarray, "*n d"]
+    u: Float[Array | np.ndarray, "*n t m"]
+    x: Float[Array | np.ndarray, "*n t d"]
+    dt: float = eqx.field(static=True, converter=_plain)
 
     def __len__(self) -> int:
         return self.x0.shape[0]
@@ -90,7 +97,12 @@ def check_dt(trajectories: Trajectories, windows: Trajectories, name: str) -> No
 
 
 def split(trajectories: Trajectories, at: int) -> tuple[Trajectories, Trajectories]:
-    """The first `at` intervals of each window, and the intervals after them; ValueError if a part would be empty."""
+    """The first `at` intervals of each window, and the intervals after them; ValueError if a part would be empty.
+
+    Args:
+        trajectories: windows, or one window without its axis.
+        at: intervals of the first part.
+    """
     checks.count("at", at)
     if not at < trajectories.horizon:
         raise ValueError(f"at must lie between 0 and the horizon {trajectories.horizon}, got {at}")
@@ -112,6 +124,10 @@ def windows_of(
     Numbers that are not finite are accepted, so that windows with gaps can be removed afterwards; see `check`.
 
     Args:
+        states: the state at the start and after each interval (t + 1, d).
+        inputs: the input held over each interval (t, m).
+        dt: length of an interval [s].
+        steps: intervals of each window.
         stride: intervals between the starts of two windows; by default `steps`, so that windows do not overlap.
 
     Raises:
@@ -133,7 +149,11 @@ def windows_of(
 
 
 def concatenate(parts: Iterable[Trajectories]) -> Trajectories:
-    """All windows of the parts, in order; ValueError if they differ in dt, horizon, or size of state or input."""
+    """All windows of the parts, in order; ValueError if they differ in dt, horizon, or size of state or input.
+
+    Args:
+        parts: windows of the same dt, horizon, and sizes of state and input.
+    """
     parts = checks.list_of("parts", parts, Trajectories)
     if not parts or len({(part.dt, part.x.shape[1:], part.u.shape[1:]) for part in parts}) != 1:
         sizes = [(part.dt, part.horizon, part.x.shape[-1], part.u.shape[-1]) for part in parts]

@@ -49,22 +49,37 @@ class AbstractVectorField(eqx.Module):
         return self(x, u) if direct else over_samples(training_mode(self))(x, u)
 
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
+        """ẋ of many samples in inference mode, a column for each."""
         return self(x, u) if features_first(self) else over_samples(self)(x, u)
 
     def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
+        """The field after one training batch: running statistics move, learned parameters do not."""
         return with_moved_stats(self, x, u)
 
     def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
+        """What a residual adds to ẋ of this physics.
+
+        Args:
+            residual: what a network returned, in units of ẋ (d,).
+        """
         return residual
 
     def linearize(self, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns):
+        """ẋ of one sample in inference mode, and its derivative (d, c) along c directions.
+
+        Args:
+            dx: directions of the state, in columns (d, c).
+            du: directions of the input, in columns (m, c).
+        """
         return jvp_columns(self, (x, u), (dx, du))
 
     def parameter_columns(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
+        """The derivative of ẋ of one sample along each of p learned numbers (d, p)."""
         theta, at = ravel_learned(self)
         return jax.jacfwd(lambda theta: at(theta)(x, u))(theta)
 
     def fuse_for_inference(self) -> "AbstractVectorField":
+        """The same map in inference mode, in a layout that is faster for few samples at a time."""
         return self
 
 

@@ -52,6 +52,7 @@ def make_residual(
     """A residual network that reads and returns part of a multirotor's state; by default all of it (paper).
 
     Args:
+        scaling: as in `residual_network`.
         inputs: "all" of x; "no_xy", without p_x and p_y (`DropXY`); "no_xy_yaw", also without yaw (`DropXYYaw`);
             "near_ground", that and the rotors' distance to the ground (`GroundDistance`); "body", in the body frame
             (`BodyFrame`); "body_motion", that without the height (`BodyMotion`).

@@ -24,6 +24,11 @@ class GridNetwork(AbstractVectorField):
     The neighbours are gathered, and one product serves all points: on a CPU the derivative of a convolution of XLA
     takes ten times as long. In training mode the hidden units are computed again for the gradient rather than kept
     (`jax.checkpoint`): measured, that takes half the time and a twentieth of the memory.
+
+    Attributes:
+        network: what is evaluated at each point.
+        grid: the points and their components.
+        kernel: points along each axis that the network reads, odd.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -89,6 +94,7 @@ def grid_network(
     """A network that is the same at every point of a grid.
 
     Args:
+        grid: the points, and the components at each.
         input_size: m, the numbers in u; every point reads all of them. With 0 the network does not depend on u.
         kernel: points along each axis that it reads, odd: 1 is pointwise, 3 a convolution.
         hidden: units at each point.

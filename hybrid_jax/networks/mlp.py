@@ -67,6 +67,14 @@ class ResidualNetwork(AbstractVectorField):
     """ẋ = W₂ σ(norm(W₁ z)) + b₂ with z = [x, scaled u]; 17 → 64 → 13, batch normalisation and ReLU in the paper.
 
     W₁ has no bias: batch normalisation would remove it, and the others have a shift.
+
+    Attributes:
+        weight_in: W₁ (h, m), of h hidden units and the m numbers of z.
+        norm: normalisation of W₁ z before the activation.
+        weight_out: W₂ (d, h).
+        bias_out: b₂ (d,).
+        scaling: of what the network reads and of what it returns; z is [x, u] after it.
+        activation: σ, by its name in `residual_network`, or a `SmoothRelu`.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -76,11 +84,10 @@ class ResidualNetwork(AbstractVectorField):
     weight_out: Float[Array, "d h"]
     bias_out: Float[Array, " d"]
     scaling: AbstractScaling = eqx.field(default_factory=InputScaling)
-    activation: str | SmoothRelu = eqx.field(static=True, default="relu")  # σ
+    activation: str | SmoothRelu = eqx.field(static=True, default="relu")
 
-    # d and m, where the network is a field by itself.
-    state_size = property(lambda self: len(self.bias_out))
-    input_size = property(lambda self: self.weight_in.shape[1] - len(self.bias_out))
+    state_size = property(lambda self: len(self.bias_out), doc="d, where the network is a field by itself.")
+    input_size = property(lambda self: self.weight_in.shape[1] - len(self.bias_out), doc="m, likewise.")
 
     def __call__(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         return self.scaling.outputs(affine(self.weight_out, self.bias_out, self.activations(x, u)))
@@ -112,7 +119,11 @@ class ResidualNetwork(AbstractVectorField):
         return self.fused_with(jnp.zeros((len(self.weight_out), self.weight_in.shape[1]), self.weight_in.dtype)) or self
 
     def fused_with(self, linear: Float[Array, "d m"]) -> FusedNetwork | None:
-        """This and a linear map of z in one, or None if the normalisation is no affine map."""
+        """This and a linear map of z in one, or None if the normalisation is no affine map.
+
+        Args:
+            linear: the map A of z (d, m).
+        """
         if not isinstance(self.norm, AbstractAffineNorm):
             return None
         weight_out, bias_out = self.scaling.outputs(self.weight_out), self.scaling.outputs(self.bias_out)
@@ -122,7 +133,12 @@ class ResidualNetwork(AbstractVectorField):
 
 
 class LinearResidual(AbstractVectorField):
-    """ẋ = W [x, u] + b: the simplest correction of another field."""
+    """ẋ = W [x, u] + b: the simplest correction of another field.
+
+    Attributes:
+        weight: W (d, n), of the n numbers of [x, u], in units of ẋ over theirs.
+        bias: b (d,), in units of ẋ.
+    """
 
     accepts_batch: ClassVar[bool] = True
 
@@ -137,6 +153,10 @@ class LinearSkip(AbstractVectorField):
     """ẋ = A z + f_d(x, u), z = [x, scaled u]: a linear skip connection around a network.
 
     Linear drag is such a map, which hidden units only approximate, and which extrapolates beyond the data.
+
+    Attributes:
+        weight: A (d, m), of the m numbers of z.
+        field: the network f_d, which also scales z.
     """
 
     accepts_batch: ClassVar[bool] = True
@@ -171,6 +191,9 @@ def residual_network(
     """A network with weights uniform in ±1/√fan_in, as the paper's stack initialises a linear layer.
 
     Args:
+        state_size: d, the numbers in x.
+        input_size: m, the numbers in u; may be 0.
+        hidden: number of hidden units.
         scaling: by default read off the training windows by `hybrid_jax.fit`; see `standardise.with_scaling`.
         norm: normalisation of the hidden units: "batch", "layer" or "none".
         outputs: size of what it returns, by default `state_size`.
@@ -219,7 +242,11 @@ def _uniform(key: PRNGKeyArray, shape: tuple[int, ...], fan_in: int) -> Array:
 
 
 def zero_output(field: AbstractVectorField) -> AbstractVectorField:
-    """The field with all output layers and linear skip connections at zero; ValueError if it contains no network."""
+    """The field with all output layers and linear skip connections at zero; ValueError if it contains no network.
+
+    Args:
+        field: a network, or a field that contains one.
+    """
 
     def has_outputs(node) -> bool:
         return isinstance(node, ResidualNetwork | LinearSkip)
@@ -244,6 +271,10 @@ def smoothed(field: AbstractVectorField, beta: float) -> AbstractVectorField:
     Solvers of optimal control problems that use second derivatives need this: those of ReLU are zero but for its kink.
     ReLU is found in networks of this library, and where a module holds `jax.nn.relu` as a field, as Equinox' MLP does;
     not where the code of a module calls it.
+
+    Args:
+        field: the field whose networks are changed.
+        beta: β, sharpness of `SmoothRelu`: the larger, the nearer to ReLU.
     """
     smooth = SmoothRelu(beta)
 

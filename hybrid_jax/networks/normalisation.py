@@ -35,7 +35,12 @@ class AbstractScaling(eqx.Module):
 
 
 class InputScaling(AbstractScaling):
-    """u ↦ (u − offset) / scale, the same for all inputs; x and the output as they are. ValueError unless scale > 0."""
+    """u ↦ (u − offset) / scale, the same for all inputs; x and the output as they are. ValueError unless scale > 0.
+
+    Attributes:
+        offset: what is taken from each input, in its unit.
+        scale: what each input is then divided by, in its unit.
+    """
 
     offset: float = eqx.field(static=True, default=0.0)
     scale: float = eqx.field(static=True, default=1.0)
@@ -74,16 +79,33 @@ class AbstractNorm(eqx.Module):
 
     @abstractmethod
     def infer(self, weight: Float[Array, "h m"], z: Float[Array, " m *b"]) -> Float[Array, " h *b"]:
-        """The normalised W z of each sample in inference mode."""
+        """The normalised W z of each sample in inference mode.
+
+        Args:
+            weight: W (h, m).
+            z: scaled states and inputs (m, …).
+        """
 
     def train_layers(
         self, activation: Activation, weight_in, weight_out, bias_out, z: Float[Array, "m b"]
     ) -> Float[Array, "d b"]:
-        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode."""
+        """W₂ σ(normalised W₁ z) + b₂ on a minibatch z (m, b) in training mode.
+
+        Args:
+            activation: σ, a function of each hidden unit.
+            weight_in: W₁ (h, m).
+            weight_out: W₂ (d, h).
+            bias_out: b₂ (d,).
+            z: scaled states and inputs, a column for each sample (m, b).
+        """
         return affine(weight_out, bias_out, activation(self.infer(weight_in, z)))
 
     def observed(self, hidden: Float[Array, "h b"]) -> Self:
-        """This after the pre-activations of a training batch."""
+        """This after the pre-activations of a training batch.
+
+        Args:
+            hidden: W₁ z, a column for each sample (h, b).
+        """
         return self
 
 
@@ -92,7 +114,11 @@ class AbstractAffineNorm(AbstractNorm):
 
     @abstractmethod
     def fold(self, weight: Float[Array, "h m"]) -> tuple[Float[Array, "h m"], Float[Array, " h"]]:
-        """(W', c) such that W' z + c is the normalised W z in inference mode."""
+        """(W', c) such that W' z + c is the normalised W z in inference mode.
+
+        Args:
+            weight: W (h, m).
+        """
 
     def infer(self, weight, z):
         weight, bias = self.fold(weight)
@@ -104,6 +130,13 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
     """Batch normalisation of the hidden pre-activations h = W z, with gain γ and shift β (Ioffe and Szegedy 2015).
 
     In training by the minibatch's mean and variance, in inference by running ones, which fold into a map of z.
+
+    Attributes:
+        gain: γ of each hidden unit (h,).
+        shift: β of each hidden unit (h,).
+        running: mean and variance of each hidden unit, which inference uses.
+        momentum: share by which a training batch moves `running`.
+        epsilon: added to the variance before its root is taken.
     """
 
     gain: Float[Array, " h"]
@@ -124,6 +157,11 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
 
     def training_mode(self, seen):
+        """This for one sample of a minibatch.
+
+        Args:
+            seen: the moments of the minibatch.
+        """
         return MinibatchNorm(self.gain, self.shift, seen, self.epsilon)
 
 
@@ -142,7 +180,13 @@ class MinibatchNorm(AbstractNorm):
 
 
 class LayerNorm(AbstractNorm):
-    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016)."""
+    """Layer normalisation: the h units of a sample to mean 0 and variance 1, then gain and shift (Ba et al. 2016).
+
+    Attributes:
+        gain: factor on each hidden unit (h,).
+        shift: added to each hidden unit (h,).
+        epsilon: added to the variance before its root is taken.
+    """
 
     gain: Float[Array, " h"]
     shift: Float[Array, " h"]
@@ -156,7 +200,11 @@ class LayerNorm(AbstractNorm):
 
 
 class Bias(AbstractAffineNorm):
-    """No normalisation: the pre-activations plus a bias, as in a plain linear layer."""
+    """No normalisation: the pre-activations plus a bias, as in a plain linear layer.
+
+    Attributes:
+        shift: the bias of each hidden unit (h,).
+    """
 
     shift: Float[Array, " h"]
 

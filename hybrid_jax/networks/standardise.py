@@ -48,6 +48,7 @@ def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractV
     that was given or set stays as it is.
 
     Args:
+        field: a field that contains networks; one without is returned as it is.
         windows: those that the field is to be trained on.
     """
     if not (networks := _unset(field)):

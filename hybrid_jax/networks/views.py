@@ -158,11 +158,20 @@ class RotorThrust(AbstractVectorField):
         return _nearness(x, _up(x), self.vehicle)
 
     def share(self, near: Float[Array, " rotors *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " rotors *b"]:
-        """f of each rotor."""
+        """f of each rotor.
+
+        Args:
+            near: R / h of each rotor (rotors,).
+            u: speed of each rotor [rad/s].
+        """
         return jax.vmap(self.field)(near[:, None], u[:, None])[:, 0]
 
     def write(self, x, u, share: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
-        """ẋ from the additional thrust of each rotor, as a share of k u²."""
+        """ẋ from the additional thrust of each rotor, as a share of k u².
+
+        Args:
+            share: of each rotor, as a share of k u² (rotors,).
+        """
         vehicle = self.vehicle
         thrust = vehicle.thrust_coefficient * u * u * share
         x_moment, y_moment = (dot(arms, thrust) for arms in zip(*vehicle.rotor_positions, strict=True))

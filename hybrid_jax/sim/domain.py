@@ -26,13 +26,24 @@ _DERIVED: Any = None  # a default that depends on the vehicle
 
 
 class Quadrotor(eqx.Module):
-    """ẋ = f(x, u, t) of one vehicle under a sum of forces."""
+    """ẋ = f(x, u, t) of one vehicle under a sum of forces.
+
+    Attributes:
+        parameters: the vehicle's constants, as arrays that may be traced.
+        forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
+    """
 
     parameters: Parameters
-    forces: tuple[Force, ...] = eqx.field(static=True)  # of `hybrid_jax.sim.forces`, or custom functions
+    forces: tuple[Force, ...] = eqx.field(static=True)
 
     def derivative(self, x: State, u: Input, t: Scalar) -> State:
-        """ẋ for rotor speeds u [rad/s] at time t [s]."""
+        """ẋ for rotor speeds u [rad/s] at time t [s].
+
+        Args:
+            x: state (13,).
+            u: rotor speeds [rad/s].
+            t: time [s], of which wind is a function.
+        """
         # Not above: MJX takes as long to import as JAX, and a program that was kept needs no MJX.
         from hybrid_jax.sim import scene
 
@@ -42,7 +53,14 @@ class Quadrotor(eqx.Module):
         return jnp.concatenate([x[VELOCITY], turning, scene.accelerations(self.parameters, x, u, applied)])
 
     def step(self, x: State, u: Input, t: Scalar, dt: Scalar | float) -> State:
-        """The state after dt [s] with u held from time t on: one step of classical RK4."""
+        """The state after dt [s] with u held from time t on: one step of classical RK4.
+
+        Args:
+            x: state (13,).
+            u: rotor speeds [rad/s].
+            t: time at the start [s].
+            dt: length of the step [s].
+        """
 
         def stage(slope, fraction):
             slope = _derivative(self, x + fraction * dt * slope, u, t + fraction * dt)
@@ -65,6 +83,10 @@ class Quadrotor(eqx.Module):
         """The states of n flights at the end of each interval, from x0 at t0 [s] with u[:, i] held over interval i.
 
         Args:
+            x0: states at the start (n, 13).
+            u: rotor speeds (n, t, rotors) [rad/s].
+            t0: time at the start of each flight (n,) [s].
+            dt: length of an interval [s].
             chunk: flights that are vectorised together.
 
         Raises:
@@ -96,15 +118,22 @@ _derivative = eqx.filter_jit(Quadrotor.derivative)
 class Domain:
     """A true system: a vehicle and the forces on it beyond thrust and gravity.
 
+    Attributes:
+        name: what the system is called; flights depend on it.
+        vehicle: the true vehicle.
+        drag_coefficient: C_D [kg/s]; by default that of the Iris times the square of the size.
+        forces: functions of `hybrid_jax.sim.forces`, or of your own, that add to thrust and gravity.
+        nominal: the vehicle that the pilot of random flights is tuned for; by default the true one.
+
     Raises:
         ValueError: not a vehicle, a drag coefficient that is negative or not finite, or a force that is not a function.
     """
 
     name: str
     vehicle: Vehicle = IRIS
-    drag_coefficient: float = _DERIVED  # C_D [kg/s]; by default that of the Iris times the square of the size
+    drag_coefficient: float = _DERIVED
     forces: tuple[Force, ...] = (drag, ground_effect)
-    nominal: Vehicle = _DERIVED  # that the pilot of random flights is tuned for; by default the true one
+    nominal: Vehicle = _DERIVED
 
     def __post_init__(self):
         object.__setattr__(self, "nominal", self.vehicle if self.nominal is None else self.nominal)

@@ -42,18 +42,31 @@ SPARE = 2  # fly this many times the requested windows, so that few of those kep
 
 
 class Flights(NamedTuple):
-    """n flights of t decisions, float64."""
+    """n flights of t decisions, float64.
+
+    Attributes:
+        states: (n, t + 1, 13).
+        inputs: rotor speeds (n, t, rotors), held from one state to the next [rad/s].
+        lowest_rotor: altitude of the lowest rotor (n, t + 1) [m].
+        start: time of the first state (n,) [s].
+    """
 
     states: Float[Array | np.ndarray, "*n t+1 13"]
-    inputs: Float[Array | np.ndarray, "*n t rotors"]  # held from one state to the next [rad/s]
-    lowest_rotor: Float[Array | np.ndarray, "*n t+1"]  # altitude [m]
-    start: Float[Array | np.ndarray, "*n"]  # time of the first state [s]
+    inputs: Float[Array | np.ndarray, "*n t rotors"]
+    lowest_rotor: Float[Array | np.ndarray, "*n t+1"]
+    start: Float[Array | np.ndarray, "*n"]
 
 
 def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
     """Simulate random closed-loop flights of `seconds` each, at 100 Hz, always in float64 and on the CPU.
 
     Flight i depends on the key and i alone.
+
+    Args:
+        domain: the true system.
+        flights: how many flights.
+        seconds: length of each [s].
+        key: random key.
 
     Raises:
         ValueError: flights or seconds are not positive, or key is not a random key.
@@ -109,7 +122,12 @@ def _fly_chunk(
 
 
 def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = IRIS) -> np.ndarray:
-    """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed."""
+    """Which flights (n,) of a vehicle diverged, left the arena, were too fast or crashed.
+
+    Args:
+        states: of n flights (n, t, 13).
+        vehicle: whose size sets the limits.
+    """
     scale, altitude = pilot.scale_of(vehicle), states[..., POSITION][..., 2]
     far = np.linalg.norm(states[..., POSITION][..., :2], axis=-1) > MAX_DISTANCE * scale.length
     fast = np.linalg.norm(states[..., VELOCITY], axis=-1) > MAX_SPEED * scale.speed
@@ -119,11 +137,17 @@ def gone_wrong(states: Float[Array | np.ndarray, "n t 13"], vehicle: Vehicle = I
 
 @dataclass(frozen=True)
 class SplitSpec:
-    """The number of windows of a split, and of intervals of 0.01 s in each."""
+    """The number of windows of a split, and of intervals of 0.01 s in each.
+
+    Attributes:
+        windows: windows of the split.
+        steps: intervals of each window.
+        flights: the windows are the first ones of so many flights, in order; by default at random of many.
+    """
 
     windows: int
     steps: int
-    flights: int = 0  # the windows are the first ones of so many flights, in order; by default at random of many
+    flights: int = 0
 
     def __post_init__(self):
         checks.count("windows", self.windows)
@@ -143,6 +167,9 @@ def make_dataset(
     A split depends on the domain's name, its own name and size and the seed, not on the other splits.
 
     Args:
+        domain: the true system.
+        splits: name → size of each split.
+        seed: of all random numbers, at least 0.
         progress: called with the finished share of the work, 0 … 1.
 
     Raises:
