@@ -36,11 +36,17 @@ ATTITUDE_GAIN, RATE_GAIN = 30.0, 10.0
 
 
 class Plan(eqx.Module):
-    """State of the controller between calls."""
+    """State of the controller between calls.
 
-    variables: Float[Array, "t rotors"]  # tanh maps them to shares of the rotor speeds' range, held over each interval
-    cost: Scalar  # predicted by the controller's model
-    damping: Scalar  # of the best Gauss–Newton step
+    Attributes:
+        variables: (t, rotors); tanh maps them to shares of the rotor speeds' range, held over each interval.
+        cost: predicted by the controller's model.
+        damping: of the best Gauss–Newton step.
+    """
+
+    variables: Float[Array, "t rotors"]
+    cost: Scalar
+    damping: Scalar
 
 
 _Point = tuple[Plan, Float[Array, "t 13"]]  # and the states that the model predicts
@@ -66,20 +72,32 @@ def checked_states(
 class Controller:
     """Model predictive controller. It holds hyper-parameters only; the plan is passed in and returned.
 
+    Attributes:
+        vehicle: gives the limits and the initial guess, hover; the model passed to a call gives the dynamics.
+        weights: of the cost.
+        steps: intervals of the horizon.
+        interval: length of one [s]; one step of RK4.
+        period: time between two calls [s].
+        iterations: Gauss–Newton steps per call.
+        damping: lower bound of the damping.
+        min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
+        unit_quaternion: normalise the quaternion after each step of the prediction.
+        rotor_lag: time constant with which rotors follow their commands [s]; see `rotor_speeds`.
+
     Raises:
         ValueError: an argument is of another type or out of range, or `interval` is no multiple of `period`.
     """
 
-    vehicle: Vehicle  # gives the limits and the initial guess, hover; the model passed to a call gives the dynamics
-    weights: Weights = field(default_factory=Weights)  # of the cost
-    steps: int = 20  # intervals of the horizon
-    interval: float = 0.05  # length of one [s]; one step of RK4
-    period: float = 0.01  # time between two calls [s]
-    iterations: int = 1  # Gauss–Newton steps per call
-    damping: float = 1e-3  # lower bound of the damping
-    min_speed: float = 0.0  # lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's
-    unit_quaternion: bool = True  # normalise the quaternion after each step of the prediction
-    rotor_lag: float = 0.0  # time constant with which rotors follow their commands [s]; see `rotor_speeds`
+    vehicle: Vehicle
+    weights: Weights = field(default_factory=Weights)
+    steps: int = 20
+    interval: float = 0.05
+    period: float = 0.01
+    iterations: int = 1
+    damping: float = 1e-3
+    min_speed: float = 0.0
+    unit_quaternion: bool = True
+    rotor_lag: float = 0.0
 
     def __post_init__(self):
         for name, kind in (("vehicle", Vehicle), ("weights", Weights)):
@@ -113,13 +131,21 @@ class Controller:
         return Plan(variables, jnp.asarray(jnp.inf, float), jnp.asarray(INITIAL_DAMPING, float))
 
     def speeds(self, plan: Plan) -> Float[Array, "t rotors"]:
-        """The rotor speeds [rad/s] of a plan, within the limits."""
+        """The rotor speeds [rad/s] of a plan, within the limits.
+
+        Args:
+            plan: what a call returned.
+        """
         return self._speeds(jnp.tanh(plan.variables))
 
     def horizon(self, reference: Float[Array, "n 13"], i: int | Scalar) -> Float[Array, "t 13"]:
         """The reference at the end of each interval of a call at sample i, from one sample per period.
 
         For a traced i the last sample, with its velocity, stands for all beyond the end.
+
+        Args:
+            reference: a state for each period (n, 13).
+            i: number of the sample, from 0.
 
         Raises:
             ValueError: a concrete i is negative, or its horizon ends after the reference.

@@ -21,17 +21,26 @@ class Weights:
     Tilt and rotor speed must differ from their reference in a steady wind or under an error of k. Tilt therefore costs
     little, and of rotor speeds only the changes cost; otherwise position would pay for it.
 
+    Attributes:
+        position: of the distance [1/m].
+        tilt: of the attitude error about the body's x and y axes [1/rad].
+        yaw: of the attitude error about the body's z axis [1/rad].
+        velocity: of the velocity's error [s/m].
+        body_rates: of the body rates' error [s/rad].
+        change: of a rotor's speed from one interval to the next, as a share of half its range.
+        terminal: factor on all deviations of the last state of the horizon.
+
     Raises:
         ValueError: a weight is negative or not finite, or `position`, `yaw` or `change` is zero.
     """
 
-    position: float = 10.0  # 1/m
-    tilt: float = 0.3  # of the attitude error about body x and y, 1/rad
-    yaw: float = 3.0  # of the attitude error about body z, 1/rad
-    velocity: float = 1.5  # s/m
-    body_rates: float = 0.3  # s/rad
-    change: float = 1.0  # of a rotor's speed from one interval to the next, as a share of half its range
-    terminal: float = 3.0  # factor on all deviations of the last state of the horizon
+    position: float = 10.0
+    tilt: float = 0.3
+    yaw: float = 3.0
+    velocity: float = 1.5
+    body_rates: float = 0.3
+    change: float = 1.0
+    terminal: float = 3.0
 
     def __post_init__(self):
         for field in fields(self):

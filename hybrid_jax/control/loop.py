@@ -27,12 +27,19 @@ SATURATION_MARGIN = 0.01  # share of its range from a limit, within which a roto
 
 
 class Flight(eqx.Module):
-    """A closed-loop flight of t periods."""
+    """A closed-loop flight of t periods.
 
-    x: Float[Array, "*n t+1 13"]  # true states, the initial one first
-    u: Float[Array, "*n t 4"]  # rotor speeds that are commanded over each period, rad/s
-    plans: Plan  # of the controller at each call
-    estimates: Any  # state of the estimator at each call
+    Attributes:
+        x: true states (t + 1, 13), the initial one first.
+        u: rotor speeds that are commanded over each period (t, 4) [rad/s].
+        plans: of the controller at each call.
+        estimates: state of the estimator at each call.
+    """
+
+    x: Float[Array, "*n t+1 13"]
+    u: Float[Array, "*n t 4"]
+    plans: Plan
+    estimates: Any
 
     @property
     def disturbance(self) -> Float[Array, "*n t 6"]:
@@ -46,11 +53,16 @@ class Hardware:
 
     A sample at time t decides what is commanded from t + latency on, and the rotors follow with a lag. The plant is
     told their mean speed over each period. Sensors add white noise to each entry of the state.
+
+    Attributes:
+        latency: time from a sample to its command [s], a multiple of the controller's period.
+        rotor_lag: time constant [s].
+        noise: standard deviations of position [m], quaternion, velocity [m/s] and body rates [rad/s].
     """
 
-    latency: float = 0.0  # from a sample to its command, a multiple of the controller's period [s]
-    rotor_lag: float = 0.0  # time constant [s]
-    noise: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)  # std: m, of quaternions, m/s, rad/s
+    latency: float = 0.0
+    rotor_lag: float = 0.0
+    noise: tuple[float, float, float, float] = (0.0, 0.0, 0.0, 0.0)
 
     def __post_init__(self):
         checks.not_negative("latency", self.latency)
@@ -61,7 +73,11 @@ class Hardware:
             checks.not_negative("noise", size)
 
     def delay(self, period: float) -> int:
-        """The latency in periods."""
+        """The latency in periods.
+
+        Args:
+            period: of the controller [s].
+        """
         periods = round(self.latency / period)
         if abs(periods * period - self.latency) > 1e-6 * period:
             raise ValueError(f"latency must be a multiple of the period {period}, got {self.latency}")
@@ -80,13 +96,21 @@ class Hardware:
 
 
 class Performance(eqx.Module):
-    """Tracking performance of a flight."""
+    """Tracking performance of a flight.
 
-    position_rmse: Scalar  # m
-    yaw_rmse: Scalar  # rad
-    largest_error: Scalar  # of position, m
-    crashed: Bool[Array, ""]  # below the ground, too far from the reference, or not finite
-    saturation: Scalar  # share of the rotor speeds at a limit
+    Attributes:
+        position_rmse: [m].
+        yaw_rmse: [rad].
+        largest_error: of position [m].
+        crashed: below the ground, too far from the reference, or not finite.
+        saturation: share of the rotor speeds at a limit.
+    """
+
+    position_rmse: Scalar
+    yaw_rmse: Scalar
+    largest_error: Scalar
+    crashed: Bool[Array, ""]
+    saturation: Scalar
 
 
 class Moment(eqx.Module):
@@ -102,14 +126,25 @@ class Moment(eqx.Module):
 
 
 class Loop(NamedTuple):
-    """A closed loop that can be stopped and continued, which `fly` is made of."""
+    """A closed loop that can be stopped and continued, which `fly` is made of.
+
+    Attributes:
+        controller: plans at each period.
+        hardware: what stands between controller and vehicle.
+        estimator: an `AbstractEstimator`, or one with its methods.
+    """
 
     controller: Controller
     hardware: Hardware
-    estimator: Any  # an `AbstractEstimator` or one with its methods
+    estimator: Any
 
     def begin(self, x0: State, plan: Plan, key: PRNGKeyArray) -> Moment:
-        """At the state x0, with the rotors at the speeds of the plan."""
+        """At the state x0, with the rotors at the speeds of the plan.
+
+        Args:
+            x0: true state (13,).
+            plan: that the rotors follow at first.
+        """
         key, now = jax.random.split(key)
         seen, speeds = self.hardware.measure(x0, now), self.controller.speeds(plan)[0].astype(x0.dtype)
         sent = jnp.tile(speeds, (self.hardware.delay(self.controller.period), 1))
@@ -119,6 +154,12 @@ class Loop(NamedTuple):
         """One period, the i-th; also returns what is commanded [rad/s].
 
         The controller plans from where its model expects the vehicle when the command arrives.
+
+        Args:
+            plant: the true vehicle, as in `fly`.
+            reference: a state for each period (n, 13).
+            now: what `begin` or the last `tick` returned.
+            i: number of the period, from 0.
         """
         controller, estimator, period = self.controller, self.estimator, self.controller.period
         model, x, speeds = estimator.model(now.estimate), now.seen, now.speeds
@@ -158,6 +199,8 @@ def fly(
     if a compiled function does not return them.
 
     Args:
+        x0: true state at the start (13,).
+        controller: plans at each period.
         plant: returns the state one period later.
         model: prediction model of the controller and of the observer.
         reference: one state per period (see `references.sample`).
@@ -201,6 +244,9 @@ def performance(
     """Tracking performance after the initial state.
 
     Args:
+        flight: what `fly` returned.
+        reference: a state for each period (n, 13).
+        controller: that flew; gives the limits of the rotor speeds.
         ground: altitude below which a flight counts as crashed [m].
         crash_distance: distance from the reference beyond which it does [m].
     """
@@ -222,10 +268,15 @@ def performance(
 
 
 class OpenLoopCosts(NamedTuple):
-    """Costs of the plans of some calls of a flight. Plans that run to their end show the model's errors unhidden."""
+    """Costs of the plans of some calls of a flight. Plans that run to their end show the model's errors unhidden.
 
-    predicted: Float[Array, " c"]  # by the controller's model
-    actual: Float[Array, " c"]  # of the same inputs in the plant
+    Attributes:
+        predicted: by the controller's model, of each call (c,).
+        actual: of the same inputs in the plant (c,).
+    """
+
+    predicted: Float[Array, " c"]
+    actual: Float[Array, " c"]
 
 
 def open_loop_costs(
@@ -239,6 +290,14 @@ def open_loop_costs(
     """Predicted and actual open-loop cost of the plans of these calls, with the hardware that the flight had.
 
     A plan begins when its command arrives, so that a call must be earlier than the end by the latency.
+
+    Args:
+        plant: the true vehicle, as in `fly`.
+        flight: what `fly` returned.
+        reference: a state for each period (n, 13).
+        controller: that flew.
+        calls: numbers of the controller's calls, from 0.
+        hardware: of the flight; by default none.
     """
     hardware = Hardware() if hardware is None else hardware
     lag, delay = hardware.rotor_lag, hardware.delay(controller.period)
@@ -272,6 +331,11 @@ def relative_cost_error(costs: OpenLoopCosts, controller: Controller, distance: 
 
     The denominator is at least the cost of plans that stay `distance` [m] from the reference, because near zero the
     ratio means nothing; ValueError if it is not positive.
+
+    Args:
+        costs: what `open_loop_costs` returned.
+        controller: gives the weights and the horizon.
+        distance: of the plans that set the least denominator [m].
     """
     checks.positive("distance", distance)
     weights = controller.weights

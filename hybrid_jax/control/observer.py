@@ -43,21 +43,27 @@ class Estimate(eqx.Module):
 
 
 class Observer(AbstractEstimator):
-    """The disturbance observer, see `Estimate`, around a prediction model."""
+    """The disturbance observer, see `Estimate`, around a prediction model.
+
+    Attributes:
+        field: the prediction model without a disturbance.
+        bandwidth: of the observer [rad/s]; 0 leaves the disturbance at zero.
+        period: time between two samples [s].
+    """
 
     field: AbstractVectorField
-    bandwidth: Scalar | float  # rad/s; 0 leaves the disturbance at zero
+    bandwidth: Scalar | float
     period: float = eqx.field(static=True)
 
     def begin(self, x):
         return Watched(Estimate.begin(x), x)
 
-    def update(self, estimate, x, u):
-        expected = estimate.estimate.predict(self.field, estimate.x, u, self.period)
+    def update(self, state, x, u):
+        expected = state.estimate.predict(self.field, state.x, u, self.period)
         return Watched(expected.correct(x, self.bandwidth, self.period), x)
 
-    def model(self, estimate):
-        return disturbed(self.field, estimate.disturbance)
+    def model(self, state):
+        return disturbed(self.field, state.disturbance)
 
 
 class Watched(eqx.Module):

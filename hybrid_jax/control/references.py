@@ -26,7 +26,13 @@ X, Y, Z = np.eye(3).tolist()
 
 
 def sample(path: Path, controller: Controller, duration: float) -> Float[Array, "n 13"]:
-    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call."""
+    """One reference state per period, for a flight of `duration` [s] and the horizon of its last call.
+
+    Args:
+        path: such as `hover()`: a function of time [s] to position [m] and yaw [rad].
+        controller: gives the period, the horizon and gravity.
+        duration: length of the flight [s].
+    """
     if not callable(path):
         raise ValueError(f"path must be a function of time, such as hover(), got {checks.short_repr(path)}")
     checks.positive("duration", duration, "a positive number of seconds")
@@ -61,14 +67,26 @@ def attitude_along(thrust: Float[Array, "3"], yaw: Scalar) -> Quaternion:
 
 
 def hover(position: tuple[float, float, float] = (0.0, 0.0, 1.0), yaw: float = 0.0) -> Path:
-    """Stay at a position [m] with a yaw [rad]."""
+    """Stay at a position [m] with a yaw [rad].
+
+    Args:
+        position: (x, y, z) in the world [m].
+        yaw: angle about the world's z axis [rad].
+    """
     _check_vector("position", position)
     checks.number("yaw", yaw)
     return lambda t: (jnp.array(position) + 0 * t, jnp.asarray(yaw) + 0 * t)
 
 
 def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.5, yaw: float = 0.0) -> Path:
-    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s]."""
+    """Gerono's lemniscate, x = a sin φ, y = a sin φ cos φ, a [m], φ̇ constant; fastest at its centre, √2 a φ̇ [m/s].
+
+    Args:
+        top_speed: at the centre [m/s].
+        half_width: a, the largest distance from the centre along x [m].
+        altitude: height above the origin [m].
+        yaw: constant angle about the world's z axis [rad].
+    """
     checks.positive("top_speed", top_speed)
     checks.positive("half_width", half_width)
     checks.number("altitude", altitude)
@@ -84,7 +102,14 @@ def figure_eight(top_speed: float, half_width: float = 4.0, altitude: float = 1.
 
 
 def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, altitude: float = 1.5) -> Path:
-    """Hover over the origin; at time `at` [s] the position jumps by `to` [m] and the yaw to `yaw` [rad]."""
+    """Hover over the origin; at time `at` [s] the position jumps by `to` [m] and the yaw to `yaw` [rad].
+
+    Args:
+        to: jump of the position (x, y, z) [m].
+        at: time of the jump [s].
+        yaw: yaw after the jump [rad]; before it is 0.
+        altitude: height before the jump [m].
+    """
     _check_vector("to", to)
     for name, value in (("at", at), ("yaw", yaw), ("altitude", altitude)):
         checks.number(name, value)
@@ -100,6 +125,12 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
     """Fly along x at `speed` [m/s], down to the altitude `low` [m] and up to `high`, every `every` seconds.
 
     The altitude follows cos⁴, which is flat at the bottom: 40 % of the time is spent in the lowest tenth.
+
+    Args:
+        speed: along x [m/s].
+        low: lowest altitude [m], above 0.
+        high: highest altitude [m].
+        every: time from one highest point to the next [s].
     """
     checks.number("speed", speed)
     checks.number("high", high)
@@ -116,7 +147,12 @@ def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: fl
 
 
 def add_body_rates(state: State, rates: tuple[float, float, float] = (6.0, 0.0, 0.0)) -> State:
-    """The state with body rates [rad/s] added: a large-rate initial condition."""
+    """The state with body rates [rad/s] added: a large-rate initial condition.
+
+    Args:
+        state: of a multirotor (13,).
+        rates: what is added to the body rates (x, y, z) [rad/s].
+    """
     state = checks.floating("state", state)
     if state.shape != (STATE_SIZE,):
         raise ValueError(f"state (13,) expected, got {state.shape}")

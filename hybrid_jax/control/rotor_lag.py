@@ -16,6 +16,12 @@ def rotor_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[
 
     Exact for a command that is held. To take the mean as speeds that are held is right for velocities, to first order
     of the change; over an interval as long as the lag, positions and angles need `stage_shares`.
+
+    Args:
+        speeds: of the rotors at the start [rad/s].
+        command: held over dt [rad/s].
+        lag: τ, time constant [s]; 0 for none.
+        dt: time that passes [s].
     """
     if not lag:
         return command, command

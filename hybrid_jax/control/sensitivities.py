@@ -105,7 +105,13 @@ def advance_lagged(
 
 
 def advance(model: AbstractVectorField, x: State, u: Input, dt: float, unit_quaternion: bool = True) -> State:
-    """The state after dt [s] with u held: one step of classical RK4."""
+    """The state after dt [s] with u held: one step of classical RK4.
+
+    Args:
+        model: ẋ = f(x, u) of a rigid body.
+        dt: length of the step [s].
+        unit_quaternion: normalise the quaternion afterwards.
+    """
     x = rk4_step(model, x, u, dt)
     return _with_unit_quaternion(x) if unit_quaternion else x
 

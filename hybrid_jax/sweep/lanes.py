@@ -25,7 +25,11 @@ WIDTH = {"cpu": 1}  # one lane fills the cache (benchmarks/sweep.py); on a GPU a
 
 
 def stack(lanes: Sequence[PyTree]) -> PyTree:
-    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, such as numbers, differ."""
+    """One tree whose arrays have a first axis over the lanes; ValueError if other leaves, such as numbers, differ.
+
+    Args:
+        lanes: trees of one structure, one for each lane.
+    """
 
     def stacked(*leaves):
         if isinstance(leaves[0], jax.Array | np.ndarray | np.generic):
@@ -38,7 +42,13 @@ def stack(lanes: Sequence[PyTree]) -> PyTree:
 
 
 def lane(lanes: PyTree, index: int | np.ndarray) -> PyTree:
-    """The lane, or lanes, at an index of the first axis."""  # asarray: an entry of a NumPy vector is a scalar
+    """The lane, or lanes, at an index of the first axis.
+
+    Args:
+        lanes: a tree whose arrays have a first axis over the lanes.
+        index: number of a lane, from 0, or an array of numbers or truth values.
+    """
+    # asarray: an entry of a NumPy vector is a scalar
     return jax.tree.map(lambda leaf: np.asarray(leaf[index]) if eqx.is_array(leaf) else leaf, lanes)
 
 
@@ -109,7 +119,13 @@ class LaneMap:
         return lane(results, np.array([where[i] for i in active], int))
 
     def schedule(self, total: int, costs: Numbers, active: Numbers) -> tuple[list[np.ndarray], int, int]:
-        """Each device's shard, the width of a chunk, and the chunks that a device can take."""
+        """Each device's shard, the width of a chunk, and the chunks that a device can take.
+
+        Args:
+            total: the number of lanes.
+            costs: expected work of each lane, in any unit.
+            active: numbers of the lanes that are run.
+        """
         devices = len(self.devices)
         width = self.width or -(-total // devices)
         lanes = max(total, self._min_capacity if self.width else 0)

@@ -31,15 +31,25 @@ PROGRAMS = 16  # compiled programs kept in memory, to train and to evaluate
 
 @dataclass(frozen=True)
 class Progress:
-    """The state of a sweep after a block of epochs."""
+    """The state of a sweep after a block of epochs.
 
-    active: int  # lanes still training
-    lanes: int  # all lanes
-    epochs: int  # the most that a lane has completed
-    best: float  # the smallest validation L_MSE of any lane
-    at_least: int  # epochs that some active lane still needs
-    at_most: int  # epochs that some active lane may still need
-    seconds: float  # since the sweep began
+    Attributes:
+        active: lanes that are still training.
+        lanes: all lanes.
+        epochs: the most that a lane has completed.
+        best: the smallest validation L_MSE of any lane.
+        at_least: epochs that some active lane still needs.
+        at_most: epochs that some active lane may still need.
+        seconds: since the sweep began [s].
+    """
+
+    active: int
+    lanes: int
+    epochs: int
+    best: float
+    at_least: int
+    at_most: int
+    seconds: float
 
 
 def sweep(
@@ -57,6 +67,8 @@ def sweep(
     """Train every lane until it stops. If all have stopped already, the program is compiled and nothing is trained.
 
     Args:
+        validation: the windows that stop a lane early.
+        settings: as of `fit`, the same for all lanes.
         states: stacked initial states, one for each lane (`fitting.start`, `lanes.stack`).
         plans: stacked run configurations, one for each lane.
         train: the windows that `plans` index into; shared by all lanes, as `validation` is.
@@ -100,7 +112,15 @@ def sweep(
 def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:
-    """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`."""
+    """L_MSE of each lane's field in inference mode on every `every`-th state; compiled for at least `min_lanes`.
+
+    Args:
+        fields: stacked fields, one for each lane.
+        windows: shared by all lanes.
+        every: count the state after each so many intervals.
+        settings: give the integrator.
+        min_lanes: lanes to compile for at least.
+    """
     return evaluate_windows(fields, windows, every, settings, min_lanes)[0]
 
 
