@@ -84,7 +84,7 @@ def conclusion(outputs: Outputs) -> list[str]:
     place, label = max((i, label) for i, label in enumerate(selected.labels) if label != SUM)
     value, low, high = (end[place, 0] for end in selected.expected)
     interval = f" ({LEVEL:.0%} interval {low:.2g} to {high:.2g})" if np.isfinite(high) else ""
-    chosen = ", ".join(dict.fromkeys(each.chosen for each in outputs.selections))
+    chosen = ", ".join(dict.fromkeys(str(each.chosen) for each in outputs.selections))
     return [
         f"Chosen by flights left out of training: {chosen}.",
         f"After {label} steps of a flight not seen, expect a position RMSE of {value:.2g} m{interval}.",
@@ -149,7 +149,7 @@ def expected_table(selections: Sequence[Selection]) -> Table:
             yield text + tested * bool(len(came_out))
 
     lines = [
-        (each.fold, each.chosen, str(each.n_train or EMPTY), label, *cells_of(each, place))
+        (each.fold, str(each.chosen), str(each.n_train or EMPTY), label, *cells_of(each, place))
         for each in selections
         for place, label in enumerate(each.labels)
     ]
@@ -243,7 +243,7 @@ def choice_table(selections: Sequence[Selection]) -> Table:
             worst = f"{ratios.max():.3f} ({selected.left_out[int(ratios.argmax())]})"
             mark = "yes" * (name == selected.chosen)
             mean = f"{np.exp(scores.mean()):.3f}"
-            lines.append((selected.fold, str(selected.n_train or EMPTY), name, mean, worst, mark))
+            lines.append((selected.fold, str(selected.n_train or EMPTY), str(name), mean, worst, mark))
     title = "Candidates: error on flights left out of training over that of thrust with frozen rates (geometric mean)"
     return Table(title, ("tested on", "N", "candidate", "mean", "worst", "chosen"), lines, labels=3)
 

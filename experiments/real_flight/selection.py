@@ -16,17 +16,34 @@ share the flight.
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import scipy
 from jaxtyping import Float
 
-# Of each candidate, the simplest first: log of its error over that of thrust with frozen rates, mean over quantities.
-Scores = Mapping[str, Float[np.ndarray, "flights seeds"]]
-
-BLEND = " + "  # between the names of candidates whose fields are averaged
 LEVEL = 0.8
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A model and the recipe that trains it; a baseline, without a recipe; or the mean of the fields of some parts."""
+
+    model: str
+    recipe: str = ""
+    parts: tuple["Candidate", ...] = ()
+
+    @classmethod
+    def blend(cls, parts: Sequence["Candidate"]) -> "Candidate":
+        return cls("", parts[0].recipe, tuple(parts))
+
+    def __str__(self) -> str:
+        return " + ".join(map(str, self.parts)) if self.parts else f"{self.model} {self.recipe}".rstrip()
+
+
+Named = TypeVar("Named")  # a candidate, or any other name of one
+# Of each candidate, the simplest first: log of its error over that of thrust with frozen rates, mean over quantities.
+Scores = Mapping[Named, Float[np.ndarray, "flights seeds"]]
 
 
 @dataclass(frozen=True)
@@ -35,9 +52,9 @@ class Selection:
 
     fold: str
     n_train: int
-    chosen: str
+    chosen: Candidate
     left_out: Sequence[str]  # flights or manoeuvres
-    scores: Scores
+    scores: Scores[Candidate]
     expected: Float[np.ndarray, "3 labels quantities"]  # of the chosen candidate, and the ends of the interval
     labels: Sequence[str] = ()
     observed: dict[str, np.ndarray] = field(default_factory=dict)  # its errors on each test flight, where there are any
@@ -49,34 +66,36 @@ class Selection:
 
     def described(self) -> dict[str, Any]:
         """As JSON values."""
-        scores = {name: dict(zip(self.left_out, each.mean(axis=1), strict=True)) for name, each in self.scores.items()}
+        flights = self.left_out
+        scores = {str(name): dict(zip(flights, each.mean(axis=1), strict=True)) for name, each in self.scores.items()}
         return vars(self) | {
+            "chosen": str(self.chosen),
             "scores": scores,
             "expected": dict(zip(("value", "low", "high"), self.expected, strict=True)),
         }
 
 
-def choose(scores: Scores, baselines: Collection[str]) -> str:
+def choose(scores: Scores[Named], baselines: Collection[Named]) -> Named:
     """The simplest candidate within one standard error of the best, of those that are considered."""
     considered = _considered(scores, baselines)
     best = min(considered, key=lambda name: scores[name].mean())
     return next(name for name in considered if _within_error(scores[name], scores[best]))
 
 
-def undecided(scores: Scores, baselines: Collection[str]) -> list[str]:
+def undecided(scores: Scores[Named], baselines: Collection[Named]) -> list[Named]:
     """The two best learned candidates, if both are within one standard error of the best candidate, else none."""
     ordered = sorted(_considered(scores, baselines), key=lambda name: scores[name].mean())
     near = [name for name in ordered if _within_error(scores[name], scores[ordered[0]]) and name not in baselines]
     return near[:2] if len(near) > 1 else []
 
 
-def _considered(scores: Scores, baselines: Collection[str]) -> list[str]:
+def _considered(scores: Scores[Named], baselines: Collection[Named]) -> list[Named]:
     """The candidates that are nowhere worse than the safest baseline, beyond a standard error over seeds."""
     finite = [name for name, each in scores.items() if np.isfinite(each).all()]
     worst = {name: scores[name].mean(axis=1).max() for name in finite if name in baselines}
     baseline = scores[min(worst, key=worst.__getitem__)]
 
-    def safe(name: str) -> bool:
+    def safe(name: Named) -> bool:
         worse = scores[name] - baseline
         seeds = worse.shape[1]
         error = worse.std(axis=1, ddof=1) / seeds**0.5 if seeds > 1 else 0.0

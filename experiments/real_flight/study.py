@@ -31,7 +31,7 @@ from experiments.real_flight.scoring import (
     linear_residuals,
     parameters,
 )
-from experiments.real_flight.selection import BLEND, Selection
+from experiments.real_flight.selection import Candidate, Selection
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting import names
 from experiments.reporting.results import Results
@@ -104,15 +104,15 @@ def source_of(experiment: Experiment, name: str, fold: Fold, like: Source | None
     return data, trained
 
 
-def candidates(config: RealFlightConfig) -> list[str]:
+def candidates(config: RealFlightConfig) -> list[Candidate]:
     """Baselines, and models with their recipes, the simplest first; of those trained in the same way, one."""
     learned = [
-        f"{model} {recipe}"
+        Candidate(model, recipe)
         for model in (names.PHYSICS_ONLY, names.HYBRID)
         for recipe in config.tried
         if model in config.models and equivalent_recipe(model, recipe, config.tried) == recipe
     ]
-    return [*reversed(BASELINES), *learned]
+    return [*map(Candidate, reversed(BASELINES)), *learned]
 
 
 class Trainer:
@@ -123,13 +123,14 @@ class Trainer:
         self.adapts = "target" in experiment.logs
         self.mode = names.FINE_TUNED if self.adapts else names.SOURCE_ONLY  # of what is delivered
         self.source_data, self.source_model = source
-        self.target_data, self.trained = cache(self._target_data), cache(self._trained)
 
-    def _target_data(self, recipe: str) -> TrainingData:
+    @cache  # noqa: B019 - a trainer lives as long as its fold
+    def target_data(self, recipe: str) -> TrainingData:
         loss = self.source_data(recipe).objective
         return train.training_data(self.experiment, self.fold, recipe, loss, 1, self.capacity)
 
-    def _trained(self, model: str, recipe: str, seeds: int, mode: str) -> TrainedModel:
+    @cache  # noqa: B019
+    def trained(self, model: str, recipe: str, seeds: int, mode: str) -> TrainedModel:
         """A model adapted to each N, or without a target trained on all flights of the fold."""
         experiment, first = self.experiment, self.source_model(model, recipe, seeds)
         if self.adapts:
@@ -138,14 +139,14 @@ class Trainer:
         again = experiment.config.refit
         return train.refit(experiment, self.name, self.fold, self.source_data(recipe), first) if again else first
 
-    def fields(self, candidate: str, seeds: int, size: int) -> Sequence[AbstractVectorField]:
+    def fields(self, candidate: Candidate, seeds: int, size: int) -> Sequence[AbstractVectorField]:
         """A candidate for an N of the configuration, 0 without a target: a field per seed, or one if all are equal."""
-        if BLEND in candidate:
-            parts = [self.fields(part, seeds, size) for part in candidate.split(BLEND)]
+        model = candidate.model
+        if candidate.parts:
+            parts = [self.fields(part, seeds, size) for part in candidate.parts]
             return [Blend(each) for each in zip(*parts, strict=True)]
-        model, _, recipe = candidate.partition(" ")
-        if recipe:
-            trained = self.trained(model, recipe, seeds, self.mode)
+        if candidate.recipe:
+            trained = self.trained(model, candidate.recipe, seeds, self.mode)
             first = self.experiment.config.n.index(size) * seeds if self.adapts else 0
             return [trained.run(first + seed) for seed in range(seeds)]
         if model == names.LINEAR_RESIDUAL:
@@ -183,7 +184,7 @@ class Trainer:
         names = np.repeat([of(log) for log in logs], cut.sizes)
         return cut.windows, [(name, names == name) for name in dict.fromkeys(names.tolist())]
 
-    def log_errors(self, candidate: str, seeds: int, size: int) -> np.ndarray:
+    def log_errors(self, candidate: Candidate, seeds: int, size: int) -> np.ndarray:
         """Logs of a candidate's errors, (flights, seeds, labels, quantities)."""
         fields, config = self.fields(candidate, seeds, size), self.experiment.config
 
@@ -203,17 +204,20 @@ def select(trainer: Trainer, inner: Sequence[Trainer], size: int) -> Selection:
     seeds, labels = min(CHOICE_SEEDS, config.seeds), scoring.labels(config)
     judged = [labels.index(SUM)] if SUM in labels else range(len(labels))
 
+    baselines = [*map(Candidate, BASELINES)]
+
     @cache
-    def errors(candidate: str) -> np.ndarray:
+    def errors(candidate: Candidate) -> np.ndarray:
         return np.concatenate([each.log_errors(candidate, seeds, size) for each in inner])
 
-    def scored(candidate: str) -> np.ndarray:
-        return (errors(candidate) - errors(names.THRUST))[:, :, judged].mean(axis=(2, 3))
+    def scored(candidate: Candidate) -> np.ndarray:
+        return (errors(candidate) - errors(Candidate(names.THRUST)))[:, :, judged].mean(axis=(2, 3))
 
     scores = {candidate: scored(candidate) for candidate in candidates(config)}
-    if pair := selection.undecided(scores, BASELINES):
-        scores[BLEND.join(pair)] = scored(BLEND.join(pair))
-    chosen = selection.choose(scores, BASELINES)
+    if pair := selection.undecided(scores, baselines):
+        both = Candidate.blend(pair)
+        scores[both] = scored(both)
+    chosen = selection.choose(scores, baselines)
     left_out = [name for each in inner for name in each.tested]
     observed = np.exp(trainer.log_errors(chosen, config.seeds, size).mean(axis=1))
     expected = selection.expected(errors(chosen).mean(axis=1))
@@ -223,9 +227,9 @@ def select(trainer: Trainer, inner: Sequence[Trainer], size: int) -> Selection:
 
 def recipe_of(selected: Selection, config: RealFlightConfig) -> str:
     """The recipe of the models in the report: the chosen one, or with a baseline that of the best learned candidate."""
-    learned = {name: each.mean() for name, each in selected.scores.items() if " " in name and np.isfinite(each).all()}
-    best = selected.chosen if selected.chosen in learned else min(learned, key=learned.__getitem__, default="")
-    return best.split(BLEND)[0].partition(" ")[2] or config.tried[0]
+    learned = {name: each.mean() for name, each in selected.scores.items() if name.recipe and np.isfinite(each).all()}
+    best = selected.chosen if selected.chosen in learned else min(learned, key=learned.__getitem__, default=None)
+    return best.recipe if best else config.tried[0]
 
 
 def _run_fold(experiment: Experiment, outputs: Outputs, number: int, source: Source) -> None:
@@ -251,7 +255,7 @@ def _test(trainer: Trainer, outputs: Outputs, number: int, selections: Sequence[
     windows, replicates = trainer.test_windows()
     score = partial(scoring.score, windows=windows, replicates=replicates, config=config, fold=trainer.fold.name)
     for model in (names.HOLD, names.THRUST):
-        yield score(*trainer.fields(model, 1, 0), model=model, mode=names.NOMINAL)
+        yield score(*trainer.fields(Candidate(model), 1, 0), model=model, mode=names.NOMINAL)
     chosen = recipe_of(max(selections, key=lambda each: each.n_train), config)
     for model in config.models:
         for trained, theta in _models(trainer, model, equivalent_recipe(model, chosen, config.tried)):
@@ -264,7 +268,7 @@ def _test(trainer: Trainer, outputs: Outputs, number: int, selections: Sequence[
         for seed in range(config.seeds):
             outputs.chosen[number, size, seed] = each = fields[seed % len(fields)]
             tags = {"model": names.CHOSEN, "mode": trainer.mode, "n_train": size, "seed": seed}
-            yield score(each, **tags, recipe=selected.chosen)
+            yield score(each, **tags, recipe=str(selected.chosen))
 
 
 def _models(trainer: Trainer, model: str, recipe: str) -> Iterable[tuple[TrainedModel, list[dict[str, Any]]]]:

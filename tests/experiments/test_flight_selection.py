@@ -8,13 +8,14 @@ from recorded import CONFIG, LOGS, OTHERS, samples
 
 from experiments.real_flight.folds import Fold, leave_out, make_folds, motion_of_logs, require_windows
 from experiments.real_flight.report import expected_table, warnings_of
-from experiments.real_flight.selection import BLEND, Selection, choose, expected, undecided
+from experiments.real_flight.selection import Candidate, Selection, choose, expected, undecided
 from experiments.real_flight.study import candidates, recipe_of
 from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.windows import cut_windows, flight_of, manoeuvre_of
 
 SIMPLE = ("hold", "thrust")
 GOOD = [-0.5, -0.4, -0.6, -0.5]
+STAGED, TURNING = Candidate("hybrid", "staged"), Candidate("hybrid", "turning")
 
 
 def scores(seeds=2, **flights):
@@ -59,8 +60,8 @@ def test_learned_candidates_that_are_not_told_apart_are_blended():
     assert sorted(undecided(scores(**close), SIMPLE)) == ["a", "b"]
     assert undecided(scores(a=GOOD), SIMPLE) == []
     assert undecided(scores(a=GOOD, b=[-0.1, -0.2, -0.1, -0.1]), SIMPLE) == []
-    both = scores(**close) | {BLEND.join(undecided(scores(**close), SIMPLE)): scores(a=GOOD)["a"] - 0.3}
-    assert choose(both, SIMPLE) == BLEND.join(undecided(scores(**close), SIMPLE))
+    both = scores(**close) | {"a + b": scores(a=GOOD)["a"] - 0.3}
+    assert choose(both, SIMPLE) == "a + b"
 
 
 def test_a_baseline_is_mostly_taken_where_others_are_better_by_chance():
@@ -120,21 +121,22 @@ def test_one_manoeuvre_or_flight_is_refused_with_what_to_do():
 def test_candidates_are_the_simplest_first():
     config = replace(CONFIG, recipes=("staged", "turning"))
     learned = ["physics_only staged", "hybrid staged", "hybrid turning"]  # of physics alone, both are one
-    assert candidates(config) == ["hold", "thrust", "linear_residual", *learned]
+    assert [*map(str, candidates(config))] == ["hold", "thrust", "linear_residual", *learned]
 
 
 def selected(chosen, **more):
-    found = scores(**{"hybrid staged": GOOD, "hybrid turning": [2.0] * 4})
+    found = {Candidate(name): each for name, each in scores().items()}
+    found |= {STAGED: scores(a=GOOD)["a"], TURNING: scores(a=[2.0] * 4)["a"]}
     return Selection("square", 0, chosen, list("abcd"), found, expected(np.zeros((3, 1, 4))), ["10"], **more)
 
 
 def test_recipe_of_the_other_models():
-    for chosen in ("hybrid staged", "thrust", BLEND.join(("hybrid staged", "hybrid turning"))):
+    for chosen in (STAGED, Candidate("thrust"), Candidate.blend((STAGED, TURNING))):
         assert recipe_of(selected(chosen), CONFIG) == "staged"
 
 
 def test_report_says_how_many_flights_came_out_as_expected():
-    found = selected("thrust", observed={"a": np.ones((1, 4)), "b": np.full((1, 4), 2.0)})
+    found = selected(Candidate("thrust"), observed={"a": np.ones((1, 4)), "b": np.full((1, 4), 2.0)})
     np.testing.assert_array_equal(found.inside(), [[1] * 4])
     (line,) = expected_table([found]).lines
     assert line[:4] == ("square", "thrust", "–", "10")
