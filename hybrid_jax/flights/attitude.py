@@ -19,11 +19,17 @@ BODIES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1, -1])}
 
 @dataclass(frozen=True)
 class Frames:
-    """The frames of the vectors in a log; ENU stands for any world with z up."""
+    """The frames of the vectors in a log.
 
-    world: str  # ENU or NED
-    body: str  # FLU or FRD
-    velocity: str  # world or body
+    Attributes:
+        world: "ENU", which stands for any world with z up, or "NED".
+        body: "FLU" or "FRD".
+        velocity: where velocities stand, "world" or "body".
+    """
+
+    world: str
+    body: str
+    velocity: str
 
     def __post_init__(self):
         for name, known in (("world", WORLDS), ("body", BODIES), ("velocity", ("world", "body"))):

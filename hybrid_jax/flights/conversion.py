@@ -29,6 +29,8 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     States are interpolated linearly, attitudes spherically; rotor speeds are means of held values.
 
     Args:
+        recording: what was read of a log.
+        dt: interval of the samples [s].
         polynomial: rotor speed [rad/s] = Σ polynomial[i] commandⁱ, of commands as shares from 0 to 1; not needed where
             speeds were measured, but then preferred to speeds that are slower than commands.
 

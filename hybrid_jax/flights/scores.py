@@ -19,12 +19,19 @@ Errors = Float[Array | np.ndarray, "*n"]
 
 
 class FlightErrors(NamedTuple):
-    """Lengths of the error vectors, and the angle from the predicted attitude to the true one [0 … π]."""
+    """Sizes of the errors of predicted states.
 
-    position: Errors  # m
-    velocity: Errors  # m/s
-    rotation: Errors  # rad
-    body_rates: Errors  # rad/s
+    Attributes:
+        position: length of the error [m].
+        velocity: length of the error [m/s].
+        rotation: angle from the predicted attitude to the true one [rad], 0 … π.
+        body_rates: length of the error [rad/s].
+    """
+
+    position: Errors
+    velocity: Errors
+    rotation: Errors
+    body_rates: Errors
 
 
 def errors_between(predicted: Float[Array, "*n 13"], truth: Float[Array, "*n 13"]) -> FlightErrors:
@@ -45,6 +52,9 @@ def flight_errors(
     """Compute the errors (n, t) of a field in inference mode, for every window at the end of every interval.
 
     Args:
+        field: the model.
+        windows: true states and inputs, states as in `hybrid_jax.state`.
+        solver: integrates the field; by default the classical Runge–Kutta method of fourth order.
         chunk: number of windows that are predicted at a time.
 
     Raises:

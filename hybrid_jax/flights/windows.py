@@ -27,11 +27,17 @@ _RUN = re.compile(r"[_\- ]*((run|flight|take|log)[_\- ]*|[_\- ])\d+$", re.IGNORE
 
 @dataclass(frozen=True)
 class LogWindows:
-    """Windows of several flights in float32, ordered by flight."""
+    """Windows of several flights.
+
+    Attributes:
+        windows: in float32, ordered by flight.
+        sizes: number of windows of each flight.
+        stride: samples between the starts of two windows.
+    """
 
     windows: Trajectories
-    sizes: list[int]  # windows of each flight
-    stride: int  # samples between the starts of two
+    sizes: list[int]
+    stride: int
 
     def __len__(self) -> int:
         return len(self.windows)
@@ -91,7 +97,7 @@ def load_windows(
 
 
 def flight_of(log: FlightLog) -> str:
-    """The name of a flight's file, without folder and `SUFFIXES`."""
+    """The name of a flight's file, without folder and suffix."""
     return _SUFFIX.sub("", Path(log.name).name)
 
 
@@ -105,6 +111,11 @@ def manoeuvre_of(log: FlightLog) -> str:
 
 def hold_out(logs: Sequence[FlightLog], names: Sequence[str], of: Callable[[FlightLog], str] = flight_of) -> Split:
     """Split flights into those of other names and those of the given names.
+
+    Args:
+        logs: the flights.
+        names: of the flights that are held out.
+        of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
 
     Raises:
         ValueError: an unknown name, or one side is empty.
@@ -126,8 +137,10 @@ def folds(
     """Make splits in which each flight is held out once, together with all flights of its name.
 
     Args:
+        logs: the flights.
         count: number of splits; by default one per name.
         of: the name of a flight: `flight_of`, `manoeuvre_of` or a function of your own.
+        seed: of the order in which names are dealt to the splits.
 
     Raises:
         ValueError: count is less than 2 or more than the number of names.
@@ -154,6 +167,11 @@ def require_common_interval(logs: Sequence[FlightLog]) -> float:
 
 def cut_windows(logs: Sequence[FlightLog], steps: int, stride: int = 1) -> LogWindows:
     """Cut logs into windows of `steps` intervals that cross no gap; logs shorter than a window are left out.
+
+    Args:
+        logs: flights with even samples.
+        steps: intervals per window.
+        stride: samples between the starts of two windows.
 
     Raises:
         ValueError: no log is as long as a window, or samples are not evenly spaced.

@@ -87,6 +87,8 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
     """Resample each segment at multiples of dt [s]: states linearly, attitudes spherically, motors as means.
 
     Args:
+        log: the flight.
+        dt: new interval between samples [s].
         longest_gap: interpolate across gaps and repeated samples up to this long [s].
 
     Raises:
@@ -117,6 +119,9 @@ def resample(log: FlightLog, dt: float, longest_gap: float = 0.0) -> tuple[Fligh
 def in_flight(log: FlightLog) -> tuple[FlightLog, str]:
     """Cut out the time on the ground, where `airborne` says that the vehicle is not in the air.
 
+    Args:
+        log: the flight.
+
     Raises:
         ValueError: no samples remain.
     """
@@ -130,6 +135,7 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
     """Filter states and motors with the same second-order Butterworth filter, segment by segment.
 
     Args:
+        log: the flight, with even samples.
         cutoff: −3 dB frequency [Hz] (−6 dB at zero phase, where the filter runs forward and back).
         causal: filter forward only, as on board; slow signals are delayed by √2 / (2π cutoff).
 
@@ -159,6 +165,10 @@ def low_pass(log: FlightLog, cutoff: float, *, causal: bool = False) -> tuple[Fl
 def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
     """Delay the motor values by `lag` [s]; samples that would need unknown values are cut.
 
+    Args:
+        log: the flight.
+        lag: delay [s]; a negative one shifts the motors to earlier times.
+
     Raises:
         ValueError: no segment is longer than the lag.
     """
@@ -178,6 +188,10 @@ def delay_motors(log: FlightLog, lag: float) -> tuple[FlightLog, str]:
 
 def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
     """Replace motors u by the mean over each interval of w with τ ẇ = u − w; segments start in equilibrium.
+
+    Args:
+        log: the flight, with even samples.
+        time_constant: τ [s], at least 0.
 
     Raises:
         ValueError: the time constant is negative, or samples are not evenly spaced.
@@ -199,6 +213,10 @@ def lag_motors(log: FlightLog, time_constant: float) -> tuple[FlightLog, str]:
 def align_motors(log: FlightLog, vehicle: Vehicle | None) -> tuple[FlightLog, str]:
     """Apply `delay_motors` with the lag of the best cross-correlation with the angular acceleration.
 
+    Args:
+        log: the flight.
+        vehicle: the vehicle, for the places and spins of its rotors and its inertia.
+
     Raises:
         ValueError: there is no vehicle, or the log has too little motion to estimate the lag.
     """
@@ -216,7 +234,9 @@ def choose_time_constant(
     """Choose the time constant [s] for `lag_motors` with the smallest error; also return the error of each candidate.
 
     Args:
+        logs: flights with even samples.
         error: prediction error of a model fitted to logs to which a candidate was applied.
+        candidates: time constants that are tried [s].
 
     Raises:
         ValueError: no error is finite, or as `lag_motors`.

@@ -50,18 +50,31 @@ LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in 
 
 @dataclass(frozen=True)
 class Check:
-    """The result of one check."""
+    """The result of one check.
 
-    name: str  # of the two records compared
+    Attributes:
+        name: of the check, such as the two records compared.
+        value: what was found, in `unit`; not a number where the check cannot tell.
+        unit: of value and limit, such as "s" or "relative error".
+        limit: maximum of the value; of correlations the minimum.
+        verdict: "ok", "warns", "fails" or "cannot tell".
+        suggestion: what to correct, if anything.
+    """
+
+    name: str
     value: float
     unit: str
-    limit: float  # maximum of the value; of correlations the minimum
-    verdict: str  # "ok", "warns", "fails" or "cannot tell"
-    suggestion: str  # what to correct, if anything
+    limit: float
+    verdict: str
+    suggestion: str
 
 
 def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     """Run all checks of a log against itself and its vehicle; without a vehicle, those that need none.
+
+    Args:
+        log: the flight.
+        vehicle: constants that its motion is compared with.
 
     Raises:
         ValueError: fewer than two samples, or another number of motors than the vehicle has.

@@ -25,6 +25,7 @@ def check_recording(recording: Recording, vehicle: Vehicle | None = None, dt: fl
     """Run all checks of a recording.
 
     Args:
+        recording: what was read of a log.
         vehicle: the vehicle that the log is to be of; without it, its rotors and largest speed are not compared.
         dt: interval [s] that the flight is to have; without it, the rates of the signals are not judged.
     """

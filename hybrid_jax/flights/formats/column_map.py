@@ -49,7 +49,13 @@ STATES = ("position", "attitude", "velocity", "body_rates", "motors")  # what tr
 
 @dataclass(frozen=True)
 class Columns:
-    """The columns of one quantity and their unit; for motor commands also the coefficients c0, c1, … of their map."""
+    """The columns of one quantity.
+
+    Attributes:
+        columns: names in the header of the file.
+        unit: one of `SCALES`.
+        polynomial: of motor commands, the coefficients c0, c1, … of their map to rotor speeds [rad/s].
+    """
 
     columns: tuple[str, ...]
     unit: str
@@ -58,7 +64,12 @@ class Columns:
 
 @dataclass(frozen=True)
 class Format:
-    """How the numbers stand in the file."""
+    """How the numbers stand in the file.
+
+    Attributes:
+        delimiter: one character between fields.
+        decimal: the decimal mark, a point or a comma.
+    """
 
     delimiter: str = ","
     decimal: str = "."
@@ -73,6 +84,18 @@ class Format:
 @dataclass(frozen=True)
 class ColumnMap:
     """The meaning of the columns of a CSV log: the tables of the TOML file, with a quantity for each key of `SCALES`.
+
+    Attributes:
+        frames: frames of the vectors.
+        time: time of each row.
+        position: position in the world.
+        attitude: rotation body → world, as a quaternion or as roll, pitch and yaw.
+        velocity: in the world or the body, as `frames` says.
+        body_rates: angular velocity of the body.
+        specific_force: of the body, as an accelerometer measures it.
+        voltage: of the battery.
+        motors: rotor speeds or commands, in the vehicle's order.
+        format: delimiter and decimal mark of the file.
 
     Raises:
         ValueError: the table, the key and what was expected, in one line.
@@ -109,6 +132,9 @@ class ColumnMap:
 
 def load_column_map(path: str | Path) -> ColumnMap:
     """Read a column map.
+
+    Args:
+        path: of the TOML file.
 
     Raises:
         ValueError: file, table, key and what was expected, in one line.
