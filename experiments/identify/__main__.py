@@ -11,11 +11,12 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from experiments.identify.checked import check_consistent, check_whole, require_distinct
+from experiments.identify.checked import check_consistent, check_whole, content_of
 from experiments.identify.report import figure, tables
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
+from experiments.runner.log_options import LogOptions, require_distinct
 from experiments.runner.options import Count, Positive, check_numbers
 from experiments.runner.run_record import environment
 from hybrid_jax import checks, runtime
@@ -29,12 +30,12 @@ from hybrid_jax.identification.recordings import Initial, Layout
 from hybrid_jax.io import save
 
 NAME = "identify"
-LISTS = ("--learn", "--measured", "--motor-order")
+LISTS = ("--learn", "--measured", "--motor-order", "--topics")
 ANYWAY = "{} checks of the logs failed, and --anyway went on: no number below counts until they pass."
 
 
 @dataclass(frozen=True)
-class Config:
+class Config(LogOptions):
     """Learn what a vehicle is from logs of its commands and of whatever was measured beside them.
 
     The vehicle file names what is known and, in `learn`, what is not. With commands instead of rotor speeds it needs a
@@ -76,10 +77,6 @@ class Config:
     """Steps of a window. Short ones resist slow disturbances, long ones tell slow effects."""
     windows: Count = 300
     """Windows at most, spread evenly over the logs."""
-    columns: Path | None = None
-    """Column map of CSV logs."""
-    motor_order: tuple[int, ...] = ()
-    """Which motor of the log, from 0, each rotor of the vehicle is, such as 2,0,3,1."""
     anyway: bool = False
     """Go on although checks of the logs failed: the page then says so first."""
 
@@ -90,7 +87,7 @@ class Config:
 
 def recordings(config: Config) -> tuple[list[Recording], list[Recording], list[str]]:
     """Logs to learn from, and those left out; also what their readers say, and which files were not read."""
-    read = partial(read_recording, columns=config.columns, motor_order=config.motor_order)
+    read = partial(read_recording, **config.reading)
     out = [read(path) for path in config.test]
     files, others = find_logs(config.folder) if config.folder.is_dir() else ([config.folder], {})
     left = {path.resolve() for path in config.test}
@@ -145,7 +142,9 @@ def checked(config: Config, console: Console):
         ChecksFailed: a check failed, without --anyway.
     """
     model, (logs, left_out, said) = model_of(config), recordings(config)
-    require_distinct(logs, left_out)
+    # It could be fitted and predicted.
+    named = [*((log.name, log) for log in logs), *((f"--test {log.name}", log) for log in left_out)]
+    require_distinct([(name, content_of(log)) for name, log in named])
     say = partial(console.print, highlight=False, soft_wrap=True, markup=False)
     for line in said:
         say(line)

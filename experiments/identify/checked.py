@@ -1,5 +1,6 @@
 """Checks of logs before a vehicle is identified from them, as far as their signals allow."""
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -7,11 +8,12 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from experiments.runner.command import ChecksFailed
 from experiments.runner.flags import in_flags
 from hybrid_jax.dynamics.actuators import Actuated
-from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
@@ -39,17 +41,10 @@ COMPARED = (
 )
 
 
-def require_distinct(logs: Sequence[Recording], left_out: Sequence[Recording]) -> None:
-    """Refuse a flight that occurs twice, whatever its files are called: it could be fitted and predicted."""
-    first: dict[str, str] = {}
-    for option, recordings in (("", logs), ("--test ", left_out)):
-        for each in recordings:
-            arrays = {f"{name} {part}": getattr(each.signals[name], part)
-                      for name in each.signals for part in ("t", "values")}  # fmt: skip
-            key, file = digest(None, arrays), f"{option}{each.name}"
-            if key in first:
-                raise ValueError(f"{file}: the same flight as {first[key]}; leave one of the two out")
-            first[key] = file
+def content_of(recording: Recording) -> str:
+    """What tells a recording apart from others, whatever its file is called."""
+    parts = itertools.product(recording.signals.items(), ("t", "values"))
+    return digest(None, {f"{name} {part}": getattr(signal, part) for (name, signal), part in parts})
 
 
 def check_whole(recordings: Sequence[Recording], vehicle: Vehicle, anyway: bool) -> list[str]:
@@ -100,7 +95,7 @@ def _flight(recording: Recording, signals: dict[str, Signal], dt: float) -> Flig
     filled = _filled(recording, signals, dt)
     log, first = to_flight(filled, dt), max(signal.t[0] for signal in filled.signals.values())
     spans = airborne(replace(recording, signals={**recording.signals, MOTORS: signals[MOTORS]}), MOTORS)
-    flying = np.any([(log.t + first >= begin) & (log.t + first <= end) for begin, end in spans] or [[False]], axis=0)
+    flying = within(log.t + first, spans)
     return log[flying] if np.count_nonzero(flying) > 1 else log
 
 
@@ -111,18 +106,20 @@ def _signals(recording: Recording, field: Any) -> dict[str, Signal]:
     if body and attitude and "velocity" not in found and attitude.interval < 1.5 * body.interval:
         found["velocity"] = body  # `to_flight` turns it
     motors = recording.signals["command" if isinstance(field, Actuated) else MOTORS]
-    speeds = _speeds(recording, field) if isinstance(field, Actuated) else motors.values
+    speeds = motors.values
+    if isinstance(field, Actuated):
+        speeds = np.asarray(field.steady_speeds(jnp.asarray(inputs_of(recording, field).T)).T)
     return found | {MOTORS: replace(motors, values=np.maximum(speeds, 0.0))}
 
 
-def _speeds(recording: Recording, field: Actuated) -> np.ndarray:
+def inputs_of(recording: Recording, field: Actuated) -> Float[np.ndarray, "n m"]:
+    """The commands and, if the field reads it, the voltage; where none was measured, the nominal one."""
     inputs, voltage = recording.signals["command"], recording.signals.get("voltage")
-    u = np.asarray(inputs.values)
-    if field.reads_voltage:
-        known = field.actuator.nominal_voltage
-        volts = known if voltage is None else np.interp(inputs.t, voltage.t, np.asarray(voltage.values)[:, 0])
-        u = np.column_stack([u, np.broadcast_to(volts, len(u))])
-    return np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)
+    if not field.reads_voltage:
+        return np.asarray(inputs.values)
+    known = field.actuator.nominal_voltage
+    volts = known if voltage is None else np.interp(inputs.t, voltage.t, np.asarray(voltage.values)[:, 0])
+    return np.column_stack([inputs.values, np.broadcast_to(volts, len(inputs))])
 
 
 def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Recording:

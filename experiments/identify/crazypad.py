@@ -12,12 +12,13 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
+from experiments.identify.checked import inputs_of
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
-from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify
@@ -87,18 +88,14 @@ def cut_out(recording: Recording, begin: float, end: float) -> Recording:
 
 def force_errors(field: Any, recording: Recording, after: float = 0.0) -> np.ndarray:
     """Specific force along the thrust less that predicted of commands and voltage [m/s²], in flight, from a time on."""
-    command, voltage, force = (recording.signals[name] for name in ("command", "voltage", "specific_force"))
-    inputs = np.asarray(command.values)
-    if field.reads_voltage:
-        inputs = np.column_stack([inputs, np.interp(command.t, voltage.t, np.asarray(voltage.values)[:, 0])])
+    command, force = (recording.signals[name] for name in ("command", "specific_force"))
     edges = np.arange(command.t[0], command.t[-1], 0.01)
-    speeds = rotor_speeds(field, command.t, inputs, edges)
+    speeds = rotor_speeds(field, command.t, inputs_of(recording, field), edges)
     theta = field.body.theta()
     k = np.asarray(theta.get("k_rotors", VEHICLE.thrust_coefficient) * theta.get("efficiency", 1.0))
     t = (edges[1:] + edges[:-1]) / 2
     error = np.interp(t, force.t, np.asarray(force.values)[:, -1]) - (k * speeds**2).sum(axis=1) / VEHICLE.mass
-    inside = np.any([(t >= begin) & (t <= end) for begin, end in airborne(recording)], axis=0)
-    return error[inside & (t >= after)]
+    return error[within(t, airborne(recording)) & (t >= after)]
 
 
 def rms(errors: np.ndarray) -> float:
@@ -112,15 +109,15 @@ def source(normal: list[Flight]) -> Any:
     return identify(field, [each.recording for each in normal], LAYOUT, MEASURED).field
 
 
-def first_seconds(flight: Flight, seconds: float = SECONDS) -> tuple[Recording, float]:
+def first_seconds(recording: Recording, seconds: float = SECONDS) -> tuple[Recording, float]:
     """The first seconds in the air, and when they end."""
-    begin, _ = airborne(flight.recording)[0]
-    return cut_out(flight.recording, begin, begin + seconds), begin + seconds
+    begin, _ = airborne(recording)[0]
+    return cut_out(recording, begin, begin + seconds), begin + seconds
 
 
 def take_off(field: Any, normal: list[Flight]) -> Any:
     """The field with what normal flights tell of each rotor in the seconds after take-off."""
-    parts = [first_seconds(each)[0] for each in normal]
+    parts = [first_seconds(each.recording)[0] for each in normal]
     return identify(changed(field, np.zeros(VEHICLE.rotors)), parts, SHORT, MEASURED, free=("efficiency",)).field
 
 
@@ -129,7 +126,7 @@ def damage(fresh: Any, flight: Flight) -> tuple[np.ndarray, Float[np.ndarray, " 
 
     All four are found by thrust and trim. Then the one that lost most alone is fitted to the accelerometer.
     """
-    (part, end), whole = first_seconds(flight), np.asarray(fresh.body.deviations["efficiency"])
+    (part, end), whole = first_seconds(flight.recording), np.asarray(fresh.body.deviations["efficiency"])
     found = identify(fresh, [part], SHORT, MEASURED, free=("efficiency",))
     efficiencies = np.array([found.intervals[f"efficiency[{i}]"] for i in range(VEHICLE.rotors)])
     lost = 1 - efficiencies[:, [0, 2, 1]] / np.exp(whole)[:, None]
@@ -166,7 +163,7 @@ def run(options: Options) -> None:
         lengths = sorted({WHOLE, *others})
         lost = np.interp(flight.length, lengths, [others.get(length, 0.0) for length in lengths])
         efficiency = np.log1p(-lost * (np.arange(VEHICLE.rotors) == 2))
-        row.append(rms(force_errors(changed(here, efficiency), flight.recording, first_seconds(flight)[1])))
+        row.append(rms(force_errors(changed(here, efficiency), flight.recording, first_seconds(flight.recording)[1])))
     lines = [(*line, f"{row[2]:.2f}") for line, row in zip(lines, found, strict=True)]
     pooled = np.sqrt(np.mean(np.square(found), axis=0))
     lines.append(("all", "", "", "", "", *(f"{each:.3f}" for each in pooled)))

@@ -15,7 +15,8 @@ from jaxtyping import Array, Float
 from rich.console import Console
 
 import hybrid_jax as hj
-from experiments.identify.crazypad import ACTUATOR, VEHICLE, cut_out, force_errors, rms
+from experiments.identify.checked import inputs_of
+from experiments.identify.crazypad import ACTUATOR, VEHICLE, first_seconds, force_errors, rms
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
@@ -25,7 +26,7 @@ from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
-from hybrid_jax.flights.checks.airborne import airborne
+from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.formats.column_map import load_column_map
 from hybrid_jax.flights.load import read_recording
 from hybrid_jax.flights.log import FlightLog
@@ -69,12 +70,10 @@ def thrust_of(recordings: list[Recording], voltage: bool = True, start: Actuated
 
 def flight_of(recording: Recording, field: Actuated) -> FlightLog:
     """The time in the air, every 10 ms, with rotor speeds that follow from commands and voltage."""
-    command, voltage = recording.signals["command"], recording.signals["voltage"]
+    command = recording.signals["command"]
     flights = airborne(recording)
     t = np.arange(flights[0][0], flights[-1][1], DT)
-    u = np.asarray(command.values)
-    if field.reads_voltage:
-        u = np.column_stack([u, np.interp(command.t, voltage.t, np.asarray(voltage.values)[:, 0])])
+    u = inputs_of(recording, field)
     lead = round(0.5 / DT)
     speeds = rotor_speeds(field, command.t, u, t[0] + DT * np.arange(-lead, len(t) + 1))[lead:]
 
@@ -84,14 +83,7 @@ def flight_of(recording: Recording, field: Actuated) -> FlightLog:
 
     x = np.concatenate([at("position"), at("attitude"), at("velocity"), at("rates")], axis=1)
     x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
-    inside = np.any([(t >= begin) & (t <= end) for begin, end in flights], axis=0)
-    return FlightLog(t, x, speeds, recording.name)[inside]
-
-
-def ten_seconds(recording: Recording) -> Recording:
-    """The first in the air."""
-    begin = airborne(recording)[0][0]
-    return cut_out(recording, begin, begin + SECONDS)
+    return FlightLog(t, x, speeds, recording.name)[within(t, flights)]
 
 
 def windows_of(recordings, field: Actuated, stride: int = STRIDE) -> hj.Trajectories:
@@ -139,7 +131,7 @@ def run(options: Options) -> None:
     for i, left in enumerate(b):
         others = b[:i] + b[i + 1 :]
         fitted, gain = thrust_of(others, start=aware), thrust_of(others, voltage=False, start=constant)
-        tens = [ten_seconds(each) for each in others]
+        tens = [first_seconds(each, SECONDS)[0] for each in others]
         few = [thrust_of([each], start=aware, free=("curve",)) for each in tens]
         errors_few = np.concatenate([force_errors(each, left) for each in few])
         forces.append([*(rms(force_errors(each, left)) for each in (aware, fitted)), rms(errors_few)])

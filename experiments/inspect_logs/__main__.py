@@ -12,9 +12,9 @@ from rich.console import Console
 from experiments.inspect_logs.estimates import estimate
 from experiments.inspect_logs.page import Inspected, write_page
 from experiments.inspect_logs.vehicle import vehicle_text
-from experiments.real_flight.config import read_topics
 from experiments.runner import command
 from experiments.runner.flags import in_flags
+from experiments.runner.log_options import SpeedOptions
 from experiments.runner.options import Positive, check_numbers
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, check_log
@@ -34,7 +34,7 @@ BORNE = ("quantities", "gaps", "repeated samples", "time on the ground")
 
 
 @dataclass(frozen=True)
-class Options:
+class Options(SpeedOptions):
     """Say what is in the logs of a folder, whether it suffices for a model, and what to log instead.
 
     Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV, each file by itself, so
@@ -62,16 +62,6 @@ class Options:
     """With --write-vehicle: distance of a rotor from the centre [m]. No log tells it; inertia grows with it."""
     dt: Positive = DT
     """Interval [s] that a model is to have. A signal that is slower fails a check, as half of it would be invented."""
-    columns: Path | None = None
-    """TOML file of the columns, units and frames of CSV logs: see docs/howto/logs.md."""
-    topics: tuple[str, ...] = ()
-    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
-    motor_order: tuple[int, ...] = ()
-    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
-    polynomial: tuple[float, ...] = ()
-    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
-    from 0 (stop) to 1 (full). It comes from a test stand, or from two points: 100,1000 if a motor turns with 100 rad/s
-    as it starts and with 1100 at the full command. PWM of 1000 … 2000 µs and DShot are turned into 0 … 1 beforehand."""
     out: Path = Path("runs")
     """Folder for the page; the subfolder inspect_logs is created in it."""
 
@@ -83,7 +73,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 def inspect(options: Options) -> None:
     check_numbers("--", options)
-    read_topics(options.topics)
+    _ = options.reading  # topics are checked before anything is read
     if options.write_vehicle is not None and options.write_vehicle.exists():
         raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
     vehicle = None if options.vehicle is None else load_vehicle_model(options.vehicle).vehicle
@@ -140,10 +130,9 @@ def trusted(logs: Sequence[Inspected], console: Console) -> list[Recording]:
 
 def _read(path: Path, options: Options) -> RawLog:
     """The log, also where it is a CSV file without all that a flight needs."""
-    given = {"columns": options.columns, "topics": read_topics(options.topics), "motor_order": options.motor_order}
     if options.columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
-        return RawLog(read_recording(path, **given))
-    return read_log(path, **given)
+        return RawLog(read_recording(path, **options.reading))
+    return read_log(path, **options.reading)
 
 
 def _described(options: Options) -> dict:

@@ -1,11 +1,11 @@
 """The options of `python -m experiments.real_flight`, and its presets."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Literal
 
 from experiments.real_flight.models import Model, RecipeName
+from experiments.runner.log_options import SpeedOptions
 from experiments.runner.options import Activation, Count, Positive, Run, distinct
 from hybrid_jax.dynamics.vehicle_file import check_learned
 from hybrid_jax.flights.checks.cleaning import Cleaning
@@ -17,16 +17,8 @@ ANOTHER_MANOEUVRE: tuple[RecipeName, ...] = ("frozen_rates", "torque_off", "stag
 PATHS = ("source", "target", "test", "vehicle", "columns")
 
 
-def read_topics(words: Sequence[str]) -> dict[str, str]:
-    """The topics of --topics by what they hold; ValueError for a word without an equals sign."""
-    for word in words:
-        if "=" not in word:
-            raise ValueError(f"--topics must be words such as odometry=/odom, got {word!r}")
-    return dict(word.split("=", 1) for word in words)
-
-
 @dataclass(frozen=True)
-class RealFlightConfig(Run):
+class RealFlightConfig(SpeedOptions, Run):
     """Train on the flights in --source, adapt to N windows of those in --target, test on held-out flights.
 
     A flight is a file: CSV (.csv, .csv.gz; columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 in SI units,
@@ -50,15 +42,6 @@ class RealFlightConfig(Run):
     """Folder of test flights; by default the target's flights are held out in turn."""
     target_variant: str | None = None
     """Table [vehicle.VARIANT] of the vehicle file that applies to target and test, such as another mass."""
-    columns: Path | None = None
-    """TOML file of the columns, units and frames of CSV logs."""
-    polynomial: tuple[float, ...] = ()
-    """For logs of commands without rotor speeds: rotor speed [rad/s] = c0 + c1 command + c2 command² …, the command
-    from 0 to 1. For example 100,1000 if a motor turns with 100 rad/s as it starts and with 1100 at the full command."""
-    motor_order: tuple[int, ...] = ()
-    """Which motor of the log, from 0, each rotor of the vehicle file is, such as 2,0,3,1."""
-    topics: tuple[str, ...] = ()
-    """Topics of ROS bags, such as odometry=/odom motors=/rotors:data:rpm; also pose, imu, voltage."""
     anyway: bool = False
     """Train in spite of checks that failed. The report says so in its first line."""
     cleaning: Cleaning = field(default_factory=Cleaning)
@@ -110,7 +93,7 @@ class RealFlightConfig(Run):
 
     def __post_init__(self):
         Run.__post_init__(self)
-        read_topics(self.topics)
+        _ = self.reading  # topics are checked before anything is read
         distinct("--recipes", self.tried if self.recipes is None else self.recipes)
         for name in ("models", "horizon", "n"):
             distinct(f"--{name}", getattr(self, name))

@@ -5,7 +5,8 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from experiments.real_flight.config import RealFlightConfig, read_topics
+from experiments.real_flight.config import RealFlightConfig
+from experiments.runner import log_options
 from experiments.runner.command import ChecksFailed
 from experiments.runner.flags import in_flags
 from hybrid_jax.flights.checks.cleaning import clean, lag_motors
@@ -44,8 +45,7 @@ def load_logs(option: str, folder: Path, vehicle: Vehicle, time_constant: float,
     """
     dt = config.cleaning.resample
     try:
-        given = {"columns": config.columns, "topics": read_topics(config.topics), "motor_order": config.motor_order}
-        raws, left = read_folder(folder, **given)
+        raws, left = read_folder(folder, **config.reading)
     except ValueError as error:
         about_folder = str(error).startswith(f"{folder}: ")
         raise ValueError(f"--{option} {error}" if about_folder else str(error)) from error
@@ -71,18 +71,18 @@ def require_checks(found: Sequence[tuple[str, Sequence[Check]]], config: RealFli
 
 
 def require_distinct(sets: Sequence[LogSet], config: RealFlightConfig) -> None:
-    """Refuse a flight that occurs twice, whatever its files are called: it could be in training and test.
+    """Refuse a flight that occurs twice.
 
     Source and test may share flights where each is tested by models trained on other manoeuvres.
     """
     shared = config.target is None and config.folds_by == "manoeuvre"
-    first: dict[tuple[str, str], str] = {}
-    for each in sets:
-        for log, record in zip(each.logs, each.records, strict=True):
-            key, file = (each.label if shared else "", record["sha256"]), f"--{each.label} {log.name}"
-            if key in first:
-                raise ValueError(f"{file}: the same flight as {first[key]}; leave one of the two out")
-            first[key] = file
+    log_options.require_distinct(
+        [
+            (f"--{each.label} {log.name}", (each.label if shared else "", record["sha256"]))
+            for each in sets
+            for log, record in zip(each.logs, each.records, strict=True)
+        ]
+    )
 
 
 def _record(

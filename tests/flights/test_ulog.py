@@ -210,7 +210,7 @@ def test_other_files_are_refused(flight, topics, written, tmp_path):
     whole = ulog(topics)
     for content in (b"", b"t,px,py\n", whole[:7]):
         refusal(lambda content=content: read_ulog(written(content)), "flight.ulg")
-    refusal(lambda: read_ulog(tmp_path / "none.ulg"), "none.ulg", "cannot be read")
+    refusal(lambda: read_ulog(tmp_path / "none.ulg"), "none.ulg", "no such file")
     zero = stamped(np.arange(0.0, 5, 0.01), np.zeros((500, 4)))
     refusal(lambda: read_ulog(written(topics | {"vehicle_attitude": zero})), "vehicle_attitude", "norm")
     bad = stamped(np.arange(0.0, 5, 0.01), np.full((500, 3), np.nan))

@@ -3,6 +3,8 @@
 On the ground an accelerometer measures gravity whatever the thrust is. Near it the ground effect adds to the thrust.
 """
 
+from collections.abc import Iterable
+
 import numpy as np
 from jaxtyping import Bool, Float
 
@@ -36,7 +38,12 @@ def airborne(recording: Recording, told: str = "command") -> list[tuple[float, f
 def on_ground(log: FlightLog) -> Bool[np.ndarray, " n"]:
     """Which samples are not `airborne`."""
     flights = _flights(log.t, (log.u**2).sum(axis=1), log.x[:, 2])
-    return ~np.any([(log.t >= first) & (log.t <= last) for first, last in flights] or [np.zeros(len(log))], axis=0)
+    return ~within(log.t, flights)
+
+
+def within(t: Float[np.ndarray, " n"], spans: Iterable[tuple[float, float]]) -> Bool[np.ndarray, " n"]:
+    """Which times lie in one of some spans, from start to end [s]."""
+    return np.any([(t >= start) & (t <= end) for start, end in spans] or [np.zeros(len(t), bool)], axis=0)
 
 
 def flying_intervals(log: FlightLog) -> Bool[np.ndarray, " n-1"]:

@@ -101,11 +101,12 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
 
 
 def _at_most(name: str, value: float, unit: str, limit: float, suggestion: str) -> Check:
-    return _check(name, value, unit, limit, suggestion if value > limit else "")
+    return judged(name, value, unit, limit, suggestion if value > limit else "")
 
 
-def _check(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
-    return Check(name, value, unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
+def judged(name: str, value: float, unit: str, limit: float, advice: str) -> Check:
+    """A check that fails if there is something to advise."""
+    return Check(name, float(value), unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
 
 
 def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
@@ -119,7 +120,7 @@ def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
         return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
     fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
-    return _check(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
+    return judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
 
 
 def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
@@ -164,7 +165,7 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
     return [
-        _check(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
+        judged(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
         _spin(log, vehicle, found.yaw_sign * found.correlations[2]),
         replace(lagging, value=lag),
     ]
@@ -198,7 +199,7 @@ def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
     advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
     if name != THRUST:
         advice = advice or _axes_apart(a, b, least) or _other_scale(a, b)
-    return _check(name, value, "relative error", limit, advice)
+    return judged(name, value, "relative error", limit, advice)
 
 
 def _nearer(pairs: Pairs, limit: float, least: float) -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_jax.flights.checks.consistency import FAILS, NOTHING, OK, UNKNOWN, Check
+from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, Check, judged
 from hybrid_jax.flights.conversion import ADVICE, missing_states, motors_of, what_to_log
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
 from hybrid_jax.vehicle import Vehicle
@@ -46,15 +46,10 @@ def failures(checks: Sequence[Check], name: str) -> list[str]:
     return [f"{name}: {check.name}: {check.suggestion}" for check in checks if check.verdict == FAILS]
 
 
-def _check(name: str, advice: str, value: float = 0.0, unit: str = "", limit: float = 0.0) -> Check:
-    return Check(name, float(value), unit, limit, *((FAILS, advice) if advice else (OK, NOTHING)))
-
-
 def _whole(recording: Recording) -> Check:
     damage = recording.facts.get("damage", "")
-    return _check(
-        "whole file", f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else "", bool(damage)
-    )
+    advice = f'{damage}; copy it again, or use what is whole: failed="warn"' if damage else ""
+    return judged("whole file", bool(damage), "", 0.0, advice)
 
 
 def _airframe(recording: Recording) -> Check:
@@ -63,13 +58,13 @@ def _airframe(recording: Recording) -> Check:
         return Check("airframe", np.nan, "", 0.0, UNKNOWN, "the log does not say what flew")
     number = recording.facts.get("airframe")
     advice = f"{kind}{f' (SYS_AUTOSTART {number})' if number else ''}, no multirotor: leave the file out"
-    return _check("airframe", "" if kind.startswith("multirotor") else advice)
+    return judged("airframe", 0.0, "", 0.0, "" if kind.startswith("multirotor") else advice)
 
 
 def _quantities(recording: Recording) -> Check:
     missing = missing_states(recording)
     advice = f"no {', no '.join(missing)}: {what_to_log(recording)}"
-    return _check("quantities", advice if missing else "", len(missing), "missing")
+    return judged("quantities", len(missing), "missing", 0.0, advice if missing else "")
 
 
 def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
@@ -81,7 +76,7 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     who = "the vehicle file has" if vehicle is not None else "the airframe has"
     mend = f"name those of the rotors (motor_order={tuple(range(expected))})" if found > expected else "log all motors"
     advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
-    return _check("number of motors", "" if found == expected else advice, found, "motors", expected)
+    return judged("number of motors", found, "motors", expected, "" if found == expected else advice)
 
 
 def _motors(recording: Recording) -> Signal | None:
@@ -98,7 +93,7 @@ def _rates(recording: Recording, dt: float) -> Check:
     coarser = f"dt={float(f'{max(slow.values(), default=0.0):.2g}'):g}"
     kind = recording.facts.get("format", "")
     advice = f"slower than {_hertz(dt)}: {listed}; {ADVICE.get(kind, 'log faster')}; or take {coarser}"
-    return _check("slowest signal", advice if slow else "", worst, "s", SLOWER * dt)
+    return judged("slowest signal", worst, "s", SLOWER * dt, advice if slow else "")
 
 
 def _hertz(interval: float) -> str:
@@ -111,9 +106,8 @@ def _clock(recording: Recording) -> Check:
         longest = max([longest, *((end - start, start, signal.source) for start, end in signal.gaps())])
     length, start, source = longest
     advice = f"{source} stops at {start:.4g} s for {length:.4g} s, most of the log: split the file there"
-    return _check(
-        "longest gap", advice if length > JUMP * recording.duration else "", length, "s", JUMP * recording.duration
-    )
+    most = JUMP * recording.duration
+    return judged("longest gap", length, "s", most, advice if length > most else "")
 
 
 def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
@@ -128,8 +122,8 @@ def _limits(recording: Recording, vehicle: Vehicle | None) -> Check:
             mend = "a 16-bit number wrapped: log it without sign" if wrap else "cut these samples out"
             mend += " or raise max_rotor_speed of the vehicle file" if name == "rotor_speed" and value > 0 else ""
             where = f"{name} of motor {column} is {value:.4g} at {signal.t[row]:.4g} s, must be from 0 to {most:.4g}"
-            return _check("motors within limits", f"{where}: {mend}", share, "share of samples")
-    return _check("motors within limits", "", 0.0, "share of samples")
+            return judged("motors within limits", share, "share of samples", 0.0, f"{where}: {mend}")
+    return judged("motors within limits", 0.0, "share of samples", 0.0, "")
 
 
 def _largest(recording: Recording, vehicle: Vehicle | None) -> Iterator[tuple[str, float]]:
@@ -149,4 +143,4 @@ def _flown(recording: Recording, vehicle: Vehicle | None) -> Check:
     limit = REST_SHARE * (most if speeds else 1.0)
     value = float(motors.values.mean(axis=1).max())
     advice = "the motors rest throughout, so nothing flew: leave the file out"
-    return _check(name, advice if value < limit else "", value, "rad/s" if speeds else "of the largest", limit)
+    return judged(name, value, "rad/s" if speeds else "of the largest", limit, advice if value < limit else "")

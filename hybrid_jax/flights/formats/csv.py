@@ -7,7 +7,6 @@ import contextlib
 import io
 import json
 import re
-import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import IO
@@ -16,7 +15,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import rates_between
-from hybrid_jax.flights.formats.raw import opened
+from hybrid_jax.flights.formats.raw import opened, readable
 from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
 from hybrid_jax.state import BODY_RATES, QUATERNION, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
@@ -63,17 +62,11 @@ def read_table(
         ValueError: file, row, field and what to do, in one line.
     """
     try:
-        with opened(path) as file:
+        with readable(path) as file:
             text = io.TextIOWrapper(file, encoding="utf-8-sig")
             parts = list(_parts(path, text, [columns, further], delimiter, decimal, max_rows))
-    except FileNotFoundError as error:
-        raise ValueError(f"{path}: no such file") from error
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not text; export the log as CSV in UTF-8") from error
-    except (EOFError, zlib.error) as error:
-        raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
     return np.concatenate(parts)
 
 

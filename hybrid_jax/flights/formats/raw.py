@@ -1,8 +1,9 @@
 """Samples as they stand in a log, in ticks of its clock, and how they become the signals of a `Recording`."""
 
+import contextlib
 import gzip
 import zlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import IO, NamedTuple
 
@@ -43,15 +44,24 @@ def opened(path: str | Path) -> IO[bytes]:
     return gzip.open(path) if is_packed(path) else Path(path).open("rb")  # pyright: ignore[reportReturnType]
 
 
-def unpacked(path: str | Path) -> bytes:
-    """The bytes of a file, plain or gzip; ValueError, with the file and what to do, if they cannot be read."""
+@contextlib.contextmanager
+def readable(path: str | Path) -> Iterator[IO[bytes]]:
+    """A file, plain or gzip, to read; ValueError, with the file and what to do, if that cannot be done."""
     try:
         with opened(path) as file:
-            return file.read()
+            yield file
+    except FileNotFoundError as error:
+        raise ValueError(f"{path}: no such file") from error
     except (EOFError, zlib.error) as error:
         raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def unpacked(path: str | Path) -> bytes:
+    """The bytes of a file, plain or gzip; errors as of `readable`."""
+    with readable(path) as file:
+        return file.read()
 
 
 def record(
