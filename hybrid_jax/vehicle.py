@@ -112,6 +112,7 @@ def load_vehicle(path: str | Path, variant: str | None = None) -> Vehicle:
     `dynamics.vehicle_file.load_vehicle_model` reads its other tables, too, and checks what is in them.
 
     Args:
+        path: the TOML file.
         variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
             All variants of the file are checked.
 

@@ -86,6 +86,7 @@ class Actuated(AbstractVectorField):
     Attributes:
         body: the field that is told rotor speeds.
         deviations: of each learned parameter, by name.
+        actuator: nominal values of the curve, the lag, the voltage and the delay.
 
     Raises:
         ValueError: unknown names, or a voltage exponent without a nominal voltage.
@@ -108,14 +109,17 @@ class Actuated(AbstractVectorField):
 
     @property
     def state_size(self) -> int:
+        """How many numbers x has: 13, and the rotor speeds if they lag."""
         return STATE_SIZE + self.rotor_states
 
     @property
     def input_size(self) -> int:
+        """How many numbers u has: a command for each rotor, and the voltage if it matters."""
         return self._vehicle.rotors + self.reads_voltage
 
     @property
     def reads_voltage(self) -> bool:
+        """Whether the last input is the battery's voltage."""
         return self.actuator.nominal_voltage > 0
 
     @property
@@ -166,7 +170,11 @@ class Actuated(AbstractVectorField):
         return x[STATE_SIZE:] if self.rotor_states else self.steady_speeds(u)
 
     def accelerations(self, w: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n *b"]:
-        """ẇ [rad/s²]."""
+        """ẇ [rad/s²].
+
+        Args:
+            w: speeds of the rotors now (n) [rad/s].
+        """
         missing, (up, down) = self.steady_speeds(u) - w, self.time_constants()
         return missing / jnp.where(missing > 0, up, down)
 
@@ -179,9 +187,12 @@ class Actuated(AbstractVectorField):
         return jnp.concatenate([changed, residual[STATE_SIZE:]])
 
     def settled(self, u: Float[Array, "t m"], dt: float) -> Float[Array, " n"]:
-        """The rotor speeds [rad/s] after the inputs u, each held for dt [s], that began in equilibrium with the first.
+        """The rotor speeds [rad/s] after the inputs u (t, m), that began in equilibrium with the first.
 
         Exact for inputs that are held.
+
+        Args:
+            dt: for how long each input is held [s].
         """
         targets, (up, down) = self.steady_speeds(u.T).T, self.time_constants()
         kept = jnp.exp(-dt / up), jnp.exp(-dt / down)
@@ -193,7 +204,16 @@ class Actuated(AbstractVectorField):
 
 
 def actuated(body: RigidBody, actuator: Actuator, learn: tuple[str, ...] = ()) -> Actuated:
-    """The body behind its actuators, which learn the parameters named in `learn`; see `check_actuator_names`."""
+    """The body behind its actuators.
+
+    Args:
+        body: the field that is told rotor speeds.
+        actuator: nominal values of what stands between command and rotor.
+        learn: names of the actuators' parameters that are learned, of `actuators.NAMES`; by default none.
+
+    Raises:
+        ValueError: as of `check_actuator_names`.
+    """
     check_actuator_names(learn, actuator, tuple(body.deviations))
     shapes = {"curve": (len(actuator.curve),), "time_constants": (2,)}
     return Actuated(body, {name: jnp.zeros(shapes.get(name, ())) for name in learn}, actuator)
@@ -214,9 +234,13 @@ def check_actuator_names(learn: tuple[str, ...], actuator: Actuator, of_body: tu
 def rotor_speeds(
     field: Actuated, t: Float[np.ndarray, " n"], commands: Float[np.ndarray, "n m"], edges: Float[np.ndarray, " k"]
 ) -> Float[np.ndarray, "k-1 r"]:
-    """The mean rotor speed [rad/s] of each interval between `edges` [s], of inputs (commands, voltage) held from t on.
+    """The mean rotor speed [rad/s] of each interval, one row for each: a log of commands as one of rotor speeds.
 
-    This turns a log of commands into one of rotor speeds.
+    Args:
+        field: the body behind its actuators.
+        t: times from which each input is held until the next (n) [s].
+        commands: inputs u of the field at these times, the voltage [V] last where it reads one (n, m).
+        edges: of the intervals, ascending (k) [s].
     """
     u = np.asarray(held_means(jnp.asarray(t), jnp.asarray(commands), jnp.asarray(edges), field.delay))
     targets = np.asarray(field.steady_speeds(jnp.asarray(u.T)).T)

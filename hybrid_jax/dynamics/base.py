@@ -134,7 +134,12 @@ def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, "
 
 
 class Hybrid(AbstractVectorField):
-    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4)."""
+    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4).
+
+    Attributes:
+        physics: f_p.
+        residual: f_d, a network or any other field; physics maps what it returns, see `apply_residual`.
+    """
 
     physics: AbstractVectorField
     residual: AbstractVectorField
@@ -175,7 +180,11 @@ class Hybrid(AbstractVectorField):
 
 
 class Blend(AbstractVectorField):
-    """ẋ = the mean of several fields, such as models between which the data cannot decide."""
+    """ẋ = the mean of several fields, such as models between which the data cannot decide.
+
+    Attributes:
+        fields: one or more, of the same state and input.
+    """
 
     fields: tuple[AbstractVectorField, ...]
 
@@ -207,7 +216,11 @@ class Blend(AbstractVectorField):
 
 
 class AbstractWrapper(AbstractVectorField):
-    """ẋ = write(x, f(read(x), u)) for the field f inside."""
+    """ẋ = write(x, f(read(x), u)) for the field f inside.
+
+    Attributes:
+        field: the field inside.
+    """
 
     accepts_batch: ClassVar[bool] = True
 
@@ -218,7 +231,11 @@ class AbstractWrapper(AbstractVectorField):
         return x
 
     def write(self, x: Float[Array, " d *b"], inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
-        """ẋ from what the field inside returned; by default the same."""
+        """ẋ from what the field inside returned; by default the same.
+
+        Args:
+            inside: what the field inside returned (n).
+        """
         return inside
 
     def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
@@ -265,7 +282,11 @@ def features_first(field: AbstractVectorField) -> bool:
 
 
 def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without its `Frozen` wrappers."""
+    """The field without its `Frozen` wrappers.
+
+    Args:
+        field: any field; parts of it may be frozen, or all.
+    """
 
     def frozen(node) -> bool:
         return isinstance(node, Frozen)
@@ -274,7 +295,11 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
 
 
 def trainable(field: AbstractVectorField) -> AbstractVectorField:
-    """A tree like `field` with True at each leaf that the optimiser may move, for `equinox.partition`."""
+    """A tree with True at each leaf that the optimiser may move, for `equinox.partition`.
+
+    Args:
+        field: the field that the tree is like; its arrays of floating-point numbers are learned, unless frozen.
+    """
 
     def fixed(node) -> bool:
         return isinstance(node, RunningStats | Frozen)

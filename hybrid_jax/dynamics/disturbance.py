@@ -43,7 +43,14 @@ class ConstantDisturbance(AbstractVectorField):
         return jnp.broadcast_to(self.vector(len(x)).reshape(-1, *(1,) * (x.ndim - 1)), x.shape)
 
     def vector(self, d: int) -> Float[Array, " d"]:
-        """ẋ of any of d states."""
+        """ẋ at any x and u.
+
+        Args:
+            d: how many numbers the state has.
+
+        Raises:
+            ValueError: indices that a state of d numbers has not.
+        """
         if self.value.ndim == 0:
             return jnp.broadcast_to(self.value, (d,))
         if self.points > 1:
@@ -57,7 +64,13 @@ class ConstantDisturbance(AbstractVectorField):
 
 
 def disturbed(field: AbstractVectorField, value: Float[Array, " k"], indices: tuple[int, ...] | None = None) -> Hybrid:
-    """ẋ = f(x, u) + d."""
+    """ẋ = f(x, u) + d.
+
+    Args:
+        field: f, the undisturbed one.
+        value: d (k), one number for each disturbed state in its unit per second, or a scalar for every state.
+        indices: the disturbed states; by default the last k.
+    """
     return Hybrid(field, ConstantDisturbance(value, indices))
 
 
@@ -65,6 +78,7 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
     """The field with a constant disturbance in its physics, of zero if it has none yet.
 
     Args:
+        field: physics, or physics and a residual.
         indices: the disturbed states; by default v̇ and ω̇ of a rigid body, each component of physics on a `Grid` (one
             number for all points), and every state of another system.
 

@@ -24,9 +24,15 @@ SEAM = 3.0  # times the usual step between neighbours that one across the edge m
 
 @dataclass(frozen=True)
 class Grid:
-    """A periodic grid of equal spacing [m], and how many quantities live on it.
+    """A periodic grid of equal spacing, and how many quantities live on it.
 
-    A state is their values, one quantity after the other, each in row-major order; further axes are samples.
+    A state is their values, one quantity after the other, each in row-major order; further axes are samples. Its
+    methods take and return `fields` of shape (components, *shape, *b).
+
+    Attributes:
+        shape: points along each axis of space, at least three.
+        spacing: between neighbours along every axis [m].
+        components: how many quantities have a value at each point.
 
     Raises:
         ValueError: a side of fewer than three points, a spacing that is not positive, no components.
@@ -46,6 +52,7 @@ class Grid:
 
     @property
     def points(self) -> int:
+        """How many points the grid has."""
         return prod(self.shape)
 
     @property
@@ -66,7 +73,11 @@ class Grid:
         return x.reshape(self.components, *self.shape, *x.shape[1:])
 
     def laplacian(self, fields: Float[Array, " c *cells"]) -> Float[Array, " c *cells"]:
-        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing²; an error of O(spacing²)."""
+        """Δ of each component: the sum over neighbours of (neighbour − value) / spacing²; an error of O(spacing²).
+
+        Args:
+            fields: as `fields` returns them.
+        """
         padded = self.padded(fields, 1)
         inside = {axis: slice(1, -1) for axis in self.axes}
 
@@ -77,15 +88,30 @@ class Grid:
         return (sum(near[1:], near[0]) - len(near) * fields) / self.spacing**2
 
     def padded(self, fields: Float[Array, " c *cells"], reach: int) -> Float[Array, " c *cells"]:
-        """With `reach` more points at each edge, those of the opposite edge."""
+        """With more points at each edge, those of the opposite edge.
+
+        Args:
+            fields: as `fields` returns them.
+            reach: how many more points at each edge.
+        """
         return jnp.pad(fields, [(reach * (i in self.axes),) * 2 for i in range(fields.ndim)], mode="wrap")
 
     def patches(self, fields: Float[Array, " c *cells"], kernel: int) -> Float[Array, " k *cells"]:
-        """At each point the values at its kernel × … × kernel neighbours, itself among them: c · kernelⁿ components."""
+        """At each point the values at its kernel × … × kernel neighbours, itself among them: c · kernelⁿ components.
+
+        Args:
+            fields: as `fields` returns them.
+            kernel: points along each side of the neighbourhood, an odd number.
+        """
         return jnp.concatenate(self.moved(fields, kernel))
 
     def moved(self, fields: Float[Array, " c *cells"], kernel: int) -> list[Float[Array, " c *cells"]]:
-        """The fields of each of the kernel × … × kernel neighbours, in row-major order of where these are."""
+        """The fields of each of the kernel × … × kernel neighbours, in row-major order of where these are.
+
+        Args:
+            fields: as `fields` returns them.
+            kernel: points along each side of the neighbourhood, an odd number.
+        """
         if kernel == 1:
             return [fields]
         padded, at = self.padded(fields, kernel // 2), product(range(kernel), repeat=len(self.shape))
@@ -93,10 +119,13 @@ class Grid:
         return [padded[(slice(None), *shift)] for shift in shifts]
 
     def largest_step(self, diffusivity: float | Sequence[float] | np.ndarray | Array) -> float:
-        """The longest step [s] for which RK4 is stable with these diffusivities [m²/s], by linear theory.
+        """The longest step [s] for which RK4 is stable, by linear theory; infinite without diffusion.
 
         The Laplacian's most negative eigenvalue is −4 n / spacing² in n dimensions, so the bound is 2.785 spacing² /
         (4 n D), as that of Courant, Friedrichs and Lewy for advection is a bound on the step.
+
+        Args:
+            diffusivity: D [m²/s], one or several, of which the largest counts.
         """
         most = float(np.max(np.abs(np.asarray(diffusivity))))
         return REAL_AXIS * self.spacing**2 / (4 * len(self.shape) * most) if most else float("inf")
@@ -113,6 +142,13 @@ def check_grid(
     """Refuse windows that are not of the grid, not periodic, or sampled too slowly for the solver's steps.
 
     Data count as not periodic if steps across an edge are more than three times as large as those between neighbours.
+
+    Args:
+        grid: what each state is on.
+        windows: the data.
+        diffusivity: one or several [m²/s], of which the largest bounds the step; 0 for no bound.
+        substeps: steps of the solver in each interval of the windows.
+        name: what messages call the windows.
 
     Raises:
         ValueError: one of these, in one line; it names the bound and how many substeps would do.
@@ -141,7 +177,12 @@ def check_grid(
 
 
 class Diffusion(AbstractVectorField):
-    """ẋ = D Δx on a grid, with one diffusivity [m²/s] for each component, held as its logarithm."""
+    """ẋ = D Δx on a grid.
+
+    Attributes:
+        log_diffusivity: logarithm of D [m²/s] of each component (c).
+        grid: what the state is on.
+    """
 
     accepts_batch: ClassVar[bool] = True
 
@@ -161,7 +202,15 @@ class Diffusion(AbstractVectorField):
 
 
 def diffusion(grid: Grid, diffusivity: Sequence[float]) -> Diffusion:
-    """`Diffusion` from a diffusivity [m²/s] for each component; ValueError if one is not positive, or some lack."""
+    """`Diffusion` from its diffusivities.
+
+    Args:
+        grid: what the state is on.
+        diffusivity: D [m²/s] of each component.
+
+    Raises:
+        ValueError: a diffusivity that is not positive, or not one for each component.
+    """
     if len(diffusivity) != grid.components:
         raise ValueError(f"diffusivity: {grid.components} expected, one for each component, got {len(diffusivity)}")
     for value in diffusivity:

@@ -137,7 +137,16 @@ def rigid_body(
 
 
 def perturbed(vehicle: Vehicle, key: PRNGKeyArray, *, low: float = 0.8, high: float = 1.25) -> RigidBody:
-    """The rigid body with each of θ_p at nominal times a factor in [low, high], uniform in its logarithm."""
+    """The rigid body with each of θ_p at nominal times a random factor, uniform in its logarithm.
+
+    Args:
+        vehicle: its constants, which are the nominal values.
+        low: smallest factor, above 0.
+        high: largest factor.
+
+    Raises:
+        ValueError: factors that are not 0 < low <= high.
+    """
     if not 0 < low <= high < np.inf:
         raise ValueError(f"low and high must be two factors, 0 < low <= high, got {low} and {high}")
     factors = jax.random.uniform(key, (len(LEARNED),), minval=np.log(low), maxval=np.log(high))
@@ -154,6 +163,10 @@ def with_vehicle(field: RigidBody, vehicle: Vehicle) -> RigidBody:
     """The field on another vehicle, such as the same one with a payload, with the same θ_p in SI units.
 
     Its deviations differ, as they are relative to the vehicle's nominal values, weight and arm.
+
+    Args:
+        field: the rigid body on the vehicle that it was learned on.
+        vehicle: constants of the other.
     """
     units, known = units_of(vehicle), nominal_values(vehicle, field.terms)
 

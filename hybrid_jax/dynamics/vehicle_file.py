@@ -68,7 +68,12 @@ def learned_by_field(learn: tuple[str, ...]) -> tuple[str, ...]:
 def load_vehicle_model(path: str | Path, variant: str | None = None) -> VehicleModel:
     """Read a TOML file of `[vehicle]`, `learn` and `[terms]`; by default a rigid body that learns Ix, Iy and k.
 
-    Args and errors as of `load_vehicle`.
+    Args:
+        path: the TOML file.
+        variant: apply the table `[vehicle.VARIANT]`, which overrides some constants, such as the mass with a payload.
+
+    Raises:
+        ValueError: the file, the key and what was expected, in one line.
     """
     return vehicle_model_of(read_tables(path), path, variant)
 

@@ -43,16 +43,27 @@ NO_EFFECT = 1.0  # information of a parameter that is not told: its standard err
 
 
 class Identified(NamedTuple):
-    """The result of `identify`."""
+    """The result of `identify`.
+
+    Attributes:
+        field: with the fitted parameters.
+        intervals: confidence interval of each parameter, number by number, by default of 95 %.
+        errors: RMS of each quantity's channels over the windows, from the estimated initial states.
+        windows: how many were fitted.
+        seconds: length of all windows [s].
+        converged: whether the last round stopped by itself, before `max_steps`.
+        covariance: of the parameters (p, p), in the parametrisation of `ravel_parameters`.
+        explained: share of the change of each body rate in a window that is told (3); 1 if not measured.
+    """
 
     field: AbstractVectorField
-    intervals: dict[str, Interval]  # of each parameter, number by number: 95 %
-    errors: dict[str, np.ndarray]  # RMS of each quantity's channels over the windows, from the estimated initial states
+    intervals: dict[str, Interval]
+    errors: dict[str, np.ndarray]
     windows: int
     seconds: float
     converged: bool
-    covariance: Float[np.ndarray, "p p"]  # in the parametrisation of `ravel_parameters`
-    explained: Float[np.ndarray, "3"]  # share of the change of body rates in a window that is told; 1 if not measured
+    covariance: Float[np.ndarray, "p p"]
+    explained: Float[np.ndarray, "3"]
 
 
 def identify(
@@ -71,10 +82,14 @@ def identify(
 
     Args:
         field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
+        recordings: of one vehicle; one or more.
+        layout: how they are cut into windows, by default `Layout()`.
         measured: quantities that are compared, by default all that every recording has.
         free: names of parameters that are fitted, such as k or efficiency[2], by default all; the others stay.
         known: the covariance of those that stay, to which the fitted ones owe a part of theirs; by default zero.
         rounds: fits, each with channels weighted by the errors of the one before.
+        max_steps: of Levenberg–Marquardt in each round.
+        level: confidence of the intervals, between 0 and 1.
 
     Returns:
         A parameter that the windows do not tell has an infinite interval and stays as it was.
@@ -129,7 +144,13 @@ def identify_in_turn(
 
     An error of the torques, such as the delay of a filtered gyro, then cannot bend the thrust curve and the lag.
     Windows of forces are `FORCE_STEPS` times as long. The result has the intervals of both; the second ones hold the
-    uncertainty of the first. For arguments and errors see `identify`.
+    uncertainty of the first. For errors see `identify`, which does all at once where one of the two has no parameter or
+    no sensor.
+
+    Args:
+        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
+        recordings: of one vehicle; one or more.
+        layout: how they are cut into windows of torques, by default `Layout()`.
     """
     layout = Layout() if layout is None else layout
     theta = {*_names(field)}
@@ -151,7 +172,14 @@ def identify_in_turn(
 def prediction_errors(
     field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None, measured=()
 ) -> dict[str, Float[np.ndarray, "n t k"]]:
-    """y − ŷ of every window, predicted from the state that the samples before it tell; NaN where there is no y."""
+    """y − ŷ of every window, predicted from the state that the samples before it tell; NaN where there is no y.
+
+    Args:
+        field: an `Actuated` field, told commands; any other is told the measured rotor speeds.
+        recordings: of one vehicle; one or more.
+        layout: how they are cut into windows, by default `Layout()`.
+        measured: quantities that are compared, by default all that every recording has.
+    """
     layout = Layout() if layout is None else layout
     told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
     windows, inputs, columns = cut(recordings, layout, told, measured)

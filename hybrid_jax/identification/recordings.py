@@ -18,22 +18,35 @@ from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOC
 
 Initial = Literal["estimated", "sample"]
 UNKNOWN = {"velocity": 2.0, "tilt": 0.3, "rates": 1.0}  # spread of what nothing measures: m/s, rad, rad/s
-WARM = 0.3  # s of commands before a window that the rotors' speeds at its start follow from
+WARM = 0.3  # s
 PADDING = 1024
 BREAK = 10.0  # s between two recordings on the common clock
 
 
 @dataclass(frozen=True)
 class Layout:
-    """How recordings are cut into windows."""
+    """How recordings are cut into windows.
 
-    dt: float = 0.01  # s, of the solver's steps and of the grid on which measurements are compared
-    steps: int = 50  # intervals of a window
-    most: int = 400  # windows at most, spread evenly
-    span: float = 0.1  # s of samples before a window that its initial state is estimated from
-    initial: Initial = "estimated"  # or the nearest sample before it, taken as exact
+    Attributes:
+        dt: of the solver's steps and of the grid on which measurements are compared [s].
+        steps: intervals of a window.
+        most: windows at most, spread evenly.
+        span: of the samples before a window that its initial state is estimated from [s].
+        initial: "estimated" from these samples, or "sample", the last one before the window, taken as exact.
+        warm: of the commands before a window that the rotors' speeds at its start follow from [s].
+        disturbance: first guess of the standard deviation of a window's constant disturbances (6), 0 for none: along x,
+            y and z [m/s²], and about x, y and z [rad/s²].
+
+    Raises:
+        ValueError: a number out of range, or an unknown `initial`.
+    """
+
+    dt: float = 0.01
+    steps: int = 50
+    most: int = 400
+    span: float = 0.1
+    initial: Initial = "estimated"
     warm: float = WARM
-    # First guess of the constant disturbances of a window; 0 for none: m/s² in x, y, z, rad/s² about x, y, z.
     disturbance: tuple[float, ...] = (1.0, 1.0, 1.0, 5.0, 5.0, 5.0)
 
     def __post_init__(self):

@@ -28,7 +28,12 @@ FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes mu
 
 @dataclass(frozen=True)
 class Channel:
-    """Entries start … stop − 1 of the state, and the norm of their error that counts as 1.
+    """Entries of the state whose error is one vector.
+
+    Attributes:
+        start: the first entry, counted from 0.
+        stop: one past the last entry.
+        scale: norm of their error that counts as 1, in their unit.
 
     Raises:
         ValueError: no entries, or a scale that is not positive.
@@ -50,6 +55,10 @@ class ChannelLoss(TrajectoryLoss):
 
     ρ(r) = r²; with `huber` only up to it, and 2 huber r − huber² beyond (Huber 1964, doubled). As r is a norm, no
     direction is preferred.
+
+    Attributes:
+        channels: one or more; entries of the state that are in none do not count.
+        huber: threshold on ‖error‖ / scale, from which on ρ grows linearly; by default none.
 
     Raises:
         ValueError: no channels, or a threshold that is not positive.
@@ -81,7 +90,11 @@ class ChannelLoss(TrajectoryLoss):
         return mean_over(data, errors)
 
     def error(self, difference: Float[Array, "*n d"]) -> Float[Array, "*n"]:
-        """Σ over channels of ρ(‖error‖ / scale)."""
+        """Σ over channels of ρ(‖error‖ / scale).
+
+        Args:
+            difference: predicted minus true states (*n, d).
+        """
 
         def one(channel: Channel):
             square = jnp.sum(jnp.square(difference[..., channel.start : channel.stop] / channel.scale), axis=-1)
@@ -103,6 +116,8 @@ def channels_from(
     """Channels scaled by the RMS error of a baseline, such as one of baselines.py, at the end of the windows.
 
     Args:
+        baseline: the field whose errors are the scales.
+        windows: of the data that the field will be trained on.
         parts: entries of each channel; by default those of state.py for a state of 13, otherwise each is a channel.
 
     Raises:

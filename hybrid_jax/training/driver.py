@@ -36,23 +36,39 @@ Shared = tuple[PyTree, Settings, Optimiser]  # validation data as prepared by th
 
 
 class History(eqx.Module):
-    """The losses of every epoch."""
+    """The losses of every epoch.
+
+    Attributes:
+        train: mean of the loss over the minibatches of each epoch, the regulariser with it.
+        validation: the validation loss after each epoch.
+    """
 
     train: Float[np.ndarray, " epochs"]
     validation: Float[np.ndarray, " epochs"]
 
 
 class FitResult(eqx.Module):
-    """A finished training run."""
+    """A finished training run.
 
-    best: Learner  # the field of the best validation epoch
-    best_mse: Float[Array, ""]  # its validation loss
-    best_epoch: int  # counted from 1; 0 if it is the initial field
-    field: Learner  # after the last epoch
+    Attributes:
+        best: the field of the best validation epoch.
+        best_mse: its validation loss.
+        best_epoch: which epoch it is, counted from 1; 0 if it is the initial field.
+        field: the field after the last epoch.
+        epochs: how many were trained.
+        status: how it ended; OK if it stopped early, RUNNING if it was interrupted.
+        history: the losses of every epoch.
+        state: the final state of the run.
+    """
+
+    best: Learner
+    best_mse: Float[Array, ""]
+    best_epoch: int
+    field: Learner
     epochs: int
-    status: Status  # OK if it stopped early, RUNNING if it was interrupted
+    status: Status
     history: History
-    state: FitState  # the final state of the run
+    state: FitState
 
 
 class FitInterrupted(KeyboardInterrupt):
@@ -83,6 +99,9 @@ def fit(
     A network made without a scaling is scaled by the training windows first; see `with_scaling`.
 
     Args:
+        field: the field to begin with, or another module that the objective of `settings` can evaluate.
+        train: windows to learn from.
+        validation: windows that tell the best epoch and when to stop.
         key: of the order of the minibatches.
         rates: learning rates of Adam, a tree prefix of the field: a number, by default 1e-2, or e.g.
             `Hybrid(1e-2, 1e-3)` for physics and residual.

@@ -98,10 +98,12 @@ def fit_gauss_newton(
     For networks of up to a thousand parameters and little data with little noise; there is no early stopping.
 
     Args:
+        field: the field to begin with.
         windows: all are used in each step. A network without a scaling is scaled by them first, as in `fit`.
         penalty: L_reg, of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
             "neighbour_weights", the squared weights of a `GridNetwork` for all points but the one itself.
         weight: λ.
+        max_steps: evaluations of J at most.
         solver: by default `RK4`.
         scale: divides the error of each state, as in `fit_least_squares`.
 

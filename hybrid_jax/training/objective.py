@@ -26,24 +26,56 @@ class Objective(Protocol):
     """Maps windows to a training and a validation loss; hashable. By default `batch` and `observe` change nothing."""
 
     def prepare(self, windows: Trajectories, name: str) -> PyTree:
-        """The data of a run, with a length and indexed by arrays of integers; ValueError, with `name`, if unusable."""
+        """The data of a run, with a length and indexed by arrays of integers.
+
+        Args:
+            windows: the training or the validation data, as `fit` was given them.
+            name: what messages call them, "train" or "validation".
+
+        Raises:
+            ValueError: windows that are unusable.
+        """
 
     def batch(self, picked: PyTree, settings: "Settings") -> PyTree:
-        """A minibatch in the layout that `loss` needs."""
+        """A minibatch in the layout that `loss` needs.
+
+        Args:
+            picked: the windows of the minibatch, as indexing the data of `prepare` gives them.
+            settings: what the program is compiled for.
+        """
         return picked
 
     def loss(
         self, field: Learner, batch: PyTree, settings: "Settings", weight: Float[Array, ""]
     ) -> tuple[Float[Array, ""], PyTree]:
-        """The loss on a minibatch, and what `observe` needs of the evaluation."""
+        """The loss on a minibatch, and what `observe` needs of the evaluation.
+
+        Args:
+            field: what is trained.
+            batch: a minibatch, as `batch` returns it.
+            settings: what the program is compiled for.
+            weight: λ, the weight of the regulariser.
+        """
         ...
 
     def observe(self, field: Learner, batch: PyTree, seen: PyTree) -> Learner:
-        """The field with its running statistics updated by the minibatch; learned parameters stay as they are."""
+        """The field with its running statistics updated by the minibatch; learned parameters stay as they are.
+
+        Args:
+            field: what is trained.
+            batch: a minibatch, as `batch` returns it.
+            seen: what `loss` returned beside the loss.
+        """
         return field
 
     def validate(self, field: Learner, data: PyTree, settings: "Settings") -> Float[Array, ""]:
-        """The validation loss, which early stopping and the choice of the best epoch use."""
+        """The validation loss, which early stopping and the choice of the best epoch use.
+
+        Args:
+            field: what is trained.
+            data: the validation data, as `prepare` returns them.
+            settings: what the program is compiled for.
+        """
         ...
 
 
@@ -66,7 +98,11 @@ class TrajectoryLoss(Objective):
         return value, predicted
 
     def mean_error(self, difference: Float[Array, "t d b"]) -> Float[Array, ""]:
-        """The error of a minibatch, given predicted minus true states."""
+        """The error of a minibatch.
+
+        Args:
+            difference: predicted minus true states (t, d, b).
+        """
         return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
@@ -79,6 +115,12 @@ class TrajectoryLoss(Objective):
 @dataclass(frozen=True)
 class Settings:
     """What a training program is compiled for, the same for all runs of a sweep.
+
+    Attributes:
+        batch_size: windows of a minibatch.
+        regulariser: L_reg of a `Hybrid`, given the field, the minibatch and its predicted states; by default none.
+        solver: takes the field from sample to sample, by default one step of RK4 each.
+        objective: what is minimised and validated on, by default the squared error of trajectories.
 
     Raises:
         ValueError: a batch size that is no count, or a regulariser, solver or objective that is none.

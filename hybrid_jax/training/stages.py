@@ -27,14 +27,20 @@ class Stage:
     A group is named by the beginning of its path in the field, e.g. "physics", "residual/weight_out" or
     "physics/deviations/drag"; "" is the whole field. The longest name that matches counts. Other parameters are frozen.
 
+    Attributes:
+        rates: learning rate by the name of a group.
+        steps: intervals of each window that are trained on, from its start; by default all.
+        epochs: stop after this many.
+        patience: or after this many without a better validation loss.
+
     Raises:
         ValueError: a rate that is negative or not finite, or a count below 1.
     """
 
     rates: Mapping[str, float]
-    steps: int | None = None  # intervals of each window that are trained on, from its start; by default all
-    epochs: int = 100  # stop after this many
-    patience: int = 20  # or after this many without a better validation loss
+    steps: int | None = None
+    epochs: int = 100
+    patience: int = 20
 
     def __post_init__(self):
         for rate in self.rates.values():
@@ -46,6 +52,10 @@ class Stage:
 
 def rates_by_group(field: Learner, groups: Mapping[str, float]) -> PyTree:
     """The learning rate of each learned array of a field, as a tree like the field; see `Stage`.
+
+    Args:
+        field: whose learned arrays get a rate; 0 if they are in no group.
+        groups: learning rate by the name of a group.
 
     Raises:
         ValueError: a group without a learned array; lists the paths that exist.
@@ -91,9 +101,20 @@ def fit_in_stages(
     settings: Settings | None = None,
     progress: Report | bool | None = None,
 ) -> list[FitResult]:
-    """Train a field in stages; `results[-1].best` is the trained field. Arguments are those of `fit`.
+    """Train a field in stages; `results[-1].best` is the trained field.
 
     Every stage is validated on whole windows. Only what is better there than the field that it began with is kept.
+
+    Args:
+        field: the field to begin with.
+        train: windows to learn from, of which each stage may use a shorter beginning.
+        validation: windows that tell the best epoch of each stage and when to stop it.
+        key: of the order of the minibatches.
+        stages: one training run each, in this order.
+        optimiser: any Optax optimiser in place of Adam, whose updates the rates of a stage then multiply.
+        regulariser_weight: λ, by default 1e-3.
+        settings: of all stages; by default those of `fit`.
+        progress: True for a bar on stderr, or a function of (epoch, state) that is called about twice a second.
 
     Raises:
         ValueError: as `fit`; no stages; windows shorter than a stage needs; or rates of a group that the field has not.
