@@ -8,6 +8,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import Solver
 from hybrid_jax.rollouts import predict
 from hybrid_jax.trajectories import Trajectories, check
 
@@ -27,7 +28,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
 
 
 def rollout_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
     """L_MSE of a field in inference mode, mean over windows, at the end of every `every`-th interval.
 
@@ -47,7 +48,7 @@ def rollout_mse(
 
 
 def window_mse(
-    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver=None, chunk: int = CHUNK
+    field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
 ) -> Float[Array, " n"]:
     """L_MSE of each window; see `rollout_mse`.
 

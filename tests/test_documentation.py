@@ -54,9 +54,12 @@ def missing(found: object) -> list[str]:
 
 def missing_of_function(function: object, doc: str | None = None, known: Iterator[str] = ()) -> list[str]:
     doc = doc or inspect.getdoc(function)
-    arguments = [name for name in inspect.signature(function).parameters if not name.startswith("_")]
+    arguments = {name: one for name, one in inspect.signature(function).parameters.items() if not name.startswith("_")}
     named = described(doc, "Args") | KNOWN | set(known)
-    return ([] if doc else [": docstring"]) + [f": {name}" for name in arguments if name not in named]
+    lost = ([] if doc else [": docstring"]) + [f": {name}" for name in arguments if name not in named]
+    # The site's build warns of these, and ends.
+    own = described(getattr(function, "__doc__", None), "Args") & arguments.keys()
+    return lost + [f": annotation of {name}" for name in sorted(own) if arguments[name].annotation is inspect._empty]
 
 
 def missing_of_class(kind: type) -> list[str]:

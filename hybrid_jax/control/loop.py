@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Int, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller, Plan, checked_states
@@ -150,7 +150,9 @@ class Loop(NamedTuple):
         sent = jnp.tile(speeds, (self.hardware.delay(self.controller.period), 1))
         return Moment(x0, seen, speeds, sent, plan, self.estimator.begin(seen), key)
 
-    def tick(self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i) -> tuple[Moment, Input]:
+    def tick(
+        self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i: Int[Array, ""] | int
+    ) -> tuple[Moment, Input]:
         """One period, the i-th; also returns what is commanded [rad/s].
 
         The controller plans from where its model expects the vehicle when the command arrives.

@@ -1,8 +1,8 @@
 """Identify a vehicle from recordings of commands and of whatever was measured, through the ODE solver.
 
 The measurements of each window are compared with those that the field predicts from the window's initial state, which
-is unknown, too: it enters with the estimate of `measured.initial_states` as a prior (an arrival cost; Rao, Rawlings and
-Mayne 2003). So does a force and a torque that is constant over a window: wind, a battery that sags, and other slow
+is unknown, too: it enters with the estimate of `recordings.initial_states` as a prior (an arrival cost; Rao, Rawlings
+and Mayne 2003). So does a force and a torque that is constant over a window: wind, a battery that sags, and other slow
 errors that a pilot corrects, which would pass for effects of the commands. Both are eliminated window by window from
 the normal equations of the parameters (multiple shooting; Bock 1983). Levenberg–Marquardt takes the steps. In rounds
 each channel is weighted by its own errors, and the disturbances get the variance that they turn out to have (empirical
@@ -170,7 +170,10 @@ def identify_in_turn(
 
 
 def prediction_errors(
-    field: AbstractVectorField, recordings: Sequence[Recording], layout: Layout | None = None, measured=()
+    field: AbstractVectorField,
+    recordings: Sequence[Recording],
+    layout: Layout | None = None,
+    measured: Sequence[str] = (),
 ) -> dict[str, Float[np.ndarray, "n t k"]]:
     """y − ŷ of every window, predicted from the state that the samples before it tell; NaN where there is no y.
 

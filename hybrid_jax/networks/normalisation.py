@@ -156,7 +156,7 @@ class BatchNorm(AbstractAffineNorm, AbstractBatchNorm):
         mean = row_means(hidden)
         return self.moved(RunningStats(mean, row_means(jnp.square(hidden - mean[:, None]))))
 
-    def training_mode(self, seen):
+    def training_mode(self, seen: Moments):
         """This for one sample of a minibatch.
 
         Args:
