@@ -17,7 +17,7 @@ PACKAGES = [
 KNOWN = {"self", "cls", "key", "x", "u"}
 # Packages and modules in which something is left to describe; `python tests/test_documentation.py NAME` lists what.
 PENDING = """
-adaptation estimation io online planning
+io online planning
 """
 
 

@@ -29,10 +29,15 @@ TOGETHER = 8  # directions evaluated at a time
 
 
 class Anchored(NamedTuple):
-    """For each of k parts and c penalties the change of the weights, and how well blocks left out are predicted."""
+    """For each of k parts and c penalties the change of the weights, and how well blocks left out are predicted.
+
+    Attributes:
+        changes: of the network's weights.
+        errors: on each of b blocks (k, c, b).
+    """
 
     changes: Float[Array, "k c w"]
-    errors: BlockErrors  # "k c b"
+    errors: BlockErrors
 
 
 def fit_anchored(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
-from hybrid_jax.adaptation.methods import Solution, scale_of
+from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
@@ -48,19 +48,29 @@ CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
 class Choice(NamedTuple):
-    """c candidates, their errors on b blocks that were left out, and which one was taken."""
+    """c candidates, and which one was taken.
+
+    Attributes:
+        names: of the candidates.
+        errors: of each candidate on each of b blocks that were left out (c, b).
+        taken: the index of the candidate that was taken.
+        parameters: names of the p parameters of the extended physics, see `extended`.
+        free: which of these each candidate fitted (c, p).
+        theta: their values in each candidate, in the physics' own parametrisation (c, p).
+        change: of the network's weights in each candidate (c, w); None if the network may not change, or there is none.
+    """
 
     names: tuple[str, ...]
-    errors: BlockErrors  # "c b"
+    errors: BlockErrors
     taken: Int[Array, ""]
-    parameters: tuple[str, ...]  # names of those of the extended physics, see `extended`
-    free: Bool[Array, "c p"]  # which of these each candidate fitted
+    parameters: tuple[str, ...]
+    free: Bool[Array, "c p"]
     theta: Float[Array, "c p"]
-    change: Float[Array, "c w"] | None  # of the network's weights; None if there is no network
+    change: Float[Array, "c w"] | None
 
 
 @dataclass(frozen=True)
-class Auto:
+class Auto(Method):
     """The simplest of several methods that predicts left-out windows as well as the best; see `selection`.
 
     Of a rigid body: the source as it is; θ_p; with them steady forces and torques, drag and the rotors' efficiencies.

@@ -18,7 +18,7 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 from hybrid_jax import checks
 from hybrid_jax.adaptation.methods import Solution
 from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
-from hybrid_jax.estimation.least_squares import Theta, ravel_parameters
+from hybrid_jax.estimation.least_squares import Solver, Theta, ravel_parameters
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse
@@ -31,11 +31,17 @@ RECORDED = -1  # the augmentation_seed of a recorded window
 
 @portable
 class Encoder(eqx.Module):
-    """A perceptron from the states and inputs of the past to one number in (−1, 1) for each parameter."""
+    """A perceptron from the states and inputs of the past to one number in (−1, 1) for each parameter.
+
+    Attributes:
+        weights: of each layer (out, in), the first one first.
+        biases: of each layer (out,).
+        seen: mean and variance of its inputs over source flights.
+    """
 
     weights: tuple[Float[Array, "out in"], ...]
     biases: tuple[Float[Array, " out"], ...]
-    seen: RunningStats  # of its inputs over source flights
+    seen: RunningStats
 
     def __call__(self, past: Trajectories) -> Theta:
         z = (encoder_inputs(past) - self.seen.mean) * jax.lax.rsqrt(self.seen.variance + 1e-12)
@@ -46,33 +52,67 @@ class Encoder(eqx.Module):
 
 @portable
 class ExpertAugmented(eqx.Module):
-    """A hybrid whose θ_p an encoder estimates from the past of each flight; also a method of `adapt`."""
+    """A hybrid whose θ_p an encoder estimates from the past of each flight; also a method of `adapt`.
+
+    Attributes:
+        encoder: from the past of a flight to a place in the box.
+        expert: the hybrid of the source, which stays as it is.
+        box: lowest and highest factor on each of the expert's parameters.
+    """
 
     encoder: Encoder
-    expert: Frozen  # the hybrid of the source
+    expert: Frozen
     box: tuple[float, float] = eqx.field(static=True)
     uses_validation: ClassVar[bool] = False
 
-    def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        """The expert with the mean estimate of θ_p over the heads of the windows; the field is not used."""
+    def solve(
+        self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
+    ) -> Solution:
+        """The expert with the mean estimate of θ_p over the heads of the windows.
+
+        Args:
+            field: not used, as the expert is the source.
+            train: windows of the changed system, at least as long as the past that the encoder reads.
+            validation: not used.
+            settings: not used.
+        """
         past = self.encoder.weights[0].shape[1] // (2 * train.x0.shape[-1] + train.u.shape[-1])
         return Solution(self.with_parameters(_mean_over(self.estimate, cut(train, past))))
 
     def estimate(self, past: Trajectories) -> Theta:
-        """θ̂_p of one flight in the physics' own parametrisation; always inside the box."""
+        """θ̂_p of one flight in the physics' own parametrisation; always inside the box.
+
+        Args:
+            past: one window, as long as those that the encoder was made for.
+        """
         return self.inside(self.encoder(past))
 
     def inside(self, place: Theta) -> Theta:
-        """The parameters at a place in the box, uniform in the logarithm: −1 is its low end, 1 its high end."""
+        """The parameters at a place in the box, uniform in the logarithm.
+
+        Args:
+            place: one number for each parameter (p,): −1 is the low end of the box, 1 its high end.
+        """
         (low, high), (own, _) = np.log(self.box), ravel_parameters(self.expert.field)
         return own + (low + high) / 2 + (high - low) / 2 * place
 
     def with_parameters(self, parameters: Theta) -> AbstractVectorField:
-        """The expert with other parameters."""
+        """The expert with other parameters.
+
+        Args:
+            parameters: in the physics' own parametrisation (p,).
+        """
         return ravel_parameters(self.expert.field)[1](parameters)
 
-    def predict(self, past: Trajectories, u: Float[Array | np.ndarray, "t m"], solver=None) -> Float[Array, "t d"]:
-        """The states that follow one past flight, under the inputs u."""
+    def predict(
+        self, past: Trajectories, u: Float[Array | np.ndarray, "t m"], solver: Solver = None
+    ) -> Float[Array, "t d"]:
+        """The states that follow one past flight, under the inputs u.
+
+        Args:
+            past: one window, at whose end the prediction starts.
+            solver: takes the expert from sample to sample, by default one step of RK4 each.
+        """
         return rollout(self.with_parameters(self.estimate(past)), past.x[-1], u, past.dt, solver)
 
 
@@ -82,8 +122,10 @@ def expert_augmented(
     """An expert with an untrained encoder of two hidden layers.
 
     Args:
+        expert: a hybrid trained on the source, whose physics holds its parameters as logarithms.
         past: windows of source flight, as long as those that the encoder will read; they set the scale of its inputs.
         box: lowest and highest factor on each of the expert's parameters, 0 < low <= high.
+        hidden: units of each hidden layer of the encoder.
 
     Raises:
         ValueError: another box, or past windows that are malformed.
@@ -112,7 +154,11 @@ def encoder_inputs(past: Trajectories) -> Float[Array, " r"]:
 
 
 class Labelled(Trajectories):
-    """Windows, each with the seed of the θ_p with which the expert flies it, or RECORDED."""
+    """Windows that are used as recorded, or as the expert flies them.
+
+    Attributes:
+        augmentation_seed: of each window, the seed of the θ_p with which the expert flies it, or RECORDED.
+    """
 
     augmentation_seed: Int[Array | np.ndarray, "*n"]
 
@@ -122,10 +168,14 @@ class Augmentation(Objective):
     """The objective of an `ExpertAugmented`: L_MSE of its predictions + weight × MSE(θ̂_p, θ_p) on augmented flights.
 
     Every source window is used twice: as recorded, and as the expert flies it with a θ_p from the box.
+
+    Attributes:
+        past: intervals at the head of a window that the encoder reads; the rest is predicted.
+        seed: of the random θ_p.
     """
 
-    past: int = 10  # intervals at the head of a window that the encoder reads; the rest is predicted
-    seed: int = 0  # of the random θ_p
+    past: int = 10
+    seed: int = 0
 
     def __post_init__(self):
         checks.count("past", self.past)
@@ -148,7 +198,13 @@ class Augmentation(Objective):
         return _mean_over(lambda one: self._errors(field, one, settings)[0], data)
 
     def augmented(self, field: ExpertAugmented, one: Labelled, settings: Settings) -> tuple[Trajectories, Theta]:
-        """One window as recorded, or as the expert flies it, and its θ_p."""
+        """One window as recorded, or as the expert flies it, and its θ_p.
+
+        Args:
+            field: whose expert flies, and whose box θ_p is drawn from.
+            one: a window with its seed.
+            settings: of which the solver takes the expert from sample to sample.
+        """
         own, _ = ravel_parameters(field.expert.field)
         key = jax.random.fold_in(jax.random.key(self.seed), one.augmentation_seed)
         drawn = field.inside(jax.random.uniform(key, own.shape, minval=-1.0, maxval=1.0))

@@ -25,12 +25,19 @@ from hybrid_jax.trajectories import Trajectories
 
 
 class Solution(NamedTuple):
-    """The adapted field, the steps that it took, and how it ended, a `Status`."""
+    """What a method of adaptation returns.
+
+    Attributes:
+        field: the adapted field.
+        steps: that it took: epochs, or evaluations of the Jacobian; 0 for a closed form.
+        status: how it ended, a `Status`.
+        choice: the candidates of `Auto` and which one was taken, an `auto.Choice`; None for another method.
+    """
 
     field: AbstractVectorField
     steps: Int[Array, ""] | int = 0
     status: Int[Array, ""] | int = Status.OK
-    choice: Any = None  # of `Auto`
+    choice: Any = None
 
 
 class Method(Protocol):
@@ -50,15 +57,22 @@ class Method(Protocol):
     def solve(
         self, field: AbstractVectorField, train: Trajectories, validation: Trajectories, settings: Settings
     ) -> Solution:
-        """Adapt a field to `train`; `validation` is for early stopping and choices. ValueError: what it cannot use.
+        """Adapt a field. Methods of the library compile and map over stacked fields.
 
-        Methods of the library compile and map over stacked fields.
+        Args:
+            field: the source, which is left as it is.
+            train: windows of the changed system, to adapt to.
+            validation: other windows of it, for early stopping and choices.
+            settings: objective and solver, and of methods that train, minibatches and regulariser.
+
+        Raises:
+            ValueError: a field, windows or settings that the method cannot use.
         """
         ...
 
 
 @dataclass(frozen=True)
-class LeastSquares:
+class LeastSquares(Method):
     """Least squares on θ_p and a constant disturbance; the residual stays as it is.
 
     Attributes:
@@ -94,7 +108,7 @@ class LeastSquares:
 
 
 @dataclass(frozen=True)
-class FineTune:
+class FineTune(Method):
     """Adam from the source's parameters, with early stopping on the validation windows.
 
     Attributes:
@@ -156,7 +170,7 @@ def held_at_start(weight: float) -> optax.GradientTransformation:
 
 
 @dataclass(frozen=True)
-class Ridge:
+class Ridge(Method):
     """A linear correction by ridge regression, with the penalty that predicts the validation windows best.
 
     Attributes:
@@ -172,7 +186,7 @@ class Ridge:
 
 
 @dataclass(frozen=True)
-class Source:
+class Source(Method):
     """No adaptation: the baseline."""
 
     uses_validation: ClassVar[bool] = False

@@ -27,7 +27,13 @@ Update = Callable[[AbstractVectorField, Trajectories, Penalty, Solver], Abstract
 
 
 class RidgeFit(NamedTuple):
-    """The field at the chosen penalty, which should not be an end of the grid, and its validation loss."""
+    """The result of `fit_ridge`.
+
+    Attributes:
+        field: at the chosen penalty.
+        penalty: the chosen one, which should not be an end of the grid.
+        mse: the validation loss there.
+    """
 
     field: AbstractVectorField
     penalty: Float[Array, ""]

@@ -30,17 +30,29 @@ JOINED = 10  # windows that touch, at most so many, are predicted as one
 
 
 class BlockErrors(NamedTuple):
-    """Of one block, or of several, with windows that touch predicted as one."""
+    """Of one block, or of several, with windows that touch predicted as one.
 
-    mse: Float[Array, "*b"]  # mean over the windows of the squared error at each step
-    ends: Float[Array, "*b 2 d"]  # mean squared error of each state at the end of a window, and of those that touch
+    Attributes:
+        mse: mean over the windows of the squared error at each step.
+        ends: mean squared error of each state at the end of a window, and of those that touch (2, d).
+    """
+
+    mse: Float[Array, "*b"]
+    ends: Float[Array, "*b 2 d"]
 
 
 class Fits(NamedTuple):
-    """Least squares for each of c candidates, and how well it predicts each of b blocks that were left out."""
+    """Least squares for each of c candidates, and how well it predicts each of b blocks that were left out.
+
+    Attributes:
+        theta: the parameters of each candidate, in the order of `ravel_parameters` (c, p).
+        errors: of each candidate on each block (c, b).
+        steps: evaluations of the Jacobian of each fit.
+        converged: whether each fit stopped before the most steps, at a finite error.
+    """
 
     theta: Float[Array, "c p"]
-    errors: BlockErrors  # "c b"
+    errors: BlockErrors
     steps: Int[Array, " c"]
     converged: Bool[Array, " c"]
 

@@ -60,6 +60,13 @@ def fit_least_squares(
     Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. In float32 the
     minimum is met within a few hundredths of a standard error.
 
+    Args:
+        field: its θ_p is the start; a residual beside the physics stays as it is.
+        windows: of the system whose θ_p is sought.
+        solver: takes the field from sample to sample, by default one step of RK4 each.
+        max_steps: the most evaluations of the residuals and their Jacobian.
+        scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
+
     Raises:
         ValueError: the physics has no parameter, or windows that are malformed or not of this field.
     """
@@ -103,15 +110,28 @@ def fit_free(
 
 
 class _State(NamedTuple):
-    """The best point so far, and one to try. Points are in units, see `_units`."""
+    """The best point so far, and one to try. Points are in units, see `_units`.
+
+    Attributes:
+        z: the best point.
+        tried: the point to try.
+        errors: of the predictions at z.
+        jacobian: of the errors at z, by θ_p.
+        units: of parameters and of errors.
+        expected: decrease of the squared errors in units.
+        last: whether so little is expected that rounding hides it.
+        damping: relative to the diagonal of JᵀJ.
+        steps: evaluations so far.
+        converged: whether the last step was tried.
+    """
 
     z: Theta
     tried: Theta
-    errors: Float[Array, "n t d"]  # at z
-    jacobian: Float[Array, "n t d p"]  # by θ_p
+    errors: Float[Array, "n t d"]
+    jacobian: Float[Array, "n t d p"]
     units: tuple[Theta, Float[Array, ""]]
-    expected: Float[Array, ""]  # decrease of the squared errors in units
-    last: Bool[Array, ""]  # whether so little is expected that rounding hides it
+    expected: Float[Array, ""]
+    last: Bool[Array, ""]
     damping: Float[Array, ""]
     steps: Int[Array, ""]
     converged: Bool[Array, ""]

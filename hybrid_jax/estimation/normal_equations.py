@@ -22,11 +22,17 @@ RANK = 10  # times p and the rounding of one number: a smaller eigenvalue, of pa
 
 
 class NormalEquations(NamedTuple):
-    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r."""
+    """The contribution of each window to the normal equations of θ_p, with J the Jacobian of its errors r.
 
-    gram: Float[Array, "n p p"]  # JᵀJ
-    score: Float[Array, "n p"]  # Jᵀr
-    square: Float[Array, " n"]  # rᵀr
+    Attributes:
+        gram: JᵀJ.
+        score: Jᵀr.
+        square: rᵀr.
+    """
+
+    gram: Float[Array, "n p p"]
+    score: Float[Array, "n p"]
+    square: Float[Array, " n"]
 
 
 # A program of its own: selecting a disturbance and the covariance share it.
@@ -73,10 +79,16 @@ def has_effect(equations: NormalEquations, windows: Trajectories, scale: Scale) 
 
 
 class Inverse(NamedTuple):
-    """The pseudo-inverse of a Gram matrix JᵀJ: zero along what changes no prediction by more than rounding does."""
+    """The pseudo-inverse of a Gram matrix JᵀJ: zero along what changes no prediction by more than rounding does.
+
+    Attributes:
+        matrix: the pseudo-inverse.
+        told: the parameters that take no part in such a change.
+        rank: how many directions of θ_p change a prediction by more.
+    """
 
     matrix: Float[Array, "*n p p"]
-    told: Bool[Array, "*n p"]  # the parameters that take no part in such a change
+    told: Bool[Array, "*n p"]
     rank: Int[Array, "*n"]
 
 

@@ -44,7 +44,13 @@ Kind = Literal["sandwich", "homoscedastic"]
 
 
 class Interval(NamedTuple):
-    """An estimate and its confidence interval, in one unit."""
+    """An estimate and its confidence interval, in one unit.
+
+    Attributes:
+        value: the estimate, a number, or one for each of several runs.
+        low: the lower end of the interval, of the same shape.
+        high: the upper end.
+    """
 
     value: Float[Array, "*runs"]
     low: Float[Array, "*runs"]
@@ -70,10 +76,12 @@ def covariance_of(
 
     Args:
         field: at, or near, the minimum over θ_p of Σ_i ‖r_i‖² over windows i, with r_i = x − x̂ and J_i = ∂x̂/∂θ_p.
+        windows: those that the field was fitted to.
         kind: with H = Σ_i J_iᵀJ_i (Björck, Numerical Methods for Least Squares Problems, 1996, Sec. 9.2),
             sandwich is H⁻¹ M H⁻¹ with M = n/(n − p) Σ_i (J_iᵀr_i)(J_iᵀr_i)ᵀ. Only windows must be independent; errors
             within one may be correlated and of any unit (Huber 1967; White 1980; the factor is
             MacKinnon and White's HC1, 1985). homoscedastic is σ² H⁻¹, for white noise of one variance.
+        solver: takes the field from sample to sample, by default one step of RK4 each.
         chunk: windows that are held in memory at a time.
         error: the loss of one error x − x̂ (d,) that was minimised, such as `ChannelLoss.error`; the square by default.
             The slope and curvature of another loss enter M and H (Huber 1967).
@@ -138,8 +146,14 @@ def intervals(
     """The physical parameters of a field, each with a confidence interval; names as in `named_parameters`.
 
     The error is taken as normal in the physics' own parametrisation: the interval is value · exp(±z s) of a parameter
-    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is. With `degrees`
-    of freedom, one less than the clusters of the covariance, z is Student's quantile.
+    that is held as a logarithm and returned by `theta()`, and value ± z s of one that is held as it is.
+
+    Args:
+        field: at the estimate; a disturbance in its physics is one of the parameters.
+        covariance: of its parameters as the physics holds them (p, p), such as `covariance_of` returns.
+        level: the probability that an interval holds the true value, between 0 and 1.
+        degrees: degrees of freedom of the covariance, one less than its clusters, with which z is Student's quantile;
+            by default it is that of a normal distribution.
 
     Raises:
         ValueError: a level not between 0 and 1, or a covariance of another shape or with a negative variance.
@@ -196,12 +210,19 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
 
 
 class DisturbanceSelection(eqx.Module):
-    """The fit that was kept, with a disturbance of zero if none is needed, and why."""
+    """The fit that was kept, and why.
+
+    Attributes:
+        fit: the better of the two fits, with a disturbance of zero if none is needed.
+        needed: whether the windows need a disturbance: the gain is more than its standard error.
+        gain: by how much a disturbance lowers L_MSE of left-out windows, mean over windows.
+        standard_error: of the gain.
+    """
 
     fit: LeastSquaresFit
     needed: Bool[Array, ""]
-    gain: Float[Array, ""]  # by how much a disturbance lowers L_MSE of left-out windows, mean over windows
-    standard_error: Float[Array, ""]  # of the gain
+    gain: Float[Array, ""]
+    standard_error: Float[Array, ""]
 
 
 def select_disturbance(
@@ -219,8 +240,15 @@ def select_disturbance(
     by more than one standard error of the difference (Breiman, Friedman, Olshen and Stone, Classification and
     Regression Trees, 1984, Sec. 3.4.3). A single window, or windows that do not determine θ_p, need no disturbance.
 
-    Pure; raises and arguments as of `fit_least_squares`, but `windows` must be independent. `indices` are the disturbed
-    states, see `with_disturbance`.
+    Pure, and raises as `fit_least_squares`.
+
+    Args:
+        field: its θ_p, and its disturbance if it has one, are the start.
+        windows: of the system whose θ_p is sought, independent of each other.
+        solver: takes the field from sample to sample, by default one step of RK4 each.
+        max_steps: the most steps of each of the two fits.
+        scale: the error of each state that counts as 1 (d,), in its own unit; by default 1 for each.
+        indices: the disturbed states, see `with_disturbance`.
     """
     larger = sized(with_disturbance(field, indices), windows.x0.shape[-1])
     parameters, _ = ravel_parameters(larger)
