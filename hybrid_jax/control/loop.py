@@ -151,7 +151,7 @@ class Loop(NamedTuple):
         return Moment(x0, seen, speeds, sent, plan, self.estimator.begin(seen), key)
 
     def tick(
-        self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i: Int[Array, ""] | int
+        self, plant: Plant, reference: Float[Array, "n 13"], now: Moment, i: Int[Array, ""]
     ) -> tuple[Moment, Input]:
         """One period, the i-th; also returns what is commanded [rad/s].
 
