@@ -16,9 +16,7 @@ PACKAGES = [
 # Of a vector field ẋ = f(x, u) the state and the input, and the random key, are the same everywhere.
 KNOWN = {"self", "cls", "key", "x", "u"}
 # Packages and modules in which something is left to describe; `python tests/test_documentation.py NAME` lists what.
-PENDING = """
-io online planning
-"""
+PENDING = ""
 
 
 def public() -> Iterator[tuple[str, object]]:

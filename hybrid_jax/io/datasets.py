@@ -21,11 +21,17 @@ ARRAYS = ("x0", "u", "x")
 
 @dataclass(frozen=True)
 class Dataset:
-    """Windows by the name of their split."""
+    """Windows by the name of their split.
+
+    Attributes:
+        splits: the windows of each split, such as "train", by its name.
+        metadata: JSON values. Its entry `config` determines the windows; the rest, such as versions, describes them.
+        origin: the file that it was read from, for messages.
+    """
 
     splits: Mapping[str, Trajectories]
-    metadata: Mapping[str, Any]  # JSON values; `config` determines the windows, the rest (versions, …) describes them
-    origin: str = field(default="dataset", compare=False)  # the file it was read from, for messages
+    metadata: Mapping[str, Any]
+    origin: str = field(default="dataset", compare=False)
 
     @property
     def config(self) -> Mapping[str, Any]:
@@ -33,7 +39,15 @@ class Dataset:
         return self.metadata.get("config", {})
 
     def first(self, split: str, count: int | None = None) -> Trajectories:
-        """The first `count` windows of a split, or all; ValueError if there are fewer, or no such split."""
+        """The first windows of a split.
+
+        Args:
+            split: its name.
+            count: how many windows; None for all.
+
+        Raises:
+            ValueError: there are fewer, or there is no such split.
+        """
         if split not in self.splits:
             raise ValueError(f"{self.origin}: has no split {split!r}, only {', '.join(self.splits)}")
         windows = self.splits[split]
@@ -44,6 +58,11 @@ class Dataset:
 
 def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) -> None:
     """Write a dataset atomically. If the file already has these windows and this configuration, it is left unchanged.
+
+    Args:
+        path: of the file to write.
+        dataset: the windows and what is known about them.
+        overwrite: whether a file with other content may be replaced.
 
     Raises:
         ValueError: malformed windows, windows of a vehicle without unit quaternions, metadata that are not JSON, or a
@@ -63,7 +82,11 @@ def save_dataset(path: str | Path, dataset: Dataset, overwrite: bool = False) ->
 
 
 def load_dataset(path: str | Path, expected_config: Mapping[str, Any] | None = None) -> Dataset:
-    """Read and verify a dataset, whose configuration must have the entries of `expected_config` and may have others.
+    """Read and verify a dataset.
+
+    Args:
+        path: of a file that `save_dataset` wrote.
+        expected_config: entries that the configuration must have; it may have others. None for no condition.
 
     Raises:
         ValueError: the file is missing, damaged or not a dataset, or of another configuration; one line that names the

@@ -25,17 +25,27 @@ FORMAT = "hybrid_jax model 2"
 
 @dataclass(frozen=True)
 class Model:
-    """A vector field and what is known about it."""
+    """A vector field and what is known about it.
+
+    Attributes:
+        field: the vector field ẋ = f(x, u), or any other Equinox module that was saved.
+        about: JSON values about it, such as its origin and test error.
+    """
 
     field: AbstractVectorField
-    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)  # JSON values, such as its origin and test error
+    about: Mapping[str, Any] = dataclasses.field(default_factory=dict)
 
     def predict(
         self, x0: Float[Array | np.ndarray, "*n d"], u: Float[Array | np.ndarray, "*n t m"], dt: float
     ) -> Float[Array, "*n t d"]:
-        """The state of one window, or of n, at the end of each interval, under inputs that are held for dt [s] each.
+        """The state of one window, or of n, at the end of each interval, under inputs that are held.
 
         All are finite. To keep the other windows where some diverge, use `rollout_batch`.
+
+        Args:
+            x0: the first state of each window.
+            u: the input in each of the t intervals of each window.
+            dt: length of an interval [s].
 
         Raises:
             ValueError: shapes do not agree or do not fit the model, a number is not finite, dt is not positive, a rigid
@@ -61,6 +71,11 @@ def save(path: str | Path, field: eqx.Module, about: Mapping[str, Any] | None = 
 
     Warns if `load` will need `like`, as the file alone is not enough to rebuild the model; see `check_savable`.
 
+    Args:
+        path: of the file to write; one that exists is replaced.
+        field: the model.
+        about: JSON values, which `load` returns with the field.
+
     Raises:
         ValueError: `about` is not JSON, or the field contains an object that is no array, number, text, function,
             container or module; names its path.
@@ -79,6 +94,7 @@ def load(path: str | Path, like: eqx.Module | None = None) -> Model:
     """Read a model that `save` wrote. The modules that define its classes must have been imported.
 
     Args:
+        path: of the file.
         like: a field of the same structure, whose arrays are replaced by those of the file. Needed for classes and
             functions that the file cannot name, such as local classes and lambdas.
 
@@ -110,7 +126,11 @@ def _filled(like: eqx.Module, tree: Any, arrays: Arrays) -> Any:
 
 
 def check_savable(field: Any) -> str | None:
-    """Why `load` could not rebuild this field from a file alone, or None if it can. `load` with `like` mostly can."""
+    """Why `load` could not rebuild this field from a file alone, or None if it can. `load` with `like` mostly can.
+
+    Args:
+        field: the model that is to be saved.
+    """
     try:
         return Structure(field).problem
     except ValueError as error:
@@ -118,7 +138,14 @@ def check_savable(field: Any) -> str | None:
 
 
 def describe(field: eqx.Module) -> Any:
-    """The structure of a field as JSON values, without its arrays; ValueError if a part has no name for a file."""
+    """The structure of a field as JSON values, without its arrays.
+
+    Args:
+        field: any Equinox module.
+
+    Raises:
+        ValueError: a part has no name for a file.
+    """
     if (structure := Structure(field)).problem is not None:
         raise ValueError(structure.problem)
     return structure.tree

@@ -60,6 +60,10 @@ def portable(item: Any = None, *, name: str | None = None) -> Any:
     An Equinox module needs no decorator unless it may move to another module. A function that a field holds, or a
     dataclass that is no Equinox module, needs it to be loaded without `like`.
 
+    Args:
+        item: the class or function. Without it, as in `@portable(name="mine")`, the result is the decorator.
+        name: in files, by default its own; no other class or function may have it.
+
     Raises:
         ValueError: another class or function already has the name.
     """
@@ -78,13 +82,19 @@ def _address(item: Any) -> str:
 
 
 class Structure:
-    """The structure of a field, JSON values in `tree`; ValueError, with its path, if a part cannot be saved."""
+    """The structure of a field; ValueError, with its path, if a part cannot be saved.
+
+    Attributes:
+        tree: the structure as JSON values.
+        static_arrays: arrays in static fields, by path; the others are leaves of the field.
+        problem: why `decode` cannot rebuild the field; None if it can.
+    """
 
     def __init__(self, field: eqx.Module):
         if not isinstance(field, eqx.Module):
             raise ValueError(f"field must be an Equinox module, got {short_repr(field)}")
-        self.static_arrays: dict[str, Any] = {}  # arrays in static fields, by path; the others are leaves of the field
-        self.problem: str | None = None  # why `decode` cannot rebuild the field
+        self.static_arrays: dict[str, Any] = {}
+        self.problem: str | None = None
         try:
             self.tree = self._encode(field, "field", static=False)
         except RecursionError as error:

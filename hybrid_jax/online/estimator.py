@@ -173,7 +173,11 @@ class OnlineAdaptation(AbstractEstimator):
         return self._sound(self._merged(state, belief, free, judged, sample, history), state)
 
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
-        """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation."""
+        """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation.
+
+        Args:
+            state: of the filter, as `begin` and `update` return it.
+        """
         scales, d = jnp.asarray(self.scales, state.x.dtype), len(state.x)
         covariance = state.covariance[d:, d:]
         if state.mixture is not None:
@@ -187,11 +191,20 @@ class OnlineAdaptation(AbstractEstimator):
         return unravel((theta + jnp.asarray(self.scales, theta.dtype) * state.trusted).astype(theta.dtype))
 
     def intervals(self, state: OnlineState, level: float = 0.95) -> dict[str, Interval]:
-        """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`."""
+        """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`.
+
+        Args:
+            state: of the filter, as `begin` and `update` return it.
+            level: probability that an interval holds the value, between 0 and 1.
+        """
         return intervals(self.model(state), self.estimate(state)[1], level)
 
     def flags(self, state: OnlineState) -> Flags:
-        """What is wrong with samples, parameters and model, or was found."""
+        """What is wrong with samples, parameters and model, or was found.
+
+        Args:
+            state: of the filter, or states of several, stacked along leading axes.
+        """
         tuning, d = self.tuning, state.x.shape[-1]
         variance, free, test = jnp.diagonal(state.covariance, axis1=-2, axis2=-1)[..., d:], state.free, state.test
         if state.mixture is not None:

@@ -18,10 +18,15 @@ from hybrid_jax.integrate import compact, rollout
 
 
 class Information(NamedTuple):
-    """Sums over all windows, of errors over the noise's standard deviation; J = ∂x̂/∂θ_p."""
+    """Sums over all windows, of errors over the noise's standard deviation; J = ∂x̂/∂θ_p.
 
-    gram: Float[Array, "p p"]  # JᵀJ, the Gauss–Newton information if the first samples were exact
-    noise: Float[Array, "p p"]  # the covariance of Jᵀ(x − x̂), with the noise of first samples
+    Attributes:
+        gram: JᵀJ, the Gauss–Newton information if the first samples were exact.
+        noise: the covariance of Jᵀ(x − x̂), with the noise of first samples.
+    """
+
+    gram: Float[Array, "p p"]
+    noise: Float[Array, "p p"]
 
     def covariance(self, free: Bool[Array, " p"]) -> Float[Array, "p p"]:
         """The covariance of θ_p by least squares on the free parameters, zero for the others.

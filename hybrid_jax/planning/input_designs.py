@@ -36,16 +36,24 @@ SMOOTH = np.polynomial.Polynomial([0, 0, 0, 0, 0, 126, -420, 540, -315, 70])
 class FlightBounds:
     """The box that a multirotor stays in, and how hard it flies there.
 
+    Attributes:
+        low: corner of the box with the least x, y and z [m]; z points up.
+        high: the opposite corner [m].
+        speed: highest speed [m/s].
+        tilt: largest angle between thrust and the vertical [rad], below π/2.
+        yaw: largest heading either way of 0 [rad].
+        rotor_speed: least and most that a rotor may turn, as shares of the vehicle's highest speed.
+
     Raises:
         ValueError: an empty box, a limit that is not positive, or a tilt or share out of its range.
     """
 
-    low: tuple[float, float, float] = (-3.0, -3.0, 0.5)  # corner of the box, m
-    high: tuple[float, float, float] = (3.0, 3.0, 3.0)  # the opposite one
-    speed: float = 4.0  # m/s
-    tilt: float = 0.6  # from the vertical, rad
-    yaw: float = 1.5  # either way, rad
-    rotor_speed: tuple[float, float] = (0.2, 0.9)  # least and most, as shares of the vehicle's highest
+    low: tuple[float, float, float] = (-3.0, -3.0, 0.5)
+    high: tuple[float, float, float] = (3.0, 3.0, 3.0)
+    speed: float = 4.0
+    tilt: float = 0.6
+    yaw: float = 1.5
+    rotor_speed: tuple[float, float] = (0.2, 0.9)
 
     def __post_init__(self):
         _check_box("low", self.low, "high", self.high, 3)
@@ -62,13 +70,20 @@ class FlightBounds:
 class InputBounds:
     """The limits of any system's inputs, where it starts, and the box that its states stay in, by default none.
 
+    Attributes:
+        low: the least that each of the m inputs may be, in its own unit.
+        high: the most that each input may be.
+        start: the d numbers of the first state.
+        state_low: the least that each of the d states may be; None for no box. Given together with `state_high`.
+        state_high: the most that each state may be; None for no box.
+
     Raises:
         ValueError: an empty box, or tuples of different lengths.
     """
 
-    low: tuple[float, ...]  # of each input
+    low: tuple[float, ...]
     high: tuple[float, ...]
-    start: tuple[float, ...]  # the first state
+    start: tuple[float, ...]
     state_low: tuple[float, ...] | None = None
     state_high: tuple[float, ...] | None = None
 

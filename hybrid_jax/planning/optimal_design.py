@@ -51,16 +51,27 @@ NOISE = ((POSITION, 0.001), (QUATERNION, 0.002), (VELOCITY, 0.02), (BODY_RATES, 
 
 @dataclass(frozen=True)
 class Excitation:
-    """The result of `excitation`."""
+    """The result of `excitation`: a plan of n intervals.
 
-    reference: Callable[..., Any]  # t [s] → (position [m], yaw [rad]) of a multirotor, or → the inputs
-    t: Float[np.ndarray, " n+1"]  # s
-    states: Float[np.ndarray, "n+1 d"]  # planned
-    inputs: Float[np.ndarray, "n m"]  # planned, held over each interval
-    parameters: tuple[str, ...]  # those asked for that the inputs excite
-    information: Float[np.ndarray, "q q"]  # of these, in the physics' own parametrisation, the others being unknown too
-    standard_errors: dict[str, float]  # predicted, of those asked for, in the units of `intervals`; inf if not excited
-    margins: dict[str, float]  # share of each limit that is left
+    Attributes:
+        reference: function of time t [s] that gives position [m] and yaw [rad] of a multirotor, else the inputs.
+        t: times of the states [s], from 0.
+        states: planned states at these times.
+        inputs: planned inputs, each held over an interval; rotor speeds [rad/s] of a multirotor.
+        parameters: names of the q parameters that were asked for and that the inputs excite.
+        information: inverse covariance of these, in the physics' own parametrisation, the others being unknown too.
+        standard_errors: predicted, of all that were asked for, in the units of `intervals`; infinite if not excited.
+        margins: least share of each limit that is left, by the limit's name; 0 where all of it is used.
+    """
+
+    reference: Callable[..., Any]
+    t: Float[np.ndarray, " n+1"]
+    states: Float[np.ndarray, "n+1 d"]
+    inputs: Float[np.ndarray, "n m"]
+    parameters: tuple[str, ...]
+    information: Float[np.ndarray, "q q"]
+    standard_errors: dict[str, float]
+    margins: dict[str, float]
 
     @property
     def log_det(self) -> float:
@@ -94,11 +105,15 @@ def excitation(
     Args:
         model: of a multirotor with `FlightBounds`, else any field with `InputBounds`, at a guess of its parameters.
         parameters: names as in `intervals`; by default all but a disturbance.
+        bounds: limits that the plan keeps.
+        seconds: duration of the plan [s].
         noise: standard deviation of each state's white noise; by default that of motion capture for a multirotor.
-        window: length of the windows [s], a multiple of `dt` [s].
+        window: length of the windows [s], a multiple of `dt`.
+        dt: interval between samples, over which an input is held [s].
         bandwidth: highest frequency of the series [Hz].
         starts: random series to start from, of which the best end is kept.
         steps: of Adam.
+        seed: of the random series.
 
     Raises:
         ValueError: an unknown parameter, bounds of the wrong kind, limits that not even rest keeps, or parameters that
