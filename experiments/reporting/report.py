@@ -45,23 +45,11 @@ def to_json(report: Report) -> dict[str, Any]:
     return json_value(own | dict(report.extra))
 
 
-def rounded(value: Any) -> Any:
-    """A JSON value with its numbers to seven digits."""
-    match value:
-        case float():
-            return float(f"{value:.7g}")
-        case dict():
-            return {name: rounded(item) for name, item in value.items()}
-        case list():
-            return [rounded(item) for item in value]
-    return value
-
-
 def lines_of(record: dict[str, Any]) -> str:
-    """JSON with a line for each row, and numbers to seven digits, as single precision has."""
+    """JSON with a line for each row."""
 
     def text(value: Any) -> str:
-        return json.dumps(rounded(value), separators=(",", ":"), allow_nan=False, ensure_ascii=False)
+        return json.dumps(value, separators=(",", ":"), allow_nan=False, ensure_ascii=False)
 
     def entry(value: Any) -> str:
         return "[\n" + ",\n".join(map(text, value)) + "\n]" if isinstance(value, list) and value else text(value)

@@ -73,7 +73,7 @@ def test_report_tables_and_figures_keep_their_contract(name, folder, finished):
         assert row["theta"] is None or set(row["theta"]) == {"Ix", "Iy", "k"}
         assert row["n_train"] == (0 if row["mode"] == "source_only" else 20)
         error = source[source_of(row["model"])]
-        np.testing.assert_allclose(row["rho"], (error - row["test_mse"]) / error, rtol=1e-6)
+        np.testing.assert_allclose(row["rho"], (error - row["test_mse"]) / error, rtol=1e-12)
     out = folder / "out" / name
     with (out / "rows.csv").open() as file:
         assert len(list(csv.DictReader(file))) == len(report["rows"])
