@@ -3,7 +3,7 @@
 A step is 100 windows of 10 intervals: RK4, batch normalisation, regulariser, gradient, Adam, running statistics. The
 plain one is one sample at a time under `vmap`, batch statistics by `pmean`, an RK4 by hand, derivatives by autodiff.
 Both must agree, ours also with itself in double precision. Our own step is also timed without the
-kernels of `hybrid_jax.native`.
+kernels of `hybrid_jax.kernels`.
 """
 
 from collections.abc import Callable
@@ -20,9 +20,10 @@ from jaxtyping import PyTree
 from benchmarks import plain
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_run
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compile_all, compiled, in_turns, run, table
-from hybrid_jax import native
+from hybrid_jax import kernels
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.dynamics.batching import batch_norms
+from hybrid_jax.kernels import library
 from hybrid_jax.training.fitting import gradient_step
 
 BARE = "without kernels"
@@ -79,7 +80,7 @@ def prepare(model: Model, preset: Preset) -> Contest:
     arguments, ours = (state.field, state.adam, plan, windows), partial(gradient_step, settings=settings)
     calls, seconds = compile_all({"ours": ours, "plain": plain.training_step}, *arguments)
     difference = compare(f"steps of {model}", calls["ours"](), calls["plain"]())
-    if batch_norms(state.field) and native.prefix():
+    if batch_norms(state.field) and kernels.status() == "used":
         calls[BARE], seconds[BARE] = without_kernels(ours, *arguments)
         compare(f"steps of {model} with and without kernels", calls["ours"](), calls[BARE]())
     exact = in_double_precision(ours, *arguments)
@@ -90,7 +91,7 @@ def prepare(model: Model, preset: Preset) -> Contest:
 def without_kernels(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
     """`compiled`, by JAX alone."""
     jax.clear_caches()  # of what was traced with kernels
-    with mock.patch.object(native, "prefix", return_value=None):
+    with mock.patch.object(library, "is_available", return_value=False):
         found = compiled(function, *arguments)
     jax.clear_caches()
     return found

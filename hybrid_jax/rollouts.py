@@ -1,18 +1,17 @@
 """Trajectories of many windows at once: of a minibatch in training mode, and predicted in inference mode.
 
-By the kernels of rollout_kernels.py where they serve, else by JAX.
+By the kernels of `hybrid_jax.kernels` where they serve, else by JAX.
 """
 
 import diffrax
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from hybrid_jax import kernels
 from hybrid_jax.dynamics.base import AbstractVectorField, features_first, train_batch
 from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
 from hybrid_jax.integrate import RK4, Solver, integrate, rollout_batch
-from hybrid_jax.rollout_kernels import prediction_kernel, training_kernel
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
 _train, _evaluate = eqx.filter_jit(train_batch), eqx.filter_jit(lambda field, x, u: field(x, u))
@@ -25,9 +24,8 @@ def rollout_minibatch(
 
     A field for one sample is integrated samples first: transposing in each evaluation would cost up to half the step.
     """
-    own = training_kernel(field, solver, substeps)
-    if own and own.serves(x0, u, windows_axis=-1):
-        return own.rollout(x0, u, dt)
+    if (states := kernels.trained(field, x0, u, dt, solver, substeps)) is not None:
+        return states
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
     if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations
         return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
@@ -47,7 +45,5 @@ def predict(
     solver: Solver | None = None,
 ) -> Float[Array, "n t d"]:
     """What `rollout_batch` returns, to rounding; it raises the same."""
-    own = prediction_kernel(field, RK4() if solver is None else solver)
-    if own and own.serves(x0, u, windows_axis=0):
-        return own.predict(jnp.asarray(x0), jnp.asarray(u), dt)
-    return rollout_batch(field, x0, u, dt, solver)
+    states = kernels.predicted(field, x0, u, dt, RK4() if solver is None else solver)
+    return rollout_batch(field, x0, u, dt, solver) if states is None else states

@@ -20,7 +20,7 @@ from rich.console import Console
 from experiments.runner.flags import in_flags
 from experiments.runner.options import Run
 from experiments.runner.run_record import ChecksFailed, OtherRun, recorded
-from hybrid_jax import checks, native
+from hybrid_jax import checks, kernels
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
@@ -55,7 +55,7 @@ def run(
         if config.distributed:
             hosts.initialize(config.coordinator, config.processes, config.process_id)
         # Compiles the kernels beside what comes first, if there are none yet: GCC takes some seconds.
-        threading.Thread(target=native.status, daemon=True).start()
+        threading.Thread(target=kernels.status, daemon=True).start()
         signal.signal(signal.SIGTERM, _interrupt)
         main = hosts.is_main_process()  # it alone prints and writes
         console, folder = Console(stderr=True, quiet=not main), config.out / name

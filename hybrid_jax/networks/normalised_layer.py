@@ -1,7 +1,4 @@
-"""Batch normalisation in training mode with the layers around it, and its derivative written out.
-
-As plain JAX for any activation, precision and device, and by the kernels of `hybrid_jax.native` where they serve.
-"""
+"""Batch normalisation in training mode with the layers around it, and its derivative written out."""
 
 from functools import partial
 
@@ -9,10 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax import native
-from hybrid_jax.networks.activations import ACTIVATIONS, Activation
-
-RELU = ACTIVATIONS["relu"]
+from hybrid_jax.networks.activations import Activation
 
 
 def normalised_layer(
@@ -20,22 +14,12 @@ def normalised_layer(
 ) -> Float[Array, "d b"]:
     """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z."""
     arrays = weight_in, gain, shift, weight_out, bias_out, z
-    if _has_kernel(activation, arrays) and native.prefix():
-        return _kernel_layer(epsilon, *arrays)
     precision = jnp.result_type(*arrays)  # each derivative is returned in the precision of its array
-    return plain_layer(epsilon, activation, *(array.astype(precision) for array in arrays))
-
-
-def _has_kernel(activation: Activation, arrays) -> bool:
-    """Whether the kernels are written for this layer. They do not check shapes: what does not fit, JAX refuses."""
-    (h, m), d, b = arrays[0].shape, len(arrays[4]), arrays[5].shape[1]
-    fits = [array.shape for array in arrays] == [(h, m), (h,), (h,), (d, h), (d,), (m, b)]
-    single = all(array.dtype == jnp.float32 for array in arrays)
-    return fits and single and activation is RELU and h % native.UNITS == 0 and b >= native.VECTOR
+    return _layer(epsilon, activation, *(array.astype(precision) for array in arrays))
 
 
 @partial(jax.custom_vjp, nondiff_argnums=(0, 1))
-def plain_layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
+def _layer(epsilon, activation, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
     """W₂ σ(γ ĥ + β) + b₂ with ĥ = W₁ z normalised over the columns of z.
 
     The derivative is written out because XLA turns the sums over a minibatch that autodiff asks for into scalar loops
@@ -73,48 +57,7 @@ def _backward(_, activation, saved, d_out: Float[Array, "d b"]):
     return d_hidden @ centred.T, d_scale * inverse_deviation, d_shift, d_weight_out, d_bias, d_z
 
 
-plain_layer.defvjp(_forward, _backward)
-
-
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _kernel_layer(epsilon, weight_in, gain, shift, weight_out, bias_out, z: Float[Array, "m b"]):
-    """`plain_layer` with ReLU, each way in one call."""
-    return _forward_kernel(epsilon, weight_in, gain, shift, weight_out, bias_out, z)[0]
-
-
-def _forward_kernel(epsilon, *arrays):
-    def kernel(weight_in, gain, shift, weight_out, bias_out, z):
-        results = _shape(bias_out, z), jax.ShapeDtypeStruct((z.size + len(gain),), z.dtype)
-        arrays = weight_in, gain, shift, weight_out, bias_out, z
-        return tuple(native.call("normalised_layer_forward", results, *arrays, numbers=[epsilon]))
-
-    def plain(*arrays):
-        y, (*_, centred, _, inverse_deviation) = _forward(epsilon, RELU, *arrays)
-        return y, jnp.concatenate([centred.ravel(), inverse_deviation])
-
-    y, kept = native.with_derivative(kernel, plain)(*arrays)
-    return y, (*arrays[:4], kept)
-
-
-def _backward_kernel(_, saved, d_out: Float[Array, "d b"]):
-    def kernel(weight_in, gain, shift, weight_out, kept, d_out):
-        like = [jax.ShapeDtypeStruct(a.shape, a.dtype) for a in (weight_in, gain, shift, weight_out, d_out[:, 0])]
-        arrays = weight_in, gain, shift, weight_out, kept, d_out
-        return tuple(native.call("normalised_layer_backward", (*like, _shape(weight_in[0], d_out)), *arrays))
-
-    def plain(weight_in, gain, shift, weight_out, kept, d_out):
-        centred, inverse_deviation = kept[: -len(gain)].reshape(-1, d_out.shape[1]), kept[-len(gain) :]
-        saved = weight_in, gain, shift, weight_out, centred, weight_in @ centred, inverse_deviation
-        return _backward(None, RELU, saved, d_out)
-
-    return native.with_derivative(kernel, plain)(*saved, d_out)
-
-
-_kernel_layer.defvjp(_forward_kernel, _backward_kernel)
-
-
-def _shape(rows: Float[Array, " r"], columns: Float[Array, "_ b"]) -> jax.ShapeDtypeStruct:
-    return jax.ShapeDtypeStruct((len(rows), columns.shape[1]), columns.dtype)
+_layer.defvjp(_forward, _backward)
 
 
 def _transposed(matrix: Float[Array, "r c"]) -> Float[Array, "c r"]:

@@ -8,12 +8,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from hybrid_jax import checks
+from hybrid_jax import checks, kernels
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running_stats
 from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.integrate import RK4, along, check_solver
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.rollout_kernels import training_kernel
 from hybrid_jax.rollouts import rollout_minibatch
 from hybrid_jax.runtime import FAST_COMPILE
 from hybrid_jax.training.loss import Minibatch, Regulariser
@@ -150,9 +149,8 @@ def check_minibatch(field: Learner, settings: Settings) -> None:
 
 
 def compiler_options(field: Learner, data: PyTree, settings: Settings) -> dict[str, bool | int]:
-    """XLA's options for a training program: the fast ones where kernels of `hybrid_jax.native` do most of the work."""
-    own = training_kernel(field, settings.solver)
-    if own is None or not isinstance(data, Trajectories):
+    """XLA's options for a training program: the fast ones where kernels do most of the work."""
+    if not isinstance(data, Trajectories):
         return {}
     x0, u = (jax.ShapeDtypeStruct((settings.batch_size, *a.shape[1:]), a.dtype) for a in (data.x0, data.u))
-    return FAST_COMPILE if own.serves(x0, u, windows_axis=0) else {}
+    return FAST_COMPILE if kernels.serves_training(field, x0, u, settings.solver, windows_axis=0) else {}

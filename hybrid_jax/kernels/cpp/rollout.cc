@@ -1,5 +1,5 @@
 // The trajectories of a minibatch by RK4, and their derivative, in one call each way: `_forward` and `_backward` of
-// rollout_kernels.py.
+// fields.py.
 //
 //   ẋ = f_p(x, u) + f_d(x, u): a rigid body, or nothing, plus the layer of normalised_layer.h, of z = [x, u], or nothing.
 

@@ -1,4 +1,4 @@
-// Windows predicted by RK4 with a trained model, in one call: `_predict` of rollout_kernels.py.
+// Windows predicted by RK4 with a trained model, in one call: `_predict` of fields.py.
 //
 //   ẋ = f_p(x, u) + W₂ max(W₁ z + c, 0) + b₂, z = ([x, u] − offset) factor: a rigid body, or nothing, plus one hidden
 //   layer with ReLU, or nothing.

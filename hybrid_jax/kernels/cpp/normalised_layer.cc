@@ -1,5 +1,4 @@
-// The layer of normalised_layer.h, and the same on one minibatch in one call each way: `_forward_kernel` and
-// `_backward_kernel` of normalised_layer.py.
+// The layer of normalised_layer.h.
 
 #include "normalised_layer.h"
 
@@ -113,50 +112,3 @@ void Layer::to_rows(const float* w1t, float* d_w1) const {
   transpose(w1t, h, rows, m, m, h);
   std::memcpy(d_w1, rows, h * m * sizeof(float));
 }
-
-namespace {
-
-// The arguments of both kernels: of the way back, those from z on are what is kept and the derivative with respect to y.
-enum Argument { WEIGHT_IN, GAIN, SHIFT, WEIGHT_OUT, BIAS_OUT, Z, KEPT = BIAS_OUT, D_Y };
-
-struct Sizes {
-  int64_t m, b, h, d, lanes;
-  Sizes(Array w1, Array w2, Array columns)
-      : m(w1.size(-1)), b(columns.size(-1)), h(w1.size(-2)), d(w2.size(-2)), lanes(w1.count() / (m * h)) {}
-};
-
-Layer layer_of(const Sizes& s, const Lane& lane, float epsilon) {
-  return Layer(s.m, s.b, s.h, s.d, epsilon, lane.argument(WEIGHT_IN), lane.argument(GAIN), lane.argument(SHIFT),
-               lane.argument(WEIGHT_OUT));
-}
-
-// Results: y; z̃ and behind it 1 / √(mean (W₁ z̃)² + ε). The number: ε.
-void normalised_layer_forward_call(const Call& call) {
-  const Sizes s(call.argument(WEIGHT_IN), call.argument(WEIGHT_OUT), call.argument(Z));
-  for (int64_t i = 0; i < s.lanes; ++i) {
-    const Lane lane{call, i, s.lanes};
-    float *y = lane.result(0), *centred = lane.result(1);
-    centre(lane.argument(Z), centred, s.m, s.b);
-    layer_of(s, lane, call.numbers()[0]).forward(centred, lane.argument(BIAS_OUT), centred + s.m * s.b, y);
-  }
-}
-
-// Results: the derivatives with respect to W₁, γ, β, W₂, b₂, z.
-void normalised_layer_backward_call(const Call& call) {
-  const Sizes s(call.argument(WEIGHT_IN), call.argument(WEIGHT_OUT), call.argument(D_Y));
-  float* d_w1t = scratch(D_W1T, s.m * s.h);
-  for (int64_t i = 0; i < s.lanes; ++i) {
-    const Lane lane{call, i, s.lanes};
-    const Layer layer = layer_of(s, lane, 0);
-    const Gradients to{d_w1t, lane.result(GAIN), lane.result(SHIFT), lane.result(WEIGHT_OUT), lane.result(BIAS_OUT)};
-    layer.clear(to);
-    const float* centred = lane.argument(KEPT);
-    layer.backward(centred, centred + s.m * s.b, lane.argument(D_Y), to, lane.result(Z));
-    layer.to_rows(d_w1t, lane.result(WEIGHT_IN));
-  }
-}
-
-}  // namespace
-
-HANDLER(normalised_layer_forward)
-HANDLER(normalised_layer_backward)

@@ -11,10 +11,11 @@ import pytest
 from systems import ODD
 
 from benchmarks.subjects import DT, untrained
-from hybrid_jax import native, rollouts
+from hybrid_jax import kernels, rollouts
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.integrate import RK4, integrate, rollout_batch
+from hybrid_jax.kernels import library
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.networks.normalisation import ChannelScaling
 from hybrid_jax.runtime import FAST_COMPILE
@@ -28,7 +29,7 @@ HEXACOPTER = replace(
     spin=(1.0, -1.0) * 3,
 )
 THETA = dict(zip(LEARNED, jnp.array([0.3, -0.4, 0.1]), strict=True))
-needs_kernels = pytest.mark.skipif(native.prefix() is None, reason=native.status())
+needs_kernels = pytest.mark.skipif(not library.is_available(), reason=kernels.status())
 
 
 def network(d, r, hidden=32, **options):
@@ -122,7 +123,7 @@ def test_a_second_derivative_is_that_of_jax(monkeypatch):
         return jax.grad(lambda x0: jnp.sum(jnp.square(slope(x0))))(x0)
 
     found = curvature(trained)
-    monkeypatch.setattr(native, "prefix", lambda: None)
+    monkeypatch.setattr(library, "is_available", lambda: False)
     expected = curvature(trained)
     np.testing.assert_allclose(found, expected, rtol=0, atol=1e-5 * np.abs(expected).max())
 
@@ -163,14 +164,14 @@ def test_fusion_emitters_are_spared_where_kernels_serve(name):
     x0, u, states = (np.moveaxis(part, -1, 0) for part in windows(FIELD, 40))
     settings = Settings(batch_size=options.get("b", 16))
     found = compiler_options(field, Trajectories(x0, u, states, DT), settings)
-    assert found == (FAST_COMPILE if name not in OTHERS and native.prefix() else {})
+    assert found == (FAST_COMPILE if name not in OTHERS and library.is_available() else {})
 
 
 @pytest.mark.parametrize("solver", [RK4(substeps=2), RK4(scanned=True)])
 def test_only_one_step_of_rk4_an_interval_is_a_kernel(solver):
     x0, u, _ = windows(FIELD, 16)
     found = calls(lambda field, x0, u: rollouts.rollout_minibatch(field, x0, u, DT, solver), FIELD, x0, u)
-    assert found == (solver.substeps == 1 and native.prefix() is not None)
+    assert found == (solver.substeps == 1 and library.is_available())
 
 
 def test_arrays_that_do_not_fit_are_refused():

@@ -1,4 +1,4 @@
-"""Rollouts of the paper's models by the kernels of `hybrid_jax.native`: all intervals in one call, and its derivative.
+"""Rollouts of the paper's models by kernels: all intervals in one call, and its derivative.
 
 A model is a rigid body, a network with one hidden layer and ReLU, or their sum, in single precision, by RK4.
 """
@@ -12,19 +12,23 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax import native
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, apply_residual
 from hybrid_jax.dynamics.equations import derivative
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import RK4, Solver, integrate
+from hybrid_jax.kernels import library
+from hybrid_jax.networks.activations import ACTIVATIONS
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm, Bias, ChannelScaling, InputScaling
-from hybrid_jax.networks.normalised_layer import RELU, plain_layer
+from hybrid_jax.networks.normalised_layer import normalised_layer
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.vehicle import Vehicle
 
+RELU = ACTIVATIONS["relu"]
 Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
+VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at least so many
+UNITS = 2 * VECTOR  # hidden units that a kernel works on at once, at most: their number is a multiple of it
 
 
 class Constants(NamedTuple):
@@ -64,7 +68,7 @@ class KernelField(NamedTuple):
         arrays = jax.tree.leaves((eqx.filter((self.physics, self.network), eqx.is_array), x0, u))
         single = all(array.dtype == jnp.float32 for array in arrays)
         fits = self._fits(x0.shape[1 + windows_axis], u.shape[2 + windows_axis])
-        return single and fits and x0.shape[windows_axis] >= native.VECTOR and native.prefix() is not None
+        return single and fits and x0.shape[windows_axis] >= VECTOR and library.is_available()
 
     def _fits(self, d: int, inputs: int) -> bool:
         """Whether states of d numbers and so many inputs are those of physics and network."""
@@ -72,7 +76,7 @@ class KernelField(NamedTuple):
             h = len(network.weight_in)
             shapes = network.weight_in.shape, network.weight_out.shape, network.bias_out.shape
             of_norm = [array.shape for array in jax.tree.leaves(network.norm)]
-            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % native.UNITS:
+            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % UNITS:
                 return False
         if self.physics is None:
             return True
@@ -120,16 +124,33 @@ def _input_scaling(network: ResidualNetwork, d: int) -> tuple[Float[Array, " m"]
     return -at_zero / factor, factor
 
 
-def training_kernel(field: AbstractVectorField, solver: Solver, substeps: int = 1) -> KernelField | None:
-    """The field for `KernelField.rollout`; None if that is not for it, or not for the solver."""
-    own = _kernel_field(field, solver, substeps)
-    return own if own and (own.network is None or type(own.network.norm) is BatchNorm) else None
+def serves_training(field: AbstractVectorField, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
+    """Whether `trained` serves a minibatch of these shapes, whose windows lie along an axis."""
+    return _training_kernel(field, x0, u, solver, 1, windows_axis) is not None
 
 
-def prediction_kernel(field: AbstractVectorField, solver: Solver) -> KernelField | None:
-    """The same for `KernelField.predict`."""
+def trained(
+    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
+) -> Float[Array, "t d b"] | None:
+    """The trajectories of a minibatch in training mode, or None if no kernel is for them."""
+    own = _training_kernel(field, x0, u, solver, substeps, -1)
+    return own and own.rollout(x0, u, dt)
+
+
+def predicted(
+    field: AbstractVectorField, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver
+) -> Float[Array, "n t d"] | None:
+    """The trajectories of windows x0 (n, d), u (n, t, m) in inference mode, or None if no kernel is for them."""
     own = _kernel_field(field, solver, 1)
-    return own if own and (own.network is None or type(own.network.norm) in (BatchNorm, Bias)) else None
+    if own and (own.network is None or type(own.network.norm) in (BatchNorm, Bias)) and own.serves(x0, u, 0):
+        return own.predict(jnp.asarray(x0), jnp.asarray(u), dt)
+    return None
+
+
+def _training_kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int) -> KernelField | None:
+    own = _kernel_field(field, solver, substeps)
+    fits = own and (own.network is None or type(own.network.norm) is BatchNorm) and own.serves(x0, u, axis)
+    return own if fits else None
 
 
 def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> KernelField | None:
@@ -161,7 +182,7 @@ def _plain_rollout(constants: Constants, theta, weight_in, gain, shift, weight_o
     layers = weight_in, gain, shift, weight_out, bias_out
 
     def field(x, u):
-        y: Array = plain_layer(constants.epsilon, RELU, *layers, jnp.concatenate([x, u]))  # pyright: ignore[reportAssignmentType]
+        y: Array = normalised_layer(constants.epsilon, RELU, *layers, jnp.concatenate([x, u]))  # pyright: ignore[reportAssignmentType]
         return constants.physics(theta, x, u) + y
 
     return integrate(field, x0, u, constants.dt, RK4())
@@ -173,12 +194,12 @@ def _forward(constants: Constants, *arrays: Array):
     results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
 
     def kernel(*arrays):
-        return native.call("rollout_forward", results, *arrays, numbers=constants.numbers())
+        return library.call("rollout_forward", results, *arrays, numbers=constants.numbers())
 
     def plain(*arrays):
         return [_plain_rollout(constants, *arrays), jnp.zeros(kept, x0.dtype)]
 
-    states, saved = native.with_derivative(kernel, plain)(*arrays)
+    states, saved = library.with_derivative(kernel, plain)(*arrays)
     return states, (*arrays, saved)
 
 
@@ -186,13 +207,13 @@ def _backward(constants: Constants, saved: tuple[Array, ...], d_states: Float[Ar
     results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
 
     def kernel(*arrays):
-        return tuple(native.call("rollout_backward", results, *arrays, numbers=constants.numbers()))
+        return tuple(library.call("rollout_backward", results, *arrays, numbers=constants.numbers()))
 
     def plain(*arrays):
         *arrays, _, d_states = arrays
         return jax.vjp(partial(_plain_rollout, constants), *arrays)[1](d_states)
 
-    return native.with_derivative(kernel, plain)(*saved, d_states)
+    return library.with_derivative(kernel, plain)(*saved, d_states)
 
 
 _rollout.defvjp(_forward, _backward)
@@ -203,9 +224,9 @@ def _predict(constants: Constants, *arrays: Array) -> Float[Array, "n t d"]:
     states = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype)
 
     def kernel(*arrays):
-        return native.call("prediction", states, *arrays, numbers=constants.numbers())
+        return library.call("prediction", states, *arrays, numbers=constants.numbers())
 
-    return native.with_derivative(kernel, partial(_plain_prediction, constants))(*arrays)
+    return library.with_derivative(kernel, partial(_plain_prediction, constants))(*arrays)
 
 
 def _plain_prediction(constants: Constants, theta, offset, factor, weight_in, bias_in, weight_out, bias_out, x0, u):

@@ -1,0 +1,188 @@
+"""A library of C++ that XLA calls: compiled by GCC at first use, kept in the user's cache folder, checked and loaded.
+
+What is kept is code, so the folder must be the user's alone, and a library that is not as it was written is compiled
+anew. HYBRID_JAX_NATIVE=0 switches kernels off; `obstacle` tells what else does.
+"""
+
+import contextlib
+import ctypes
+import hashlib
+import os
+import shutil
+import stat
+import subprocess
+import tempfile
+import threading
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from functools import cache
+from pathlib import Path
+
+import jax
+import numpy as np
+import platformdirs
+
+from hybrid_jax import runtime
+
+SWITCH = "HYBRID_JAX_NATIVE"
+SOURCES = Path(__file__).parent / "cpp"
+UNITS = "normalised_layer", "rollout", "prediction"  # files that are compiled, side by side
+HANDLERS = "rollout_forward", "rollout_backward", "prediction"
+# Errors and exceptions of the square root are not asked for: without them several are taken at once.
+OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
+LONGEST = 300  # s to compile
+
+Results = jax.ShapeDtypeStruct | Sequence[jax.ShapeDtypeStruct]
+_LOCK = threading.Lock()  # programs are traced in several threads
+
+
+class Unusable(Exception):
+    """Why there is no library."""
+
+
+def obstacle() -> str | None:
+    """Why there are no kernels in this process, or None. Compiles them if need be."""
+    return _found()[1]
+
+
+def is_available() -> bool:
+    """Whether there are kernels in this process. Compiles them if need be."""
+    return _found()[0] is not None
+
+
+def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
+    """What a kernel makes of the arrays, whose number, type and shapes it does not check, and of some fixed numbers.
+
+    Lanes under `vmap` are one call.
+    """
+    kernel = jax.ffi.ffi_call(f"{_found()[0]}{handler}", results, vmap_method="broadcast_all")
+    return kernel(*arrays, numbers=np.array(numbers, np.float32))
+
+
+def with_derivative(kernel: Callable, plain: Callable) -> Callable:
+    """The kernel, which for a second derivative becomes the same in plain JAX."""
+    function = jax.custom_jvp(kernel)
+    function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
+    return function
+
+
+def _found() -> tuple[str | None, str | None]:
+    """What the names of XLA's targets begin with, once compiled and registered; or why there are none."""
+    with _LOCK:
+        return _looked_for()
+
+
+@cache
+def _looked_for() -> tuple[str | None, str | None]:
+    try:
+        _check_machine()
+        return _register(), None
+    except Unusable as reason:
+        return None, str(reason)
+
+
+def _check_machine() -> None:
+    if os.environ.get(SWITCH) == "0":
+        raise Unusable(f"{SWITCH} is 0")
+    if jax.default_backend() != "cpu":
+        raise Unusable(f"arrays are on a {jax.default_backend()}")
+    if not {"avx2", "fma"} <= set(runtime.machine()[-1].split()):
+        raise Unusable("the processor has no AVX2")
+    if not _compiler():
+        raise Unusable("there is no g++")
+
+
+def _compiler() -> str | None:
+    return shutil.which(os.environ.get("CXX") or "g++")
+
+
+def _register() -> str:
+    begin = f"hybrid_jax_{_digest()}_"
+    try:
+        library = ctypes.CDLL(str(_checked_library()))
+    except OSError as error:
+        raise Unusable(f"they could not be compiled, or not be kept: {error}") from error
+    for handler in HANDLERS:
+        jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
+    return begin
+
+
+@cache
+def _digest() -> str:
+    compiler = Path(_compiler() or "").resolve()
+    made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
+    sources = b"".join(path.read_bytes() for path in sorted(SOURCES.iterdir()))
+    return hashlib.sha256(sources + repr(made_by).encode()).hexdigest()[:16]
+
+
+def _folder() -> Path:
+    """The folder of libraries, which nobody else may read or write."""
+    folder = Path(platformdirs.user_cache_dir("hybrid_jax")) / "kernels"
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileExistsError):
+        folder.mkdir(mode=0o700)
+    about = folder.lstat()
+    if not stat.S_ISDIR(about.st_mode) or about.st_uid != os.getuid() or stat.S_IMODE(about.st_mode) & 0o077:
+        raise Unusable(f"{folder} must be a folder of this user with mode 0700")
+    return folder
+
+
+def _checked_library() -> Path:
+    """The file of the library, compiled if there is none, or none that is as it was written."""
+    library = _folder() / f"{_digest()}.so"
+    if not _is_whole(library):
+        _compile(library)
+    for path in (library, _checksum(library)):
+        path.touch()  # it was used
+    return library
+
+
+def _is_whole(library: Path) -> bool:
+    try:
+        return _checksum(library).read_text() == hashlib.sha256(library.read_bytes()).hexdigest()
+    except (OSError, UnicodeDecodeError):
+        return False
+
+
+def _checksum(library: Path) -> Path:
+    return library.with_suffix(".sha256")
+
+
+def _compile(library: Path) -> None:
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as threads:
+        objects = [Path(folder) / f"{name}.o" for name in UNITS]
+        include = f"-I{jax.ffi.include_dir()}"
+        pairs = zip(UNITS, objects, strict=True)
+        list(threads.map(_run_compiler, [["-c", include, f"{SOURCES / name}.cc", "-o", str(to)] for name, to in pairs]))
+        _run_compiler(["-shared", *map(str, objects), "-o", str(linked := Path(folder) / library.name)])
+        content = linked.read_bytes()
+    _write(library, content)
+    _write(_checksum(library), hashlib.sha256(content).hexdigest().encode())
+    _delete_unused(library.parent)
+
+
+def _run_compiler(arguments: list[str]) -> None:
+    command = [_compiler() or "g++", *OPTIONS, *arguments]
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=LONGEST)
+    except subprocess.SubprocessError as error:
+        said = (getattr(error, "stderr", None) or str(error)).strip().partition("\n")[0]
+        raise Unusable(f"they could not be compiled: {said}") from error
+
+
+def _write(path: Path, content: bytes) -> None:
+    """A file that is there whole or not at all, also after a power cut."""
+    with tempfile.NamedTemporaryFile(dir=path.parent, prefix=".", suffix=".part", delete=False) as part:
+        part.write(content)
+        part.flush()
+        os.fsync(part.fileno())
+    os.replace(part.name, path)
+
+
+def _delete_unused(folder: Path) -> None:
+    """Delete libraries of other sources or compilers, and what a kill left half written."""
+    for path in folder.glob("*"):
+        with contextlib.suppress(FileNotFoundError):  # deleted by another process
+            if time.time() - path.stat().st_mtime > runtime.UNUSED:
+                path.unlink()

@@ -1,0 +1,124 @@
+"""A library of kernels is kept as long as somebody uses it, and only one that is whole and one's own is loaded."""
+
+import hashlib
+import os
+import time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from benchmarks.subjects import DT, untrained
+from hybrid_jax import kernels, runtime
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.kernels import library
+from hybrid_jax.rollouts import predict
+
+LONG_AGO = time.time() - runtime.UNUSED - 3600
+CONTENT = b"a library"
+needs_kernels = pytest.mark.skipif(not library.is_available(), reason=kernels.status())
+
+
+@pytest.fixture
+def anew():
+    """Nothing is known of kernels, before and after."""
+    for function in (library._looked_for, library._digest):
+        function.cache_clear()
+    yield
+    for function in (library._looked_for, library._digest):
+        function.cache_clear()
+
+
+@pytest.fixture
+def cache(tmp_path, monkeypatch):
+    """The folder of libraries, where GCC needs no time."""
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    written = []
+
+    def compiled(arguments):
+        written.append(arguments[-1])
+        with open(arguments[-1], "wb") as file:
+            file.write(CONTENT)
+
+    monkeypatch.setattr(library, "_run_compiler", compiled)
+    return library._folder(), written
+
+
+def test_a_library_is_compiled_once_and_whole_beside_its_checksum(cache):
+    folder, written = cache
+    path = library._checked_library()
+    count = len(written)
+    assert library._checked_library() == path
+    assert len(written) == count > 0
+    assert path.with_suffix(".sha256").read_text() == hashlib.sha256(path.read_bytes()).hexdigest()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert {one.name for one in folder.iterdir()} == {path.name, path.with_suffix(".sha256").name}
+
+
+DAMAGES = {
+    "cut in half": lambda path: path.write_bytes(path.read_bytes()[:4]),
+    "empty": lambda path: path.write_bytes(b""),
+    "one bit": lambda path: path.write_bytes(b"b library"),
+    "no checksum": lambda path: path.with_suffix(".sha256").unlink(),
+    "checksum of no text": lambda path: path.with_suffix(".sha256").write_bytes(b"\xff"),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES.values(), ids=DAMAGES)
+def test_a_damaged_library_is_compiled_anew(damage, cache):
+    path = library._checked_library()
+    damage(path)
+    assert library._checked_library() == path
+    assert path.read_bytes() == CONTENT
+    assert library._is_whole(path)
+
+
+def test_libraries_that_nobody_used_are_deleted_when_another_is_compiled(cache):
+    folder, _ = cache
+    for name in ("unused.so", "used.so", ".half.part"):
+        (folder / name).touch()
+    for name in ("unused.so", ".half.part"):
+        os.utime(folder / name, (LONG_AGO, LONG_AGO))
+    path = library._checked_library()
+    assert {one.name for one in folder.iterdir()} == {path.name, path.with_suffix(".sha256").name, "used.so"}
+    os.utime(path, (LONG_AGO, LONG_AGO))
+    assert library._checked_library().stat().st_mtime > LONG_AGO + 3600  # what is loaded counts as used
+
+
+def test_a_folder_of_others_is_not_used(cache):
+    folder, _ = cache
+    folder.chmod(0o770)
+    with pytest.raises(library.Unusable, match="0700"):
+        library._checked_library()
+    folder.rmdir()
+    folder.symlink_to(folder.parent)
+    with pytest.raises(library.Unusable, match="0700"):
+        library._checked_library()
+
+
+def open_folder(tmp_path, monkeypatch):
+    (tmp_path / "hybrid_jax" / "kernels").mkdir(parents=True, mode=0o777)
+    (tmp_path / "hybrid_jax" / "kernels").chmod(0o777)
+
+
+WITHOUT = {
+    "switched off": (lambda _, patch: patch.setenv(library.SWITCH, "0"), "HYBRID_JAX_NATIVE is 0"),
+    "no compiler": (lambda _, patch: patch.setenv("CXX", "no-such-compiler"), "no g++"),
+    "a compiler that fails": (lambda _, patch: patch.setenv("CXX", "false"), "could not be compiled"),
+    "a folder of all": (open_folder, "0700"),
+    "no folder": (lambda path, _: (path / "hybrid_jax").touch(), "not be kept"),
+}
+
+
+@needs_kernels
+@pytest.mark.parametrize(("change", "reason"), WITHOUT.values(), ids=WITHOUT)
+def test_without_kernels_jax_does_the_same(change, reason, anew, tmp_path, monkeypatch):
+    change(tmp_path, monkeypatch)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    field = untrained("physics_only")
+    x0, u = jnp.ones((20, 13)) / 2, jnp.full((20, 2, 4), 500.0)
+    np.testing.assert_array_equal(jax.jit(predict)(field, x0, u, DT), jax.jit(rollout_batch)(field, x0, u, DT))
+    assert reason in kernels.status()
+    assert "\n" not in kernels.status()
+    assert not list(tmp_path.rglob("*.so"))
