@@ -11,7 +11,7 @@ from experiments.external_force import FLOOR
 from experiments.paper import figures
 from experiments.paper.config import QUICK, SMOKE, Config, Kind, distinct, preset_like
 from experiments.paper.lanes import rows_of
-from experiments.paper.study import adapted, flown, pretrained, source_splits, target_splits, tested
+from experiments.paper.study import adapted, assess, flown, pretrained, source_splits, target_splits
 from experiments.paper.tables import ablation_tables
 from experiments.reporting.names import FINE_TUNED, HYBRID, SOURCE_ONLY, label
 from experiments.reporting.plots import save_figures
@@ -125,7 +125,7 @@ def run(config: AblationConfig, stages: Stages) -> Results:
     for domain in DOMAINS:
         target = flown(domain, target_splits(config), config, stages)
         found = {SOURCE_ONLY: learned, FINE_TUNED: adapted(HYBRID, FINE_TUNED, learned.fields, config, stages, target)}
-        rows += rows_of([tested(HYBRID, mode, fit, config, stages, target, None) for mode, fit in found.items()])
+        rows += rows_of([assess(HYBRID, mode, config, stages, fit, target) for mode, fit in found.items()])
     return rows
 
 

@@ -22,9 +22,10 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results, Row
 from experiments.runner import command
+from experiments.runner.cache import identity_of
 from experiments.runner.options import distinct
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Found, Stages, identity_of, rows_of, stages_of
+from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation import FineTune
 from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors

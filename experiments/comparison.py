@@ -111,7 +111,7 @@ def source_models(config: ComparisonConfig, stages: Stages) -> tuple[dict[str, F
     past, _ = split(renamed.splits["train"], PAST)
     learning = replace(settings(config), objective=Augmentation(PAST))
     lanes = augmentation(learned[HYBRID].fields, past, config.encoding, config)
-    return learned, fit_of(stages.run("expert augmentation", *lanes, learning, renamed))
+    return learned, fit_of(stages.sweep("expert augmentation", *lanes, learning, renamed))
 
 
 def past_splits(**windows: int) -> dict[str, SplitSpec]:

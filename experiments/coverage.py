@@ -20,9 +20,10 @@ from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
 from experiments.runner import command
+from experiments.runner.cache import identity_of
 from experiments.runner.options import Count
 from experiments.runner.run_record import environment
-from experiments.runner.stages import Found, Stages, identity_of, rows_of, stages_of
+from experiments.runner.stages import Found, Stages, rows_of, stages_of
 from hybrid_jax.adaptation.auto import Auto
 from hybrid_jax.adaptation.pooling import SOURCES, combined
 from hybrid_jax.adaptation.selection import CLUSTERS, blocks_of

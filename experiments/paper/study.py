@@ -1,8 +1,6 @@
 """The protocol of both experiments: fly, pre-train, adapt, test; from a configuration to the rows of the report."""
 
 from collections.abc import Mapping
-from concurrent.futures import Future, ThreadPoolExecutor, wait
-from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -20,14 +18,14 @@ from experiments.paper.lanes import Fit, Lanes, by_altitude, fit_of, lanes_of, r
 from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
-from experiments.runner.stages import Stages, stages_of
+from experiments.runner.stages import Stage, Stages, stages_of
 from hybrid_jax import kernels
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
 from hybrid_jax.io.datasets import ARRAYS, Dataset
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.runtime import FAST_COMPILE, cores, jit_with
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sim.domain import SOURCE, Domain
 from hybrid_jax.sim.flight import DT, SplitSpec
 from hybrid_jax.state import INPUT_SIZE, QUATERNION, STATE_SIZE
@@ -64,50 +62,56 @@ class Study:
 def study(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, console: Console) -> Study:
     """Run the protocol on a target domain, from models around the nominal θ_p of the vehicle before the change."""
     stages = stages_of(config, console)
-    lanes: list[Lanes] = []
-    learned: dict[str, Fit] = {}
-    sources = dict.fromkeys(source_of(model) for model in config.models)
-    programs: dict[str, Future] = {}
-    with ExitStack() as stack:
-        # Compiled on other threads, while flights are simulated or another model is trained; not by several processes,
-        # which must compile in the same order.
-        pool = ThreadPoolExecutor(cores())
-        stack.callback(pool.shutdown, cancel_futures=True)
-        if jax.process_count() == 1:
-            for model in sources:
-                if not stages.knows(f"pre-training {model}"):
-                    programs[model] = pool.submit(_compile, model, vehicle, config)
-            for model in config.models:
-                if model in SOLVED:
-                    programs[model] = pool.submit(_compile_solved, model, vehicle, config)
-        source = flown(SOURCE, source_splits(config), config, stages, config.source_flights)
-        target = flown(domain, target_splits(config), config, stages, config.target_flights)
-        home = flown(SOURCE, {"test": SplitSpec(config.test, 100)}, config, stages)
-        for model in config.models:
-            start = source_of(model)
-            if start not in learned:
-                wait([programs[start]] if start in programs else [])  # an error is met again below
-                learned[start] = pretrained(start, vehicle, config, stages, source)
-                lanes.append(tested(start, SOURCE_ONLY, learned[start], config, stages, target, home))
-            fields = learned[start].fields
-            wait([programs[model]] if model in programs else [])
-            if model in SOLVED:
-                name = f"{FINE_TUNED} {model} {target.config['domain']}"
-                finals = {FINE_TUNED: solved(name, SOLVED[model], fields, config, stages, target)}
-            else:
-                starts = {FINE_TUNED: fields, TARGET_ONLY: fresh_fields(model, vehicle, config)}
-                finals = {mode: adapted(model, mode, begin, config, stages, target) for mode, begin in starts.items()}
-            lanes += [tested(model, mode, final, config, stages, target, None) for mode, final in finals.items()]
-    return Study(source, target, lanes, rows_of(lanes), stages.seconds, stages.notes())
+    source, target, *models = protocol(domain, vehicle, config, stages)
+    results = stages.run([source, target, *models])
+    lanes = [result for result in results.values() if isinstance(result, Lanes)]
+    return Study(results[source], results[target], lanes, rows_of(lanes), stages.seconds, stages.notes())
+
+
+def protocol(domain: Domain, vehicle: Vehicle, config: AdaptationConfig, stages: Stages) -> list[Stage]:
+    """Fly in the source and in the target; pre-train each model, adapt it to the target, and test what came of it."""
+    flying = partial(flown, config=config, stages=stages)
+    source = Stage(("flights", SOURCE.name), partial(flying, SOURCE, source_splits(config), file=config.source_flights))
+    target = Stage(("flights", domain.name), partial(flying, domain, target_splits(config), file=config.target_flights))
+    home = Stage(("flights", "test"), partial(flying, SOURCE, {"test": SplitSpec(config.test, 100)}))
+    found, learned = [source, target, home], dict[str, Stage]()
+
+    def test(model: str, mode: str, fit: Stage, *more: Stage) -> Stage:
+        return Stage(("test", mode, model), partial(assess, model, mode, config, stages), (fit, target, *more))
+
+    for model in config.models:
+        start = source_of(model)
+        if start not in learned:
+            ahead = partial(_compile, start, vehicle, config)
+            train = partial(pretrained, start, vehicle, config, stages)
+            learned[start] = Stage(("pre-training", start), train, (source,), ahead)
+            found += [learned[start], test(start, SOURCE_ONLY, learned[start], home)]
+        for mode in (FINE_TUNED,) if model in SOLVED else (FINE_TUNED, TARGET_ONLY):
+            ahead = partial(_compile_solved, model, vehicle, config) if model in SOLVED else None
+            adapting = partial(_adapted, model, mode, vehicle, config, stages)
+            adapt = Stage((mode, model, domain.name), adapting, (learned[start], target), ahead)
+            found += [adapt, test(model, mode, adapt)]
+    return found
+
+
+def _adapted(
+    model: str, mode: str, vehicle: Vehicle, config: Config, stages: Stages, learned: Fit, target: Dataset
+) -> Fit:
+    """A model after adaptation from its source model, or, target-only, from a fresh start."""
+    if model in SOLVED:
+        name = f"{mode} {model} {target.config['domain']}"
+        return solved(name, SOLVED[model], learned.fields, config, stages, target)
+    start = learned.fields if mode == FINE_TUNED else fresh_fields(model, vehicle, config)
+    return adapted(model, mode, start, config, stages, target)
 
 
 def pretrained(model: str, vehicle: Vehicle, config: Config, stages: Stages, source: Dataset) -> Fit:
     """A model after pre-training on source flight, one run per seed."""
     shared, name = (settings(config), source, capacity(config)), f"pre-training {model}"
-    found = stages.run(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
+    found = stages.sweep(name, *pretraining(model, fresh_fields(model, vehicle, config), config), *shared)
     for factor in config.rates.decay:
         lanes = pretraining(model, found.best, config, factor)
-        found = stages.run(f"{name}, rates times {factor:g}", *lanes, *shared)
+        found = stages.sweep(f"{name}, rates times {factor:g}", *lanes, *shared)
     return fit_of(found)
 
 
@@ -118,14 +122,14 @@ def adapted(
     name = f"{mode} {name or model} {target.config['domain']}"
     if config.validation != "own":
         lanes = adaptation(model, mode, fields, config, config.sizes)
-        return fit_of(stages.run(name, *lanes, settings(config), target, capacity(config)))
+        return fit_of(stages.sweep(name, *lanes, settings(config), target, capacity(config)))
     # The windows to stop by are of the pool. Runs of one sweep have equally many, so each size is a sweep.
     data = Dataset(dict.fromkeys(("train", "validation"), target.splits["train"]), target.metadata)
 
     def of_size(size: int) -> Fit:
         lanes, shared = adaptation(model, mode, fields, config, [size]), settings(config)
         shared = replace(shared, batch_size=min(shared.batch_size, int(lanes[1].n_train[0])))
-        return fit_of(stages.run(f"{name} {size}", *lanes, shared, data))
+        return fit_of(stages.sweep(f"{name} {size}", *lanes, shared, data))
 
     return jax.tree.map(lambda *parts: np.concatenate(parts), *map(of_size, config.sizes))
 
@@ -171,8 +175,8 @@ def windows_of(method: Method, size: int, config: Config) -> tuple[np.ndarray, n
     return held_back(subset) if getattr(method, "uses_validation", True) else (subset, subset)
 
 
-def tested(
-    model: str, mode: str, fit: Fit, config: Config, stages: Stages, target: Dataset, home: Dataset | None
+def assess(
+    model: str, mode: str, config: Config, stages: Stages, fit: Fit, target: Dataset, home: Dataset | None = None
 ) -> Lanes:
     """The models with their L^T_MSE on the test flights, also by altitude; and on those of the source, their floor."""
     errors, more = np.empty(0), {}

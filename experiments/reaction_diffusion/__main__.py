@@ -14,8 +14,9 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
+from experiments.runner.cache import identity_of
 from experiments.runner.run_record import environment
-from experiments.runner.stages import identity_of, stages_of
+from experiments.runner.stages import stages_of
 
 NAME = "reaction_diffusion"
 SELECTIONS = ("preset", "parts", "cases", "shifts", "seeds", "sizes")  # options that say which jobs, not how

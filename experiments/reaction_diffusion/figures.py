@@ -12,10 +12,11 @@ from experiments.reaction_diffusion.shifted import AUTO
 from experiments.reporting.names import FINE_TUNED, HYBRID, LEAST_SQUARES, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.plots import COLUMN, PAGE, STYLE, colour, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
+from hybrid_jax.io.archive import Arrays
 
 STYLES = {FINE_TUNED: "-o", TARGET_ONLY: "--s", SOURCE_ONLY: ":", LEAST_SQUARES: "-.^", AUTO: "-D"}
 TINTS = {LEAST_SQUARES: "#CC79A7", AUTO: "#009E73"}
-Shown = dict[str, np.ndarray]
+Shown = Arrays
 
 
 def draw(rows: Results, shown: Shown, patterns: Shown, dt: float) -> dict[str, tuple[Figure, str]]:

@@ -12,6 +12,7 @@ from experiments.reaction_diffusion.models import error, joined, pieces, predict
 from experiments.reaction_diffusion.systems import D_U, D_V, SCOTT_COARSE, Conversion, gray_scott, patterns
 from experiments.reporting.results import Row
 from experiments.runner.stages import Found, Kept, rows_of
+from hybrid_jax.io.archive import Arrays
 from hybrid_jax.networks import zero_output
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.networks.normalisation import ChannelScaling
@@ -56,7 +57,7 @@ def source_model(config: Config, kept: Kept) -> Any:
     return source
 
 
-def study(config: Config, kept: Kept) -> tuple[list[Row], dict[str, np.ndarray]]:
+def study(config: Config, kept: Kept) -> tuple[list[Row], Arrays]:
     """A row for each new environment, in which F and k alone are adapted to one trajectory; and a forecast of one."""
     source = source_model(config, kept)
 

@@ -157,7 +157,7 @@ def in_stages(
             exact = np.maximum(best_epochs[number], 1).astype(np.int32)
             runs = eqx.tree_at(lambda run: (run.max_epochs, run.min_epochs), runs, (exact, exact))
         stage = f"{name} {start.model} {start.recipe} {number + 1}"
-        finals.append(experiment.stages.run(stage, states, runs, settings, splits, (lanes, 0)))
+        finals.append(experiment.stages.sweep(stage, states, runs, settings, splits, (lanes, 0)))
         if best_epochs:
             last = (finals[-1].field if epochs else fields for epochs in best_epochs[number])
             fields = stack([lane(each, run) for run, each in enumerate(last)])

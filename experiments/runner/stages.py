@@ -1,59 +1,91 @@
-"""Sweeps and other jobs with a cache: what is finished is loaded, what was interrupted goes on, any other is run."""
+"""The stages of an experiment: what is finished is found in the cache, what was interrupted goes on, the rest runs."""
 
-import hashlib
 import json
-import re
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
 from contextlib import contextmanager, nullcontext
-from dataclasses import asdict
-from functools import cache, partial
-from importlib.util import find_spec
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, TypeVar
 
-import numpy as np
+import jax
 from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.reporting.results import Row
+from experiments.runner.cache import Cache, sweep_identity
 from experiments.runner.checkpoint import Autosave, Checkpoints, DeferredSignals
 from experiments.runner.options import Run
 from experiments.runner.progress import Line, clock
 from experiments.runner.run_record import PACKAGES, require_same
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive, with_leaves
-from hybrid_jax.io.datasets import Dataset, content_hash, versions
-from hybrid_jax.io.files import backup_path, json_value
-from hybrid_jax.io.models import describe
+from hybrid_jax.io.archive import Arrays, named_leaves, with_leaves
+from hybrid_jax.io.datasets import Dataset, versions
+from hybrid_jax.runtime import cores
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.training import Progress, sweep
 from hybrid_jax.training.fitting import FitState, RunConfig
-from hybrid_jax.training.objective import Settings, TrajectoryLoss
-
-FORMAT, JOB_FORMAT = "hybrid_jax sweep 1", "hybrid_jax job 1"
-RECIPE = 1  # increment when the same start, plan and data no longer give the same result
-FINISHED_BY = ("jax", "hybrid_jax")
+from hybrid_jax.training.objective import Settings
 
 Result = TypeVar("Result")
-Found = tuple[Sequence[Row], dict[str, np.ndarray]]  # of a job: rows, and arrays by name
+Found = tuple[Sequence[Row], Arrays]  # of a job: rows, and arrays by name
 Job = Callable[[], Found]
 Kept = Callable[[str, Mapping[str, Job]], dict[str, Found]]  # `Stages.kept` of some inputs
 
 
-class Stages:
-    """The stages of an experiment: training sweeps cached in a folder, and the time that each stage took.
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """A stage of an experiment, which `Stages.run` runs after those that it needs.
 
-    `saving` is as in `Run`; with `fresh`, unfinished sweeps, and those of other versions, are moved aside and run anew.
+    Attributes:
+        words: what is done, and to what; together they name the stage.
+        work: makes the result, from the results of `needs`.
+        needs: the stages before it.
+        compile: compiles the programs that `work` will run, if their shapes are known before `needs` are done.
+    """
+
+    words: tuple[str, ...]
+    work: Callable[..., Any]
+    needs: tuple["Stage", ...] = ()
+    compile: Callable[[], object] | None = None
+
+    @property
+    def name(self) -> str:
+        """The words, as the console, the report and the cache show them."""
+        return " ".join(self.words)
+
+
+class Stages:
+    """Runs the stages of an experiment, keeps their results in a folder, and measures the time that each took.
+
+    `saving` is as in `Run`, `fresh` as in `Cache`.
     """
 
     def __init__(self, folder: Path, console: Console, saving: float = 0.02, fresh: bool = False):
-        self._folder, self._console, self._share, self._fresh = folder, console, saving, fresh
+        self._console, self._share, self._cache = console, saving, Cache(folder, self._say, fresh)
         self.seconds: dict[str, float] = {}  # by stage
-        self.reused: list[str] = []  # sweeps that came from the cache
+        self.reused: list[str] = []  # stages that came from the cache
         self._ran = self._saving = 0.0
 
-    def run(
+    def run(self, protocol: Sequence[Stage]) -> dict[Stage, Any]:
+        """The results of stages, run in their order; meanwhile other threads compile what later ones will run.
+
+        Several processes of one run must compile in the same order, so there each stage compiles when it runs.
+        """
+        results: dict[Stage, Any] = {}
+        pool = ThreadPoolExecutor(cores())
+        try:
+            new = [each for each in protocol if jax.process_count() == 1 and not self._cache.knows(each.name)]
+            compiling = {each: pool.submit(each.compile) for each in new if each.compile}
+            for stage in protocol:
+                wait([compiling[stage]] if stage in compiling else [])  # an error is met again below
+                results[stage] = stage.work(*(results[each] for each in stage.needs))
+        finally:
+            pool.shutdown(cancel_futures=True)
+        return results
+
+    def sweep(
         self,
         name: str,
         states: FitState,
@@ -71,21 +103,20 @@ class Stages:
             ValueError: the cached result is damaged; the message names the file, so that it can be deleted.
             OSError: the state cannot be saved.
         """
-        finished = self._folder / f"{_stem(name)}-{_identity(states, plans, settings, data)[:16]}.npz"
+        finished = self._cache.path(name, sweep_identity(states, plans, settings, data))
         with self._alone(name, finished.with_suffix(".lock")):
-            return self._run(name, states, plans, settings, data, min_capacity, finished)
+            return self._sweep(name, states, plans, settings, data, min_capacity, finished)
 
-    def _run(self, name, states, plans, settings, data, min_capacity, finished: Path) -> FitState:
+    def _sweep(self, name, states, plans, settings, data, min_capacity, finished: Path) -> FitState:
         begun = finished.with_suffix(".begun")
         checkpoints = Checkpoints(begun)
-        if self._fresh and hosts.is_main_process():
-            self._back_up(finished, begun)
+        if self._cache.fresh and begun.exists() and hosts.is_main_process():
+            self._cache.move_aside(begun)
 
         def look() -> tuple[tuple[bool, float], Arrays]:
             """Whether the sweep is finished, the seconds spent on it, and its states."""
-            if finished.exists():
-                about, arrays = load_archive(finished, FORMAT)
-                return (True, about["seconds"]), arrays
+            if (found := self._cache.load(finished)) is not None:
+                return (True, found[0]["seconds"]), found[1]
             if (found := checkpoints.load(self._say)) is None:
                 return (False, 0.0), named_leaves(states)
             require_same(f"{begun}: was begun with versions", found[0], {"versions": versions(*PACKAGES)})
@@ -115,8 +146,7 @@ class Stages:
                 raise
             self.seconds[name] = autosave.seconds()
             if hosts.is_main_process():
-                about = {"name": name, "seconds": self.seconds[name], "versions": versions(*FINISHED_BY)}
-                save_archive(finished, FORMAT, about, named_leaves(states))
+                self._cache.save(finished, {"name": name, "seconds": self.seconds[name]}, named_leaves(states))
                 checkpoints.delete()
         self._ran += self.seconds[name] - spent
         self._saving += autosave.saving
@@ -145,22 +175,15 @@ class Stages:
 
         `identity` says what determines them, besides their names; see `identity_of`.
         """
-        folder = self._folder / f"{_stem(name)}-{identity[:16]}"
-        if self._fresh and folder.exists() and hosts.is_main_process():
-            self._say(f"{folder}: moved aside to {folder.rename(backup_path(folder, 'before')).name}")
-        paths = {job: folder / f"{_stem(job)}.npz" for job in jobs}
-        found = {job: self._load(name, path) for job, path in paths.items() if path.exists()}
+        paths = {job: self._cache.path(f"{name} {job}", identity) for job in jobs}
+        found = {job: kept for job, path in paths.items() if (kept := self._load(name, path))}
         if found:
             self.reused.append(name if len(found) == len(jobs) else f"{len(found)} of {len(jobs)} parts of {name}")
         missing = [job for job in jobs if job not in found]
         if missing:
-            ran = self.parts(name, [partial(_run_and_save, paths[job], jobs[job]) for job in missing])
+            ran = self.parts(name, [partial(self._run_and_save, paths[job], jobs[job]) for job in missing])
             found |= dict(zip(missing, ran, strict=True))
         return {job: found[job] for job in jobs}
-
-    def knows(self, name: str) -> bool:
-        """Whether the cache holds a sweep of this name, in any configuration, finished or not."""
-        return any(self._folder.glob(f"{_stem(name)}-*"))
 
     def notes(self) -> list[str]:
         """Remarks on the times in `seconds`."""
@@ -186,16 +209,22 @@ class Stages:
         finally:
             lock.release()
 
-    def _load(self, stage: str, path: Path) -> Found:
-        """What a job found before; its seconds are added to the stage's."""
-        about, arrays = load_archive(path, JOB_FORMAT)
+    def _load(self, stage: str, path: Path) -> Found | None:
+        """What a job found before, on every process; its seconds are added to the stage's."""
+        about, arrays = hosts.from_first(lambda: self._cache.load(path) or (None, {}))
+        if about is None:
+            return None
         self.seconds[stage] = self.seconds.get(stage, 0.0) + about["seconds"]
         return json.loads(about["rows"]), arrays
 
-    def _back_up(self, finished: Path, begun: Path) -> None:
-        stale = finished.exists() and load_archive(finished, FORMAT)[0]["versions"] != versions(*FINISHED_BY)
-        for path in [begun] * begun.exists() + [finished] * stale:
-            self._say(f"{path}: moved aside to {path.rename(backup_path(path, 'before')).name}")
+    def _run_and_save(self, path: Path, work: Job) -> Found:
+        began = time.perf_counter()
+        rows, arrays = work()
+        # As text: errors may be infinite, which an archive's own JSON may not be.
+        text = json.dumps(rows, default=lambda number: number.item())
+        if hosts.is_main_process():
+            self._cache.save(path, {"rows": text, "seconds": time.perf_counter() - began}, arrays)
+        return json.loads(text), arrays
 
     def _say(self, line: str) -> None:
         self._console.print(line, highlight=False, soft_wrap=True)
@@ -207,68 +236,11 @@ def rows_of(found: Mapping[str, Found]) -> list[Row]:
 
 
 def stages_of(config: Run, console: Console) -> Stages:
-    """The stages of an experiment, cached in its cache folder."""
-    return Stages(config.cache / "sweeps", console, config.saving, config.fresh)
-
-
-def identity_of(*inputs: Any) -> str:
-    """Of jobs: what determines their results, given as JSON, datasets and fields, and the code of these packages.
-
-    Inputs do not say what is done with them, so any edit makes jobs anew.
-    """
-    sources = [source_digest(package) for package in ("hybrid_jax", "experiments")]
-    fixed: list[Any] = [RECIPE, *sources, versions(*FINISHED_BY)]
-    arrays: dict[str, Any] = {}
-    for value in inputs:
-        match value:
-            case AbstractVectorField():
-                fixed.append(describe(value))
-                arrays |= {f"{len(fixed)}.{name}": leaf for name, leaf in named_leaves(value).items()}
-            case Dataset():
-                fixed.append(content_hash(value))
-            case _:
-                fixed.append(json_value(value))
-    return digest(fixed, arrays)
-
-
-@cache
-def source_digest(package: str) -> str:
-    """The digest of all Python files of a package."""
-    spec = find_spec(package)
-    digest = hashlib.sha256()
-    for root in sorted(spec.submodule_search_locations or ()) if spec else ():
-        for path in sorted(Path(root).rglob("*.py")):
-            digest.update(f"{path.relative_to(root)}\n".encode() + path.read_bytes())
-    return digest.hexdigest()
-
-
-def _run_and_save(path: Path, work: Job) -> Found:
-    began = time.perf_counter()
-    rows, arrays = work()
-    # As text: errors may be infinite, which an archive's own JSON may not be.
-    text = json.dumps(rows, default=lambda number: number.item())
-    if hosts.is_main_process():
-        path.parent.mkdir(parents=True, exist_ok=True)
-        save_archive(path, JOB_FORMAT, {"rows": text, "seconds": time.perf_counter() - began}, arrays)
-    return json.loads(text), arrays
+    """The stages of an experiment, kept in its cache folder."""
+    return Stages(config.cache / "stages", console, config.saving, config.fresh)
 
 
 def summary(states: FitState) -> str:
     epochs, best = states.epoch, states.best_mse.min()
     runs, least, most = f"{len(epochs)} run{'s' * (len(epochs) > 1)}", epochs.min(), epochs.max()
     return f"{runs}, {least if least == most else f'{least} to {most}'} epochs, best validation loss {best:.3g}"
-
-
-def _stem(name: str) -> str:
-    return re.sub(r"[^\w.,=-]+", "-", name)  # as a file may be called anywhere
-
-
-def _identity(states: FitState, plans: RunConfig, settings: Settings, data: Dataset) -> str:
-    regulariser = None if settings.regulariser is None else settings.regulariser.__name__
-    shared = [settings.batch_size, regulariser, type(settings.solver).__name__]
-    objective: Any = settings.objective
-    if not isinstance(objective, TrajectoryLoss):
-        shared += [type(objective).__name__, asdict(objective)]
-    # Array leaves do not include a field's static data, such as the vehicle or the scaling of inputs.
-    fixed = [RECIPE, *shared, describe(states.field), content_hash(data)]
-    return digest(fixed, named_leaves({"start": states, "plan": plans}))

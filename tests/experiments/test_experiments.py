@@ -144,7 +144,7 @@ def test_a_signal_saves_the_state_and_a_second_run_is_refused(sent, code, folder
         finally:
             process.kill()
     assert "the same command goes on from here" in rest
-    (begun,) = (folder / "cache" / "sweeps").glob("pre-training-physics_only-*.begun")
+    (begun,) = (folder / "cache" / "stages").glob("pre-training-physics_only-*.begun")
     shutil.rmtree(begun)
 
 
@@ -195,7 +195,7 @@ def test_an_out_that_is_a_file_is_refused_and_kept(tmp_path):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("pattern", ["flights-source-*.npz", "sweeps/pre-training-hybrid-*.npz"])
+@pytest.mark.parametrize("pattern", ["flights-source-*.npz", "stages/pre-training-hybrid-*.npz"])
 def test_a_truncated_file_in_the_cache_is_named_and_nothing_is_overwritten(pattern, folder, finished):
     file = min((folder / "cache").glob(pattern))
     content = file.read_bytes()

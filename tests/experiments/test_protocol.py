@@ -16,7 +16,8 @@ from experiments.paper.conditions import adaptation, fresh_fields, measured, pre
 from experiments.paper.config import PAPER, PRESETS, SMOKE, AdaptationConfig, Stopping, column
 from experiments.paper.lanes import fit_of
 from experiments.paper.study import SOLVED, drawn_splits, placeholder, pretrained, target_splits
-from experiments.runner.stages import _identity, stages_of
+from experiments.runner.cache import sweep_identity
+from experiments.runner.stages import stages_of
 from hybrid_jax.dynamics.base import Hybrid
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.flight import SplitSpec
@@ -90,7 +91,9 @@ def test_other_input_scaling_is_another_pretraining():
     windows = placeholder(SplitSpec(2, 10))
     data = Dataset({"train": windows, "validation": windows}, {})
     identities = {
-        _identity(*pretraining("no_physics", fresh_fields("no_physics", IRIS, config), config), settings(config), data)
+        sweep_identity(
+            *pretraining("no_physics", fresh_fields("no_physics", IRIS, config), config), settings(config), data
+        )
         for config in (SMOKE, replace(SMOKE), replace(SMOKE, inputs="raw"))
     }
     assert len(identities) == 2
@@ -114,7 +117,7 @@ def test_pretraining_goes_on_from_the_best_with_all_rates_times_each_decay():
     begun = []
 
     class Trained:
-        def run(self, name, states, plans, *_):
+        def sweep(self, name, states, plans, *_):
             begun.append((states.field, plans.rates))
             return eqx.tree_at(lambda state: state.best, states, jax.tree.map(lambda leaf: leaf + 1, states.field))
 

@@ -86,7 +86,7 @@ SHORT = [log[:30] for log in LOGS]
     ],
 )
 def test_short_flights_are_refused_before_training(options, flights, message, monkeypatch, tmp_path):
-    monkeypatch.setattr(Stages, "run", lambda *_: pytest.fail("training has begun"))
+    monkeypatch.setattr(Stages, "sweep", lambda *_: pytest.fail("training has begun"))
     config = replace(CONFIG, cache=tmp_path, target=tmp_path if "target" in flights else None, **options)
     logs = {name: LogSet(name, each, []) for name, each in flights.items()}
     with pytest.raises(ValueError, match=message):

@@ -30,7 +30,7 @@ class Place:
         self.results = self.out / "param_shift"
 
     def clear(self, flights=False):
-        shutil.rmtree(self.cache / "sweeps", ignore_errors=True)
+        shutil.rmtree(self.cache / "stages", ignore_errors=True)
         shutil.rmtree(self.out, ignore_errors=True)
         for path in self.cache.glob("flights-*.npz") if flights else ():
             path.unlink()
@@ -54,16 +54,16 @@ class Place:
             return "start"
         if len(list(self.cache.glob("flights-*.npz"))) < 2:
             return "data"
-        sweeps = len(list(self.cache.glob("sweeps/*.npz")))
+        sweeps = len(list(self.cache.glob("stages/*.npz")))
         return "report" if sweeps == 3 else "adaptation" if sweeps else "pre-training"
 
     def writes(self):
         """A checkpoint is being written."""
-        return any(self.cache.glob("sweeps/*.begun/.*.part"))
+        return any(self.cache.glob("stages/*.begun/.*.part"))
 
     def checkpoints(self):
         try:
-            return sorted(self.cache.glob("sweeps/*.begun/*.npz"))
+            return sorted(self.cache.glob("stages/*.begun/*.npz"))
         except FileNotFoundError:  # the sweep has ended meanwhile
             return []
 
@@ -142,4 +142,4 @@ def test_a_run_killed_at_any_moment_resumes_to_the_same_bits(number, place, whol
     assert "damaged" not in again.stderr
     assert place.read("report.json")["rows"] == whole
     assert place.read("run.json") == begun | {"state": "finished"}
-    assert not list(place.cache.glob("sweeps/*.begun"))
+    assert not list(place.cache.glob("stages/*.begun"))

@@ -15,9 +15,10 @@ from rich.console import Console
 from experiments.paper.lanes import fit_of, lanes_of
 from experiments.paper.tables import run_notes
 from experiments.reporting.results import Results
+from experiments.runner.cache import identity_of
 from experiments.runner.progress import Line
 from experiments.runner.run_record import OtherRun
-from experiments.runner.stages import Stages, identity_of, rows_of
+from experiments.runner.stages import Stage, Stages, rows_of
 from hybrid_jax.io.archive import named_leaves
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sweep.lanes import lane, stack
@@ -32,7 +33,7 @@ PLANS = stack([make_run_config(rate, np.arange(20), 20, 5, 100, 30, 0.0) for rat
 
 def run(folder, states=STATES, plans=PLANS, settings=SETTINGS, data=DATA, fresh=False):
     found = Stages(folder, Console(quiet=True), fresh=fresh)
-    return found.run("a sweep", states, plans, settings, data), found
+    return found.sweep("a sweep", states, plans, settings, data), found
 
 
 @pytest.fixture(scope="module")
@@ -146,7 +147,7 @@ def test_a_damaged_file_is_named(tmp_path, whole):
         run(tmp_path)
 
 
-def parts(folder, done, inputs=(1,), fresh=False, stop=None):
+def parts(folder, done, inputs=(1,), stop=None):
     """Four rows, one from each job; `done` has the jobs that ran."""
 
     def job(index):
@@ -155,7 +156,7 @@ def parts(folder, done, inputs=(1,), fresh=False, stop=None):
         done.append(index)
         return [{"index": index, "error": np.float32(0.1) * index, "far": np.inf, "none": None}], {}
 
-    stages = Stages(folder, Console(quiet=True), fresh=fresh)
+    stages = Stages(folder, Console(quiet=True))
     return rows_of(stages.kept("some parts", {str(i): partial(job, i) for i in range(4)}, identity_of(*inputs)))
 
 
@@ -185,17 +186,25 @@ def test_a_job_that_is_kept_gives_the_same_rows_and_arrays(tmp_path):
     assert np.array_equal(found[0][1]["path"], found[1][1]["path"])
 
 
-@pytest.mark.parametrize(("inputs", "fresh"), [((2,), False), ((DATA,), False), ((1,), True)])
-def test_parts_of_other_inputs_run(tmp_path, inputs, fresh):
+@pytest.mark.parametrize("inputs", [(2,), (DATA,)])
+def test_parts_of_other_inputs_run(tmp_path, inputs):
     parts(tmp_path, [])
     done = []
-    parts(tmp_path, done, inputs, fresh)
+    parts(tmp_path, done, inputs)
     assert done == [0, 1, 2, 3]
 
 
 def test_a_damaged_part_is_named(tmp_path):
     parts(tmp_path, [])
-    (file,) = tmp_path.glob("*/1.npz")
+    (file,) = tmp_path.glob("some-parts-1-*.npz")
     file.write_bytes(file.read_bytes()[:-30])
-    with pytest.raises(ValueError, match=r"1\.npz: truncated, damaged or not a hybrid_jax job"):
+    with pytest.raises(ValueError, match=r"\.npz: truncated, damaged or not a hybrid_jax stage"):
         parts(tmp_path, [])
+
+
+def test_stages_run_in_order_on_what_they_need_and_compile_ahead(tmp_path):
+    compiled = []
+    one = Stage(("one",), lambda: 1)
+    two = Stage(("two",), lambda found: (found + 1, [*compiled]), (one,), partial(compiled.append, "two"))
+    found = Stages(tmp_path, Console(quiet=True)).run([one, two])
+    assert found == {one: 1, two: (2, ["two"])}

@@ -47,7 +47,7 @@ plans = stack([make_run_config(rate, np.arange(40), 40, 1, 10**6, epochs, 0.0) f
 data = Dataset({"train": swings(40), "validation": swings(20, seed=1)}, {"config": {}})
 stages = Stages(Path(sys.argv[1]), Console(stderr=True, quiet=not hosts.is_main_process()))
 try:
-    final = stages.run("a sweep", states, plans, Settings(batch_size=10), data)
+    final = stages.sweep("a sweep", states, plans, Settings(batch_size=10), data)
 except hosts.PeerLost as error:
     sys.exit(f"gone: {error}")
 print("bytes", len(jax.devices()), digest("", named_leaves(final)))
