@@ -3,10 +3,10 @@
 They serve single precision on a processor with AVX2. A run should be continued the way it began.
 """
 
-from hybrid_jax.kernels.fields import predicted, serves_training, trained
+from hybrid_jax.kernels.fields import predicted as predicted
+from hybrid_jax.kernels.fields import serves_training as serves_training
+from hybrid_jax.kernels.fields import trained as trained
 from hybrid_jax.kernels.library import obstacle
-
-__all__ = ["predicted", "serves_training", "status", "trained"]
 
 
 def status() -> str:
