@@ -18,6 +18,7 @@ class Status(IntEnum):
     OK = 1, "converged"
     CAPPED = 2, "stopped at the limit of steps"
     DIVERGED = 3, "diverged"
+    STALLED = 4, "found no step that lowers the error"
 
     message: str
 

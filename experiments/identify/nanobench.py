@@ -116,7 +116,8 @@ def errors(field, tests: hj.Trajectories, observed: bool = False) -> list[float]
 
 def fitted_to(start, recordings: list[Recording], field: Actuated, stride: int = 50):
     """The physics of a field, fitted to windows of flights by least squares."""
-    return fit_least_squares(start, windows_of(recordings, field, stride), None, FIT_STEPS, jnp.asarray(SCALE)).field
+    windows = windows_of(recordings, field, stride)
+    return fit_least_squares(start, windows, max_steps=FIT_STEPS, scale=jnp.asarray(SCALE)).field
 
 
 def run(options: Options) -> None:

@@ -175,7 +175,7 @@ def _repeats(
     def one(key: PRNGKeyArray) -> dict[str, Array]:
         windows = recording(config, start_is_measured, drag, key)
         found = fit_least_squares(rigid_body(IRIS), windows)
-        around = intervals(found.field, covariance_of(found.field, windows, config.kind), config.level)
+        around = intervals(found.field, covariance_of(found.field, windows, kind=config.kind), config.level)
         value, low, high = (jnp.stack(side) for side in zip(*(around[name] for name in LEARNED), strict=True))
         true = jnp.array([TRUTH[name] for name in LEARNED])
         inside = (low <= true) & (true <= high) & found.converged

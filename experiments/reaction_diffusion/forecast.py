@@ -85,7 +85,7 @@ def trained(case: Case, config: Config, seed: int) -> hj.AbstractVectorField:
     starts = [untrained(case, config, seed + ANOTHER * i) for i in range(config.starts)]
     hj.check_grid(plane(config.points), data, diffusivity=GUESS, substeps=COARSE.substeps, name="training data")
     if not case.kernel:
-        return hj.fit_least_squares(starts[0], data, COARSE).field
+        return hj.fit_least_squares(starts[0], data, solver=COARSE).field
     fit = partial(hj.fit_gauss_newton, penalty=case.penalty, weight=case.weight, solver=COARSE)
     first = [fit(start, pieces(data, EVERY), max_steps=min(TRIED, config.steps)) for start in starts]
     best = min(first, key=lambda found: found.loss if np.isfinite(found.loss) else np.inf).field

@@ -68,7 +68,7 @@ def study(config: Config, kept: Kept) -> tuple[list[Row], Arrays]:
             patterns(truth, 0, -(-config.test // SHARE), (TEST, index)),
         )
         middle = hj.Hybrid(gray_scott([GUESS], reacts=False), source.residual)
-        fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), SCOTT_COARSE).field
+        fitted: Any = hj.fit_least_squares(middle, pieces(seen, 3, 3), solver=SCOTT_COARSE).field
         feed, kill = (float(value[0]) for value in fitted.physics.theta().values())
         row = {"part": PART, "environment": index, "seed": 0, "draw": 0, "F": environment[0], "k": environment[1]}
         row |= {"found_F": feed, "found_k": kill, "mse": error(fitted, test, SCOTT_COARSE)}

@@ -95,15 +95,19 @@ class LeastSquares(Method):
 
     def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
         n, d = train.x0.shape
-        options = settings.solver, self.max_steps, scale_of(settings.objective, d)
+        options = {
+            "solver": settings.solver,
+            "max_steps": self.max_steps,
+            "scale": scale_of(settings.objective, d),
+        }
         indices = None if self.indices is None else checks.places("indices", self.indices, d)
         larger = sized(with_disturbance(field, indices), d)
         start = larger if self.disturbance is True else field
         check_determined(start, n)
         if self.disturbance == "auto" and n > ravel_parameters(larger)[0].size:  # else there are too few to decide
-            found = select_disturbance(field, train, *options, indices).fit
+            found = select_disturbance(field, train, indices=indices, **options).fit
         else:
-            found = fit_least_squares(start, train, *options)
+            found = fit_least_squares(start, train, **options)
         return Solution(found.field, found.steps, found.status)
 
 

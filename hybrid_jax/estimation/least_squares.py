@@ -1,12 +1,11 @@
 """Nonlinear least squares for the physical parameters θ_p; a hybrid's residual stays as it is.
 
-Levenberg–Marquardt (Levenberg 1944; Marquardt 1963) needs tens of evaluations where Adam needs thousands. θ_p is in the
+Levenberg–Marquardt (`levenberg_marquardt`) needs tens of evaluations where Adam needs thousands. θ_p is in the
 physics' own parametrisation: for a `RigidBody` the log-ratios.
 """
 
 from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
 
 import diffrax
 import equinox as eqx
@@ -18,13 +17,12 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.estimation.levenberg_marquardt import State, begin, minimise, move_of_rows
 from hybrid_jax.integrate import compact, rollout
-from hybrid_jax.status import Status, ended
+from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories, check, check_attitudes
 
-DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
-HIDDEN = 10  # times the rounding of one number: what rounding does to the sum of squares
 
 Solver = diffrax.AbstractSolver | None  # of the rollouts; RK4 by default
 Scale = Float[Array, " d"] | None  # the error of each state that counts as 1; without one, 1 in its own unit
@@ -53,11 +51,16 @@ class LeastSquaresFit(eqx.Module):
 
 
 def fit_least_squares(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver = None, max_steps: int = 100, scale: Scale = None
+    field: AbstractVectorField,
+    windows: Trajectories,
+    *,
+    solver: Solver = None,
+    max_steps: int = 100,
+    scale: Scale = None,
 ) -> LeastSquaresFit:
     """Minimise L_MSE, with the error of each state over `scale`, in inference mode over the θ_p of the field's physics.
 
-    Pure: it compiles, maps over stacked fields, and reports failure in `converged` instead of raising. In float32 the
+    Pure: it compiles, maps over stacked fields, and reports failure in `status` instead of raising. In float32 the
     minimum is met within a few hundredths of a standard error.
 
     Args:
@@ -109,41 +112,12 @@ def fit_free(
     return fit_and_linearise(field, windows, solver, max_steps, scale, free)[0]
 
 
-class _State(NamedTuple):
-    """The best point so far, and one to try. Points are in units, see `_units`.
-
-    Attributes:
-        z: the best point.
-        tried: the point to try.
-        errors: of the predictions at z.
-        jacobian: of the errors at z, by θ_p.
-        units: of parameters and of errors.
-        expected: decrease of the squared errors in units.
-        last: whether so little is expected that rounding hides it.
-        damping: relative to the diagonal of JᵀJ.
-        steps: evaluations so far.
-        converged: whether the last step was tried.
-    """
-
-    z: Theta
-    tried: Theta
-    errors: Float[Array, "n t d"]
-    jacobian: Float[Array, "n t d p"]
-    units: tuple[Theta, Float[Array, ""]]
-    expected: Float[Array, ""]
-    last: Bool[Array, ""]
-    damping: Float[Array, ""]
-    steps: Int[Array, ""]
-    converged: Bool[Array, ""]
-
-
 def fit_and_linearise(
     field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale, free=None
 ) -> tuple[LeastSquaresFit, Float[Array, "n t d p"], Float[Array, "n t d"]]:
     """`fit_free`, and there the Jacobian of the predictions, and their errors with the opposite sign.
 
-    The loop is ours, not Optimistix's, so that one rollout serves the start, the steps and the end: a first call takes
-    less than half as long, and an adaptation does not fit beyond what rounding lets it see.
+    Points are in units, see `_units`; the best one is kept with its errors, their Jacobian and the units.
     """
     start, unravel = ravel_parameters(field)
 
@@ -153,26 +127,30 @@ def fit_and_linearise(
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
 
-    def step(state: _State) -> _State:
-        jacobian, found = jax.jacfwd(errors, has_aux=True)(theta_at(state.tried, state.units[0]))
-        first = state.steps == 0
-        units = jax.tree.map(partial(jnp.where, first), _units(jacobian, found, windows, scale, free), state.units)
-        least = LEAST * rounding(windows, scale) / units[1]
-        return _improved(state, jacobian, found, units, first, least)
+    def scaled(array, size):
+        return (array / size).astype(float).reshape(-1, *array.shape[3:])
+
+    def evaluate(z: Theta, state: State):
+        units = state.best[3]
+        jacobian, found = jax.jacfwd(errors, has_aux=True)(theta_at(z, units[0]))
+        own = _units(jacobian, found, windows, scale, free)
+        units = jax.tree.map(partial(jnp.where, state.steps == 0), own, units)
+        return jnp.sum(jnp.square(scaled(found, units[1]))), (z, found, jacobian, units)
+
+    def aim(best, damping):
+        z, found, jacobian, (unit, size) = best
+        move, expected = move_of_rows(scaled(jacobian * unit, size), scaled(found, size), damping)
+        return z + move, expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: errors(start)[0])
     zero = jnp.zeros(start.shape)  # of JAX's default precision, as all numbers of the loop but the errors are
     nothing = jnp.zeros(shape.shape, shape.dtype), jnp.zeros((*shape.shape, start.size), shape.dtype)
     units = jnp.zeros(start.shape, shape.dtype), jnp.ones((), shape.dtype)
-    no = jnp.array(False)
-    begin = _State(zero, zero, *nothing, units, jnp.zeros(()), no, jnp.full((), DAMPING), jnp.zeros((), jnp.int32), no)
-    end = jax.lax.while_loop(
-        lambda state: (state.steps < max_steps) & ~state.converged & jnp.isfinite(state.tried).all(), step, begin
-    )
-    mse = jnp.mean(jnp.sum(jnp.square(end.errors), axis=-1))
-    finite = jnp.isfinite(mse)
-    theta = jnp.where(finite, theta_at(end.z, end.units[0]), start)
-    return LeastSquaresFit(unravel(theta), mse, end.steps, ended(end.converged, finite)), end.jacobian, end.errors
+    end = minimise(evaluate, aim, begin(zero, (zero, *nothing, units)), max_steps)
+    z, found, jacobian, (unit, _) = end.best
+    mse = jnp.mean(jnp.sum(jnp.square(found), axis=-1))
+    theta = jnp.where(jnp.isfinite(mse), theta_at(z, unit), start)
+    return LeastSquaresFit(unravel(theta), mse, end.steps, end.status), jacobian, found
 
 
 def _units(jacobian, errors, windows: Trajectories, scale: Scale, free) -> tuple[Theta, Float[Array, ""]]:
@@ -185,28 +163,6 @@ def _units(jacobian, errors, windows: Trajectories, scale: Scale, free) -> tuple
     effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
     seen = effect > rounding(windows, scale)
     return jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0), size
-
-
-def _improved(state: _State, jacobian, errors, units, first, least) -> _State:
-    """The state after a point was tried. The damping changes as in Gould, Orban, Sartenaer and Toint (2005)."""
-    unit, size = units
-
-    def scaled(array):
-        return (array / size).astype(state.z.dtype).reshape(-1, *array.shape[3:])
-
-    change = jnp.sum(jnp.square(scaled(errors))) - jnp.sum(jnp.square(scaled(state.errors)))
-    accepted = first | (change <= -0.01 * state.expected) | (state.last & jnp.isfinite(change))
-    good = ~first & (change < -0.99 * state.expected)
-    damping = state.damping * jnp.where(accepted, jnp.where(good, 1 / 3.5, 1), 4)
-    tried, known = (state.tried, errors, jacobian), (state.z, state.errors, state.jacobian)
-    z, errors, jacobian = jax.tree.map(partial(jnp.where, accepted), tried, known)
-    p, r = len(z), scaled(errors)
-    rows = jnp.concatenate([scaled(jacobian * unit), r[:, None]], axis=1)
-    upper = jnp.linalg.qr(jnp.concatenate([rows, jnp.sqrt(damping) * jnp.eye(p, p + 1)]), mode="r")
-    move = -jax.scipy.linalg.solve_triangular(upper[:p, :p], upper[:p, p])
-    expected = jnp.sum(jnp.square(upper[:p, p])) + damping * move @ move
-    last = expected <= jnp.maximum(least**2, HIDDEN * jnp.finfo(errors.dtype).eps * r @ r)
-    return _State(z, z + move, errors, jacobian, units, expected, last, damping, state.steps + 1, state.last)
 
 
 def ravel_parameters(field: AbstractVectorField) -> tuple[Theta, Callable[[Theta], AbstractVectorField]]:

@@ -60,6 +60,7 @@ class Interval(NamedTuple):
 def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
+    *,
     kind: Kind = "sandwich",
     solver: Solver = None,
     chunk: int = CHUNK,
@@ -228,6 +229,7 @@ class DisturbanceSelection(eqx.Module):
 def select_disturbance(
     field: AbstractVectorField,
     windows: Trajectories,
+    *,
     solver: Solver = None,
     max_steps: int = 100,
     scale: Scale = None,

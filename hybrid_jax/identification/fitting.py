@@ -26,12 +26,14 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import TANGENT
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
 from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.prediction_error import Problem, all_errors, normal_equations, rms, slopes_between
 from hybrid_jax.identification.recordings import Layout, Windows, cut
+from hybrid_jax.status import Status
 
 ROUNDS = 3  # of weights
 CLUSTER = 2.0  # s of windows that are taken as one observation,
@@ -39,6 +41,7 @@ FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many 
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
+TOLERANCE = 1e-5  # share of the cost: a step that lowers it by less is slow
 NO_EFFECT = 1.0  # information of a parameter that is not told: its standard error is its own size, or a factor of e
 
 
@@ -51,7 +54,7 @@ class Identified(NamedTuple):
         errors: RMS of each quantity's channels over the windows, from the estimated initial states.
         windows: how many were fitted.
         seconds: length of all windows [s].
-        converged: whether the last round stopped by itself, before `max_steps`.
+        status: how the last round ended.
         covariance: of the parameters (p, p), in the parametrisation of `ravel_parameters`.
         explained: share of the change of each body rate in a window that is told (3); 1 if not measured.
     """
@@ -61,9 +64,14 @@ class Identified(NamedTuple):
     errors: dict[str, np.ndarray]
     windows: int
     seconds: float
-    converged: bool
+    status: Status
     covariance: Float[np.ndarray, "p p"]
     explained: Float[np.ndarray, "3"]
+
+    @property
+    def converged(self) -> bool:
+        """Whether the last round stopped by itself, where no step lowers the errors further."""
+        return self.status == Status.OK
 
 
 def identify(
@@ -114,9 +122,9 @@ def identify(
         theta, unravel = ravel_parameters(field)
         spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
         problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
-        changes, converged = jnp.zeros_like(spread), False
+        changes, status = jnp.zeros_like(spread), Status.RUNNING
         for _ in range(rounds):
-            theta, changes, converged = _fit(field, theta, changes, problem, layout, max_steps, moves)
+            theta, changes, status = _fit(field, theta, changes, problem, layout, max_steps, moves)
             errors = {name: np.asarray(size) for name, size in rms(field, theta, changes, problem, layout).items()}
             variance = normal_equations(field, theta, changes, problem, layout)[3]
             size = jnp.sqrt(jnp.mean((changes**2 + variance)[:, TANGENT:], axis=0))
@@ -134,7 +142,7 @@ def identify(
         shares = _explained(field, theta, changes, problem, layout) if "rates" in columns else np.ones(3)
         intervals = {name: _widened(name, interval, shares) for name, interval in intervals.items()}
     span = layout.dt * layout.steps * len(windows.start)
-    return Identified(found, intervals, errors, len(windows.start), span, converged, np.asarray(covariance), shares)
+    return Identified(found, intervals, errors, len(windows.start), span, status, np.asarray(covariance), shares)
 
 
 def identify_in_turn(
@@ -165,7 +173,7 @@ def identify_in_turn(
     return second._replace(
         intervals=second.intervals | own,
         errors=first.errors | second.errors,
-        converged=first.converged & second.converged,
+        status=max(first.status, second.status),
     )
 
 
@@ -238,33 +246,28 @@ def _first_scale(windows: Windows, name: str) -> Array:
 
 
 def _fit(field, theta, changes, problem: Problem, layout: Layout, max_steps: int, moves):
-    """Levenberg–Marquardt with the damping relative to the diagonal (Marquardt 1963).
+    """θ, the changes of the initial states, and the status.
 
     Optimistix would take a dense Jacobian of all errors with the 18 unknowns of each window, more than a gigabyte for
     300 windows; here only the parameters are left of the normal equations.
     """
-    damping, at = 1e-3, normal_equations(field, theta, changes, problem, layout)
-    for _ in range(max_steps):
-        equations, offset, slope, _ = at
-        gram, score = np.asarray(equations.gram.sum(axis=0)), np.asarray(equations.score.sum(axis=0))
-        seen = (np.diagonal(gram) > NO_EFFECT) & moves
-        size = np.where(seen, np.sqrt(np.maximum(np.diagonal(gram), 1e-300)), 1.0)
-        scaled = np.where(seen[:, None] & seen, gram / np.outer(size, size), 0.0) + np.diag(
-            np.where(seen, damping, 1.0)
-        )
-        step = -np.linalg.solve(scaled, np.where(seen, score / size, 0.0)) / size
-        tried = jnp.asarray(np.asarray(theta) + step), changes - offset - jnp.einsum("nsp,p->ns", slope, step)
-        new = normal_equations(field, *tried, problem, layout)
-        total, before = float(new[0].square.sum()), float(equations.square.sum())
-        if not total < before:
-            damping *= 10
-            if damping > 1e6:
-                return theta, changes, True
-            continue
-        (theta, changes), at, damping = tried, new, max(damping / 10, 1e-9)
-        if before - total < 1e-5 * before:
-            return theta, changes, True
-    return theta, changes, False
+
+    def evaluate(point, _):
+        equations, offset, slope, _ = normal_equations(field, point[0], point[1], problem, layout)
+        gram, score = jnp.sum(equations.gram, axis=0), jnp.sum(equations.score, axis=0)
+        return jnp.sum(equations.square), (point, gram, score, (offset, slope))
+
+    def aim(best, damping):
+        (theta, changes), gram, score, (offset, slope) = best
+        seen = (jnp.diagonal(gram) > NO_EFFECT) & moves
+        step, expected = move_of_equations(jnp.where(seen[:, None] & seen, gram, 0), jnp.where(seen, score, 0), damping)
+        return (theta + step, changes - offset - jnp.einsum("nsp,p->ns", slope, step)), expected, 0.0
+
+    point = theta, changes
+    shapes = jax.eval_shape(lambda: evaluate(point, None)[1])
+    nothing = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
+    end = minimise(evaluate, aim, begin(point, nothing), max_steps, TOLERANCE, in_python)
+    return *end.best[0], Status(int(end.status))
 
 
 def _names(field) -> list[str]:

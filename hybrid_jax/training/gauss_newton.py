@@ -1,9 +1,8 @@
 """Damped Gauss–Newton for all parameters of a field, network and physics, to a precision that Adam does not reach.
 
-Levenberg–Marquardt (Levenberg 1944; Marquardt 1963). A step solves min ‖J δ + r‖² + μ ‖D δ‖², with D the lengths of the
-columns of J. J is computed in the field's precision one window at a time, with the trajectory (`sensitivities`); JᵀJ is
-summed, and the step solved, in double precision by NumPy, since squaring J would leave nothing of float32 for the
-directions that matter least.
+A step of `levenberg_marquardt` solves min ‖J δ + r‖² + μ ‖D δ‖², with D the lengths of the columns of J. J is computed
+in the field's precision one window at a time, with the trajectory (`sensitivities`); JᵀJ is summed, and the step
+solved, in double precision, since squaring J would leave nothing of float32 for the directions that matter least.
 """
 
 from collections.abc import Callable
@@ -12,24 +11,23 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
-from hybrid_jax.status import Status, ended
+from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
+from hybrid_jax.training.loss import correlation_rows
 from hybrid_jax.training.sensitivities import with_sensitivities
 from hybrid_jax.trajectories import Trajectories, check
 
 MOST = 1000  # parameters: the cost of a step grows with their square
 FIRST = 1e-2  # μ at the start
-TRIALS = 10.0 ** np.arange(-2, 3)  # times the last μ: the best is taken
-LEAST, LARGEST = 1e-12, 1e6  # of μ
-SLOW = 1e-3  # stop after two steps that lower the loss by less than this share
+SLOW = 1e-3  # share of the loss: a step that lowers it by less is slow
 
 Rows = Callable[[Hybrid, Float[Array, "t d"], Trajectories, Solver], Float[Array, " r"]]
 
@@ -40,7 +38,7 @@ class GaussNewtonFit(eqx.Module):
     Attributes:
         field: the best one that was found.
         loss: L_MSE on the windows plus λ times the penalty.
-        steps: evaluations of J.
+        steps: points that were tried.
         status: how it ended; OK if it stopped before `max_steps`, at a finite loss.
     """
 
@@ -58,10 +56,9 @@ def residual_norm(field: Hybrid, predicted, window: Trajectories, solver: Solver
 
 
 def trajectory_correlation(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
-    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2: its square is that of loss.py (Osaka et al. 2025, Eq. 7)."""
+    """Its square is that of loss.py (Osaka et al. 2025, Eq. 7)."""
     physics = integrate(field.physics, jnp.asarray(window.x0), jnp.asarray(window.u), window.dt, solver)
-    a, b = (y.ravel() / jnp.sqrt(jnp.sum(jnp.square(y)) + 1e-12) for y in (physics, predicted))
-    return (a - b) / 2**0.5
+    return correlation_rows(*(y.ravel()[:, None] for y in (physics, predicted))).ravel()
 
 
 def neighbour_weights(field: Hybrid, predicted, window: Trajectories, solver: Solver) -> Float[Array, " r"]:
@@ -103,7 +100,7 @@ def fit_gauss_newton(
         penalty: L_reg, of a `Hybrid`: "residual_norm" or "trajectory_correlation" of `training.loss`, or
             "neighbour_weights", the squared weights of a `GridNetwork` for all points but the one itself.
         weight: λ.
-        max_steps: evaluations of J at most.
+        max_steps: points that are tried at most.
         solver: by default `RK4`.
         scale: divides the error of each state, as in `fit_least_squares`.
 
@@ -156,18 +153,15 @@ class _Problem(eqx.Module):
         return found
 
     @eqx.filter_jit
-    def losses(self, thetas: Float[Array, "k p"], windows: Trajectories) -> Float[Array, " k"]:
-        def one(theta):
-            candidate = self.field(theta)
+    def loss(self, theta: Float[Array, " p"], windows: Trajectories) -> Float[Array, ""]:
+        candidate = self.field(theta)
 
-            def square(window):
-                x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
-                predicted = integrate(candidate, x0, u, window.dt, self.solver)
-                return jnp.sum(jnp.square(self.rows(candidate, predicted, window)))
+        def square(window):
+            x0, u = jnp.asarray(window.x0), jnp.asarray(window.u)
+            predicted = integrate(candidate, x0, u, window.dt, self.solver)
+            return jnp.sum(jnp.square(self.rows(candidate, predicted, window)))
 
-            return jnp.mean(jax.lax.map(square, windows))
-
-        return jax.lax.map(one, thetas)
+        return jnp.mean(jax.lax.map(square, windows))
 
     @eqx.filter_jit
     def linearised(
@@ -186,24 +180,25 @@ class _Problem(eqx.Module):
 
 
 def _descend(problem: _Problem, windows: Trajectories, max_steps: int) -> GaussNewtonFit:
+    def evaluate(theta, state: State):
+        loss = problem.loss(theta, windows)
+        if not loss < state.cost:  # then the equations there are not needed
+            return loss, state.best
+        return loss, (theta, *_normal_equations(problem, theta, windows))
+
+    def aim(best, damping):
+        theta, gram, score = best
+        with jax.enable_x64(True):
+            move, expected = (np.asarray(part) for part in _move(gram, score, float(damping)))
+        return theta + jnp.asarray(move, theta.dtype), jnp.asarray(expected, damping.dtype), 0.0
+
     theta = ravel_pytree(problem.learned)[0]
-    loss, damping, steps, slow = float(problem.losses(theta[None], windows)[0]), FIRST, 0, 0
-    while steps < max_steps and slow < 2 and 0 < loss < np.inf:
-        gram, score = _normal_equations(problem, theta, windows)
-        lengths = np.sqrt(np.maximum(np.diag(gram), 1e-12 * np.diag(gram).max()))
-        values, vectors = scipy.linalg.eigh(gram / np.outer(lengths, lengths))
-        along = vectors.T @ (score / lengths)
-        dampings = np.clip(damping * TRIALS, LEAST, LARGEST)
-        moves = [vectors @ (along / (np.maximum(values, 0) + each)) / lengths for each in dampings]
-        tried = theta - jnp.asarray(np.array(moves), theta.dtype)
-        found = np.nan_to_num(np.asarray(problem.losses(tried, windows), float), nan=np.inf)
-        best, steps = int(np.argmin(found)), steps + 1
-        better = found[best] < loss
-        slow = 0 if better and found[best] < (1 - SLOW) * loss else slow + 1
-        damping = dampings[best] if better else min(damping * TRIALS[-1] * 10, LARGEST)
-        theta, loss = (tried[best], float(found[best])) if better else (theta, loss)
-    status = Status(int(ended(np.array(slow >= 2 or loss == 0), np.isfinite(loss))))
-    return GaussNewtonFit(problem.field(theta), loss, steps, status)
+    nothing = theta, np.zeros((theta.size, theta.size)), np.zeros(theta.size)
+    end = minimise(evaluate, aim, begin(theta, nothing, FIRST), max_steps, SLOW, in_python)
+    return GaussNewtonFit(problem.field(end.best[0]), float(end.cost), int(end.steps), Status(int(end.status)))
+
+
+_move = jax.jit(move_of_equations)
 
 
 def _normal_equations(
@@ -213,4 +208,4 @@ def _normal_equations(
     for index in range(len(windows)):
         columns, r = (np.asarray(part, float) for part in problem.linearised(theta, windows[index]))
         gram, score = gram + columns @ columns.T, score + columns @ r
-    return gram, score
+    return gram / len(windows), score / len(windows)

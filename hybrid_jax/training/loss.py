@@ -31,9 +31,13 @@ Regulariser = Callable[[Hybrid, Minibatch, Float[Array, "t d b"]], Float[Array, 
 def trajectory_correlation(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:
     """1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), with ŷ_p the trajectory of f_p alone (paper, Eq. 7); the mean over trajectories."""
     physics = rollout_minibatch(field.physics, batch.x0, batch.u, batch.dt, batch.solver)
-    a, b = (_unit(y.reshape(-1, y.shape[-1])) for y in (physics, predicted))
-    # ½‖a − b‖² = 1 − ⟨a, b⟩ for unit vectors, without cancellation in float32.
-    return jnp.mean(0.5 * jnp.sum(jnp.square(a - b), axis=0))
+    rows = correlation_rows(*(y.reshape(-1, y.shape[-1]) for y in (physics, predicted)))
+    return jnp.mean(jnp.sum(jnp.square(rows), axis=0))
+
+
+def correlation_rows(physics: Float[Array, "r b"], predicted: Float[Array, "r b"]) -> Float[Array, "r b"]:
+    """(ŷ_p / ‖ŷ_p‖ − ŷ / ‖ŷ‖) / √2, whose square is 1 − ⟨ŷ_p, ŷ⟩ / (‖ŷ_p‖ ‖ŷ‖), without cancellation in float32."""
+    return (_unit(physics) - _unit(predicted)) / 2**0.5
 
 
 def inner_product(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> Float[Array, ""]:

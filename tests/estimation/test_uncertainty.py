@@ -42,15 +42,15 @@ def test_a_linear_problem_meets_its_closed_form(kind):
     windows = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(offset, np.float32))
     field = fit_least_squares(Push(jnp.ones(2)), windows).field
     expected = closed_form(windows, design, field.gains, kind)
-    np.testing.assert_allclose(covariance_of(field, windows, kind), expected, rtol=1e-4)  # float32 sums
+    np.testing.assert_allclose(covariance_of(field, windows, kind=kind), expected, rtol=1e-4)  # float32 sums
     # In pieces that do not divide the windows the sums are the same.
-    np.testing.assert_allclose(covariance_of(field, windows, kind, chunk=7), expected, rtol=1e-4)
+    np.testing.assert_allclose(covariance_of(field, windows, kind=kind, chunk=7), expected, rtol=1e-4)
 
 
 def test_under_white_noise_the_two_agree():
     windows, _ = pushes(2000, 0.1)
     field = fit_least_squares(Push(jnp.ones(2)), windows).field
-    sandwich, plain = (np.diag(covariance_of(field, windows, kind)) for kind in ("sandwich", "homoscedastic"))
+    sandwich, plain = (np.diag(covariance_of(field, windows, kind=kind)) for kind in ("sandwich", "homoscedastic"))
     # A variance from 2000 scores has a relative error of about √(3/2000) = 4 %; four of these.
     np.testing.assert_allclose(sandwich, plain, rtol=0.16)
 
@@ -63,7 +63,9 @@ def test_under_errors_shared_by_a_window_only_the_sandwich_sees_the_spread():
     spread = (shared @ solve.T).std(axis=0)
     seen = eqx.tree_at(lambda w: w.x, windows, windows.x + np.asarray(shared[0], np.float32).reshape(60, 6, 2))
     field = fit_least_squares(Push(jnp.ones(2)), seen).field
-    sandwich, plain = (np.sqrt(np.diag(covariance_of(field, seen, kind))) for kind in ("sandwich", "homoscedastic"))
+    sandwich, plain = (
+        np.sqrt(np.diag(covariance_of(field, seen, kind=kind))) for kind in ("sandwich", "homoscedastic")
+    )
     # A standard deviation from 60 scores is good to √(3/60) / 2 = 11 %; three of these.
     np.testing.assert_allclose(sandwich, spread, rtol=0.34)
     assert (plain < 0.7 * spread).all()
@@ -134,9 +136,9 @@ def test_what_makes_no_sense_is_refused():
     with pytest.raises(ValueError, match=r"windows: 1 are too few for the 1 parameters of Pendulum, at least 2"):
         covariance_of(pendulum(), SWINGS[:1])
     with pytest.raises(ValueError, match="kind must be one of sandwich, homoscedastic, got 'plain'"):
-        covariance_of(pendulum(), SWINGS, "plain")
+        covariance_of(pendulum(), SWINGS, kind="plain")
     with pytest.raises(ValueError, match="kind must be sandwich where an error is given"):
-        covariance_of(pendulum(), SWINGS, "homoscedastic", error=jnp.sum)
+        covariance_of(pendulum(), SWINGS, kind="homoscedastic", error=jnp.sum)
     for level in (0.0, 1.0, 95, float("nan")):
         with pytest.raises(ValueError, match=f"level must be between 0 and 1, got {level}"):
             intervals(rigid_body(IRIS), COVARIANCE, level)

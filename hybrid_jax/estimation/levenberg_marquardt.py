@@ -1,0 +1,151 @@
+"""One Levenberg–Marquardt (Levenberg 1944; Marquardt 1963), for all that fit by least squares.
+
+The loop is ours, not Optimistix's, so that one evaluation serves the start, the steps and the end, whatever is
+eliminated from the equations, and a fit does not go beyond what rounding lets it see. Who fits says how a point is
+evaluated and where the equations there lead under some damping; what is accepted, how the damping changes and when it
+ends is here alone.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from hybrid_jax.matrices import solve
+from hybrid_jax.status import Status, ended
+
+DAMPING = 1e-3  # at the start, relative to the diagonal of JᵀJ; Madsen, Nielsen and Tingleff (2004), Eq. 3.14
+SMALLEST, LARGEST = 1e-12, 1e8  # damping: beyond, no direction leads down
+HIDDEN = 10  # times the rounding of one number: what rounding does to the sum of squares
+SLOW = 2  # steps in a row that lower the cost by less than the tolerance end the fit
+
+Move = tuple[Float[Array, " p"], Float[Array, ""]]  # a step, and by how much it should lower the cost
+
+
+class State(NamedTuple):
+    """The best point so far, and one to try.
+
+    Attributes:
+        best: what was found at the best point; the point itself is a part of it.
+        cost: the sum of squares there.
+        tried: the point to try.
+        expected: by how much it should lower the cost.
+        last: whether that is so little that rounding hides it.
+        damping: relative to the diagonal of JᵀJ.
+        steps: points that were tried.
+        slow: how many steps in a row lowered the cost by less than the tolerance.
+        converged: whether the last step was tried, or `SLOW` were slow.
+    """
+
+    best: PyTree
+    cost: Float[Array, ""]
+    tried: PyTree
+    expected: Float[Array, ""]
+    last: Bool[Array, ""]
+    damping: Float[Array, ""]
+    steps: Int[Array, ""]
+    slow: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+    @property
+    def goes_on(self) -> Bool[Array, ""]:
+        """Whether a point is left to try, however many steps were taken."""
+        return ~self.converged & (self.damping <= LARGEST) & ((self.steps == 0) | jnp.isfinite(self.cost))
+
+    @property
+    def status(self) -> Int[Array, ""]:
+        """How it ended."""
+        stalled = ~self.converged & (self.damping > LARGEST)
+        return jnp.where(stalled, Status.STALLED, ended(self.converged, jnp.isfinite(self.cost)))
+
+
+def begin(point: PyTree, found: PyTree, damping: float = DAMPING) -> State:
+    """The state before a first point is tried; `found` has the shapes of what is found at a point."""
+    zero, none, no = jnp.zeros(()), jnp.zeros((), jnp.int32), jnp.array(False)
+    return State(found, jnp.full((), jnp.inf), point, zero, no, jnp.full((), damping), none, none, no)
+
+
+def judged(state: State, cost: Float[Array, ""], tolerance: float = 0.0) -> tuple[Bool[Array, ""], State]:
+    """Whether the point that was tried is accepted, and the damping after it: as Gould, Orban, Sartenaer and Toint
+    (2005) change a trust region.
+
+    Args:
+        state: with the point that was tried.
+        cost: the sum of squares there.
+        tolerance: a step that lowers the cost by a smaller share is slow.
+    """
+    first, change = state.steps == 0, cost - state.cost
+    accepted = first | (change <= -0.01 * state.expected) | (state.last & jnp.isfinite(change))
+    good = ~first & (change < -0.99 * state.expected)
+    damping = jnp.maximum(state.damping * jnp.where(accepted, jnp.where(good, 1 / 3.5, 1), 4), SMALLEST)
+    slow = jnp.where(accepted, jnp.where(~first & (-change < tolerance * state.cost), state.slow + 1, 0), state.slow)
+    return accepted, state._replace(
+        cost=jnp.where(accepted, cost, state.cost),
+        damping=damping,
+        steps=state.steps + 1,
+        slow=slow,
+        converged=state.last | (slow >= SLOW),
+    )
+
+
+def aimed(state: State, tried: PyTree, expected: Float[Array, ""], least: Float[Array, ""] | float = 0.0) -> State:
+    """The state with another point to try; the last one if it should lower the cost by less than `least`."""
+    hidden = HIDDEN * jnp.finfo(state.cost.dtype).eps * state.cost
+    return state._replace(tried=tried, expected=expected, last=expected <= jnp.maximum(least, hidden))
+
+
+def minimise(
+    evaluate: Callable[[PyTree, State], tuple[Float[Array, ""], PyTree]],
+    aim: Callable[[PyTree, Float[Array, ""]], tuple[PyTree, Float[Array, ""], Float[Array, ""] | float]],
+    state: State,
+    max_steps: int,
+    tolerance: float = 0.0,
+    loop=jax.lax.while_loop,
+) -> State:
+    """Try points until one is the last.
+
+    Args:
+        evaluate: of a point, and the state before it was tried, the cost and what else is found there.
+        aim: of what was found at a point, and the damping, the next point, what is expected of it, and the least.
+        state: `begin`.
+        max_steps: points that are tried at most.
+        tolerance: see `judged`.
+        loop: drives it: `jax.lax.while_loop` in a compiled program, `in_python` outside.
+    """
+
+    def step(state: State) -> State:
+        cost, found = evaluate(state.tried, state)
+        accepted, state = judged(state, cost, tolerance)
+        best = jax.tree.map(partial(jnp.where, accepted), found, state.best)
+        return aimed(state._replace(best=best), *aim(best, state.damping))
+
+    return loop(lambda state: state.goes_on & (state.steps < max_steps), step, state)
+
+
+def in_python(goes_on: Callable[[State], Bool[Array, ""]], step: Callable[[State], State], state: State) -> State:
+    """`jax.lax.while_loop`, one step at a time."""
+    while goes_on(state):
+        state = step(state)
+    return state
+
+
+def move_of_rows(jacobian: Float[Array, "s p"], r: Float[Array, " s"], damping: Float[Array, ""]) -> Move:
+    """The step that minimises ‖J δ + r‖² + damping ‖δ‖², by QR: JᵀJ would square the condition number."""
+    p = jacobian.shape[1]
+    rows = jnp.concatenate([jacobian, r[:, None]], axis=1)
+    upper = jnp.linalg.qr(jnp.concatenate([rows, jnp.sqrt(damping) * jnp.eye(p, p + 1)]), mode="r")
+    move = -jax.scipy.linalg.solve_triangular(upper[:p, :p], upper[:p, p])
+    return move, jnp.sum(jnp.square(upper[:p, p])) + damping * move @ move
+
+
+def move_of_equations(gram: Float[Array, "p p"], score: Float[Array, " p"], damping: Float[Array, ""]) -> Move:
+    """The same from JᵀJ and Jᵀr, with each parameter in a unit in which it has the effect 1; one without any stays."""
+    size = jnp.sqrt(jnp.diagonal(gram))
+    seen = size > 0
+    unit = jnp.where(seen, 1 / jnp.where(seen, size, 1), 0)
+    held = gram * unit[:, None] * unit + jnp.diag(jnp.where(seen, damping, 1.0))
+    move = -solve(held, score * unit)
+    return move * unit, damping * move @ move - move @ (score * unit)
