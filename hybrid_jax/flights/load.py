@@ -20,11 +20,11 @@ from hybrid_jax.flights.formats.blackbox import read_blackbox
 from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped, record_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
 from hybrid_jax.flights.formats.csv import notes_on_end, read_csv
-from hybrid_jax.flights.formats.raw import WXYZ, XYZ, is_packed, opened
+from hybrid_jax.flights.formats.raw import WXYZ, XYZ, Samples, is_packed, opened, record
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
-from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
+from hybrid_jax.flights.recording import ROTOR_UNITS, Recording
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
@@ -33,6 +33,15 @@ SUFFIXES = {".csv": CSV, ".csv.gz": CSV, ".ulg": ULOG, ".mcap": ROSBAG, ".db3": 
 SUFFIXES |= {".bbl": BLACKBOX, ".bfl": BLACKBOX}
 MAGICS = {b"ULog": ULOG, b"\x89MCAP": ROSBAG, b"SQLite format 3": ROSBAG, b"#ROSBAG": ROSBAG}
 MAGICS |= {b"H Product:Blackbox": BLACKBOX}
+# Formats that are known and not read, by their first bytes or suffix: what they are, and the way out.
+CONVERT = (
+    "an ArduPilot DataFlash log, not read: mavlogdump.py --format csv --types TYPE FILE > TYPE.csv for TYPE ATT, "
+    'IMU, XKF1 and ESC (or RCOU); put them on one clock in one table, and say what it holds: columns="MAP.toml"'
+)
+PX4LOG = "a log of PX4's sdlog2, not read: log .ulg, as PX4 does from 1.4 on"
+UNREAD = {".px4log": PX4LOG, b"\xa3\x95\x80": CONVERT, b"PK\x03\x04": "a zip archive: unpack it and give its logs"}
+UNREAD |= {".tlog": "MAVLink telemetry, not read: it is too slow; give the log of the vehicle's own card"}
+OTHER = "no format that is read"
 BAG = "metadata.yaml"  # makes a folder one recording of ROS 2
 Failed = Literal["refuse", "warn"]
 
@@ -53,8 +62,8 @@ class RawLog(NamedTuple):
         return to_flight(self.recording, dt or DT, polynomial) if self.log is None else self.log
 
     def checks(self, vehicle: Vehicle | None = None, dt: float | None = None) -> list[Check]:
-        """`check_recording`, for intervals of dt [s] if the samples do not stand at intervals of their own."""
-        return check_recording(self.recording, vehicle, dt or (DT if self.log is None else None))
+        """`check_recording`, for intervals of dt [s], by default those of samples on common times."""
+        return check_recording(self.recording, vehicle, dt or (DT if self.log is None else self.log.dt))
 
 
 def load_log(
@@ -171,11 +180,10 @@ def read_log(
     log = read_csv(path) if column_map is None else read_mapped(path, column_map)
     if len(log) < 2:
         raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
-    recording = replace(recording_of(log), notes=notes_on_end(path))
     if len(motor_order):
-        recording = reordered(recording, motor_order)
-        log = FlightLog(log.t, log.x, recording.signals["rotor_speed"].values, log.name)
-    return RawLog(recording, log)
+        log = replace(log, u=log.u[:, require_order(path, motor_order, log.u.shape[1])])
+    recording = recording_of(log)
+    return RawLog(replace(recording, notes=(*recording.notes, *notes_on_end(path))), log)
 
 
 def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
@@ -187,16 +195,35 @@ def format_of(path: str | Path) -> str:
     path = Path(path)
     if path.is_dir():
         return ROSBAG if (path / BAG).is_file() else ""
-    try:
-        with opened(path) as file:
-            head = file.read(32)
-    except (OSError, EOFError, zlib.error):
-        head = b""  # the reader that the suffix asks for says what is wrong
+    if not path.is_file():
+        return ""
+    head = _head(path)
     if is_crazyflie(head):
         return CRAZYFLIE
+    if any(head.startswith(magic) for magic in UNREAD if isinstance(magic, bytes)):
+        return ""
     found = [kind for magic, kind in MAGICS.items() if head.startswith(magic)]
     named = [kind for suffix, kind in SUFFIXES.items() if path.name.lower().endswith(suffix)]
     return (found or named or [""])[0]
+
+
+def _head(path: Path) -> bytes:
+    """The first bytes of a file, unpacked; empty where they cannot be read: the reader then says why."""
+    try:
+        with opened(path) as file:
+            return file.read(32)
+    except (OSError, EOFError, zlib.error):
+        return b""
+
+
+def why_unread(path: Path) -> str:
+    """Why a file is none that is read, and the way out of formats that are known."""
+    if not path.is_file():
+        return "no regular file"
+    head, name = _head(path), path.name.lower()
+    known = [why for key, why in UNREAD.items() if isinstance(key, str) and name.endswith(key)]
+    known += [why for key, why in UNREAD.items() if isinstance(key, bytes) and head.startswith(key)]
+    return next(iter(known), OTHER if head or path.stat().st_size else "empty")
 
 
 def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
@@ -218,10 +245,8 @@ def find_logs(folder: str | Path) -> tuple[list[Path], dict[Path, str]]:
             continue
         if format_of(path):
             logs.append(path)
-        elif path.is_dir():
-            left[path] = "a folder; give it by itself"
         else:
-            left[path] = "empty" if not path.stat().st_size else "no format that is read"
+            left[path] = "a folder; give it by itself" if path.is_dir() else why_unread(path)
     return logs, left
 
 
@@ -249,26 +274,28 @@ def read_recording(
         column_map = _column_map(columns)
         found = recording_of(read_csv(path)) if column_map is None else record_mapped(path, column_map)
         found = replace(found, notes=(*found.notes, *notes_on_end(path)))
-    elif kind in (ROSBAG, BLACKBOX) and Path(path).is_file() and is_packed(path):
+    elif kind == ROSBAG and Path(path).is_file() and is_packed(path):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
         found = read_rosbag(path, topics or {})
     elif kind:
         found = {ULOG: read_ulog, CRAZYFLIE: read_crazyflie, BLACKBOX: read_blackbox}[kind](path)
     else:
-        raise ValueError(f"{path}: is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}")
+        why = why_unread(Path(path))
+        why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}" if why == OTHER else why
+        raise ValueError(f"{path}: {why.replace('FILE', Path(path).name)}")
     return reordered(found, motor_order) if len(motor_order) else found
 
 
 def recording_of(log: FlightLog) -> Recording:
     """A flight as a recording of its columns."""
     states = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
-    t, signals = log.t - log.t[0], {}
-    for name, part in states.items():
-        signals[name] = Signal(t, log.x[:, part], WXYZ if name == "attitude" else XYZ, f"columns of {name}")
-    axes = tuple(map(str, range(log.u.shape[1])))
-    signals["rotor_speed"] = Signal(t, log.u, axes, "columns of the motors")
-    return Recording(log.name, signals, facts={"format": CSV})
+    parts = {
+        name: Samples(log.t, log.x[:, part], WXYZ if name == "attitude" else XYZ, f"columns of {name}")
+        for name, part in states.items()
+    }
+    parts["rotor_speed"] = Samples(log.t, log.u, tuple(map(str, range(log.u.shape[1]))), "columns of the motors")
+    return record(log.name, parts, facts={"format": CSV})
 
 
 def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
@@ -277,12 +304,20 @@ def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:
     Raises:
         ValueError: a motor is named twice, or the log has no such motor.
     """
-    signals, order = dict(recording.signals), [*motor_order]
+    signals = dict(recording.signals)
     for name in ROTOR_UNITS.keys() & signals.keys():
         signal = signals[name]
-        if len({*order}) < len(order) or not {*order} <= {*range(len(signal.axes))}:
-            wanted = ", ".join(signal.axes)
-            raise ValueError(f"{recording.name}: motor_order must be of {wanted}, each at most once, got {order}")
+        order = require_order(recording.name, motor_order, len(signal.axes))
         axes = tuple(map(str, range(len(order))))
         signals[name] = replace(signal, values=np.asarray(signal.values)[:, order], axes=axes)
     return replace(recording, signals=signals)
+
+
+def require_order(name, motor_order: Sequence[int], motors: int) -> list[int]:
+    """The order, if it names each of so many motors at most once; else ValueError."""
+    order = [*motor_order]
+    if len({*order}) < len(order) or not {*order} <= {*range(motors)}:
+        raise ValueError(
+            f"{name}: motor_order must be of {', '.join(map(str, range(motors)))}, each at most once, got {order}"
+        )
+    return order

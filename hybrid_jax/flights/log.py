@@ -93,11 +93,16 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
         yield row, rotors[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
 
 
+def unlike_one(q: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:
+    """Which quaternions are not of norm 1."""
+    with np.errstate(over="ignore", invalid="ignore"):  # an infinite norm is refused too
+        return ~(np.abs(np.linalg.norm(q, axis=1) - 1) <= NORM_TOLERANCE)
+
+
 def wrong_norms(q: Float[np.ndarray, "n 4"]) -> list[tuple[int, float]]:
     """Index and norm of the first quaternion, if any, that is not of norm 1."""
-    with np.errstate(over="ignore"):  # an infinite norm is refused too
-        norms = np.linalg.norm(q, axis=1)
-    return [(int(row), float(norms[row])) for row in np.flatnonzero(np.abs(norms - 1) > NORM_TOLERANCE)[:1]]
+    with np.errstate(over="ignore"):
+        return [(int(row), float(np.linalg.norm(q[row]))) for row in np.flatnonzero(unlike_one(q))[:1]]
 
 
 def _canonical(q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:

@@ -1,6 +1,7 @@
 """Twins of every format, written here byte by byte, are read as the flight they hold; damaged ones never end badly."""
 
 import gzip
+import os
 import struct
 import zlib
 
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from surface import outcome, refusal
 
 from hybrid_jax.flights import load_logs
+from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import find_logs, read_recording
@@ -100,7 +102,7 @@ def test_numbers_that_wrapped_are_found(flight, written):
     }
     path = written(usd(signed, ticks, dict.fromkeys(MOTORS, "h")))
     assert "16-bit number wrapped" in "".join(failures(check_recording(read_recording(path)), "log"))
-    refusal(lambda: read_recording(written(usd(signed, ticks % 2**16))), "goes back from", "16 bits began anew")
+    refusal(lambda: read_recording(written(usd(signed, ticks % 2**16))), "goes back from", "16 bits of µs began anew")
 
 
 def test_motors_at_rest_and_beyond_their_limits_fail(flight, written):
@@ -176,6 +178,75 @@ def test_of_two_topics_one_is_chosen(flight, tmp_path):
     assert "position" in read_recording(path, topics={"odometry": "/truth"}).signals
 
 
+def test_messages_of_every_type_are_read(flight, tmp_path):
+    """What mavros, Vicon, Gazebo and PX4's own bridge record, each type beside rotors."""
+    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
+    store, few = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE), flight[:150]
+    arrays = "uint64 timestamp\nfloat32[4] q\n", "uint64 timestamp\nfloat32[3] xyz\n"
+    for name, text in zip(("VehicleAttitude", "VehicleAngularVelocity"), arrays, strict=True):
+        store.register(typesys.get_types_from_msg(text, f"px4_msgs/msg/{name}"))
+    text = "uint64 timestamp\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32 vx\nfloat32 vy\nfloat32 vz\n"
+    store.register(typesys.get_types_from_msg(text, "px4_msgs/msg/VehicleLocalPosition"))
+    kinds = {name.split("/")[-1]: kind for name, kind in store.types.items()}
+    body, world, zeros = BODIES["FRD"], WORLDS["NED"], np.zeros(36)
+    turns = Rotation.from_quat(np.roll(few.x[:, 3:7], -1, axis=1))
+    turned = np.roll(Rotation.from_matrix(world @ turns.as_matrix() @ body).as_quat(), 1, axis=1).astype(np.float32)
+    rolled = turns.apply(few.x[:, 10:])
+
+    def messages(i):
+        at = round(few.t[i] * 1e9) + 10**18
+        header = kinds["Header"](kinds["Time"](sec=at // 10**9, nanosec=at % 10**9), "map")
+        p, q, v, w = few.x[i, :3], few.x[i, 3:7], few.x[i, 7:10], few.x[i, 10:]
+        pose = kinds["Pose"](kinds["Point"](*p), kinds["Quaternion"](*q[1:], q[0]))
+        covered = kinds["PoseWithCovariance"](pose, zeros)
+        vector = kinds["Vector3"]
+        twist = kinds["Twist"](vector(*v), vector(*w))
+        moved = kinds["Twist"](vector(*v), vector(*rolled[i]))
+        transform = kinds["Transform"](vector(*p), pose.orientation)
+        ned, frd, us = (p @ world).astype(np.float32), (w @ body).astype(np.float32), at // 1000
+        vned = (v @ world).astype(np.float32)
+        yield at, "pose", kinds["PoseStamped"](header, pose)
+        yield at, "covered", kinds["PoseWithCovarianceStamped"](header, covered)
+        yield at, "vicon", kinds["TransformStamped"](header, "body", transform)
+        yield at, "velocity_local", kinds["TwistStamped"](header, twist)
+        yield at, "twist", kinds["TwistWithCovarianceStamped"](header, kinds["TwistWithCovariance"](twist, zeros))
+        yield at, "world", kinds["Odometry"](header, "", covered, kinds["TwistWithCovariance"](moved, zeros))
+        yield at, "local", kinds["VehicleLocalPosition"](us, *map(float, ned), *map(float, vned))
+        yield at, "attitude", kinds["VehicleAttitude"](us, turned[i].copy())
+        yield at, "gyro", kinds["VehicleAngularVelocity"](us, frd)
+        yield at, "rotors", kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), few.u[i])
+        channels = np.concatenate([1000 + few.u[i], np.zeros(12)])
+        yield at, "rc", kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), channels)
+
+    def written_bag(*names):
+        folder = tmp_path / "_".join(names)
+        with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
+            lines = {}
+            for i in range(len(few)):
+                for at, name, message in messages(i):
+                    if name in names:
+                        if name not in lines:
+                            lines[name] = writer.add_connection(f"/{name}", message.__msgtype__, typestore=store)
+                        writer.write(lines[name], at, store.serialize_cdr(message, message.__msgtype__))
+        return folder
+
+    motors = {"motors": "/rotors:data:rad/s"}
+    cases = [((pose, speed), motors) for pose in ("pose", "covered", "vicon") for speed in ("velocity_local", "twist")]
+    cases += [(("world",), motors | {"velocity": "/world"}), (("local", "attitude", "gyro"), motors)]
+    for names, topics in cases:
+        signals = read_recording(written_bag(*names, "rotors"), topics=topics).signals
+        for name, part in (("position", slice(3)), ("attitude", slice(3, 7)), ("velocity", slice(7, 10))):
+            size = np.abs(signals[name].values - few.x[:, part])
+            assert min(size.max(), np.abs(signals[name].values + few.x[:, part]).max()) < 1e-5, names
+        if "rates" in signals:
+            np.testing.assert_allclose(signals["rates"].values, few.x[:, 10:], atol=1e-5)
+    path = written_bag("pose", "rc")
+    sixteen = read_recording(path, topics={"motors": "/rc:data:pwm"}, motor_order=(0, 1, 2, 3))
+    np.testing.assert_allclose(sixteen.signals["command"].values, few.u / 1000, atol=1e-9)
+    for topics, words in (({"odometry": "/pose"}, ("odometry must be of type Odometry", "PoseStamped", "pose")),):
+        refusal(lambda topics=topics: read_recording(path, topics=topics), *words)
+
+
 def varint(value):
     value, found = (value << 1) ^ (value >> 31), b""
     while value > 127:
@@ -183,7 +254,7 @@ def varint(value):
     return found + bytes([value])
 
 
-def blackbox(flight, ended=True):
+def blackbox(flight, ended=True, events=b"", headers=()):
     """Bytes of a blackbox log of intra frames alone, of signed numbers."""
     names = ["loopIteration", "time", *(f"gyroADC[{i}]" for i in range(3)), *(f"accSmooth[{i}]" for i in range(3))]
     names += ["vbatLatest", *(f"motor[{i}]" for i in range(4)), *(f"eRPM[{i}]" for i in range(4))]
@@ -194,12 +265,12 @@ def blackbox(flight, ended=True):
     head += [f"Field I encoding:{zeros}", f"Field P predictor:{zeros}", f"Field P encoding:{zeros}"]
     head += ["gyro_scale:0x3f800000", "acc_1G:2048", "vbatref:1600", "vbatcellvoltage:330,350,430"]
     head += ["motorOutput:48,2047", "motor_poles:14"]
-    content = b"".join(f"H {line}\n".encode() for line in head)
+    content = b"".join(f"H {line}\n".encode() for line in [*head, *headers])
     for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
         row = [i, 10**6 + round(t * 1e6), *(x[10:] * 180 / np.pi), 0, 0, 2048, 1650]
         row += [*(48 + u), *(u * 30 / np.pi * 7 / 100)]
         content += b"I" + b"".join(varint(round(value)) for value in row)
-    return content + (b"E\xffEnd of log\0" if ended else b"")
+    return content + events + (b"E\xffEnd of log\0" if ended else b"")
 
 
 def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
@@ -215,8 +286,96 @@ def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
     assert "damage" not in recording.facts
     assert "damage" in read_recording(written(blackbox(flight[:200], ended=False), "cut.bbl")).facts
     refusal(lambda: to_flight(recording), "no position", "identify")
-    packed = written(gzip.compress(blackbox(flight[:9])), "flight.bbl.gz")
-    refusal(lambda: read_recording(packed), packed, "gunzip flight.bbl.gz")
+    packed = written(gzip.compress(blackbox(flight[:200])), "flight.bbl.gz")
+    assert len(read_recording(packed).signals["rates"]) == last
+
+
+def test_events_and_armings_without_frames_are_no_damage(flight, written):
+    """Of Betaflight 4: an adjustment in flight, logging that resumes, disarming; and an end with its reason."""
+    pytest.importorskip("orangebox")
+    events = b"E\x0d\x05\x02" + b"E\x0d\x85abcd" + b"E\x0e\x05\x06" + b"E\x0f\x04"
+    whole = blackbox(flight[:200], events=events)
+    empty = whole[: whole.index(b"motor_poles:14\n") + 15] + b"E\xffEnd of log\0"
+    recording = read_recording(written(empty + whole + empty, "flight.bbl"))
+    assert "damage" not in recording.facts
+    assert len(recording.signals["rates"]) >= 199
+    assert any("2 times the vehicle was armed" in note for note in recording.notes)
+    reasoned = blackbox(flight[:200], events=b"E\xffEnd of log (disarm reason:4)\0", ended=False)
+    assert "damage" not in read_recording(written(reasoned, "reasoned.bbl")).facts
+
+
+def test_a_fine_gyro_is_ten_times_finer(flight, written):
+    pytest.importorskip("orangebox")
+    usual, fine = (
+        read_recording(written(blackbox(flight[:200], headers=headers), "flight.bbl")).signals["rates"].values
+        for headers in ([], ["blackbox_high_resolution:1"])
+    )
+    np.testing.assert_allclose(fine, usual / 10)
+
+
+def test_the_compressed_state_of_a_crazyflie_is_read(flight, written):
+    """quatcompress.h: the place of the largest of x, y, z, w in two bits, then a sign and nine bits for each other."""
+    columns = {f"stateEstimateZ.{axis}": 1000 * column for axis, column in zip("xyz", flight.x.T, strict=False)}
+    columns |= {f"stateEstimateZ.v{axis}": 1000 * flight.x[:, 7 + i] for i, axis in enumerate("xyz")}
+    turned = zip(("Roll", "Pitch", "Yaw"), (flight.x[:, 10:] * [1, -1, 1]).T, strict=True)
+    columns |= {f"stateEstimateZ.rate{axis}": 1000 * column for axis, column in turned}
+    columns = {name: np.round(column).astype(int) for name, column in columns.items()}
+    packed = []
+    for q in np.roll(flight.x[:, 3:7], -1, axis=1):
+        largest = int(np.abs(q).argmax())
+        bits = largest
+        for i in range(4):
+            size = round(511 * abs(q[i]) * 2**0.5)
+            bits = bits if i == largest else bits << 10 | ((q[i] < 0) ^ (q[largest] < 0)) << 9 | size
+        packed.append(int(bits))
+    columns["stateEstimateZ.quat"] = np.array(packed)
+    kinds = dict.fromkeys(columns, "h") | {"stateEstimateZ.quat": "I"}
+    path = written(usd(columns, np.round(flight.t * 1e6).astype(int), kinds))
+    signals = read_recording(path).signals
+    np.testing.assert_allclose(signals["position"].values, flight.x[:, :3], atol=1e-3)
+    np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-3)
+    near = np.abs((signals["attitude"].values * flight.x[:, 3:7]).sum(axis=1))
+    assert near.min() > 1 - 1e-5
+
+
+@pytest.mark.parametrize("stray", [0, 600, -1])
+def test_a_sample_that_tells_nothing_is_left_out_and_said(flight, written, stray):
+    """A time stamp of zero, or a motion capture that lost the vehicle; where more than half is lost, it is refused."""
+    ticks = 10**9 + np.round(flight.t * 1e6).astype(int)
+    ticks[stray] = 0
+    names = dict(zip(STATES, flight.x[:, [0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 10, 11, 12]].T, strict=True))
+    lost = np.arange(len(ticks)) % 400 < 10
+    names |= {name: np.where(lost, 0.0, names[name]) for name in STATES if name.startswith("stateEstimate.q")}
+    path = written(usd(names, ticks))
+    recording = read_recording(path)
+    assert len(recording.signals["rates"]) == len(ticks) - 1
+    assert len(recording.signals["attitude"]) == len(ticks) - lost.sum() - (not lost[stray])
+    assert len(recording.signals["attitude"].gaps()) == 2
+    for words in ("1 samples with a time far", "attitude is no rotation in"):
+        assert any(words in note for note in recording.notes)
+    nothing = names | {name: 0 * flight.t for name in STATES if name.startswith("stateEstimate.q")}
+    refusal(lambda: read_recording(written(usd(nothing, ticks))), "norm 0, must be 1")
+
+
+@pytest.mark.parametrize("name", ["00000012.BIN", "sess001.px4log", "flight.tlog", "logs.zip"])
+def test_formats_that_are_not_read_are_named_with_a_way_out(written, tmp_path, name):
+    starts = {"BIN": b"\xa3\x95\x80\x80", "zip": b"PK\x03\x04"}
+    path = written(starts.get(name.split(".")[1], b"abcd") + bytes(100), name)
+    words = {"BIN": "mavlogdump.py --format csv", "px4log": "log .ulg", "tlog": "own card", "zip": "unpack it"}
+    refusal(lambda: read_recording(path), path, words[name.split(".")[1]])
+    assert words[name.split(".")[1]] in find_logs(tmp_path)[1][path]
+
+
+def test_pipes_links_and_bombs_neither_hang_nor_fill_the_memory(tmp_path):
+    os.mkfifo(tmp_path / "pipe.ulg")
+    (tmp_path / "nowhere.csv").symlink_to(tmp_path / "none")
+    (tmp_path / "loop.csv").symlink_to(tmp_path / "loop.csv")
+    (tmp_path / "zeros.ulg.gz").write_bytes(gzip.compress(b"ULog" + bytes(1 << 25)))
+    _, left = find_logs(tmp_path)
+    assert {path.name for path in left} >= {"pipe.ulg", "nowhere.csv", "loop.csv"}
+    for name in ("pipe.ulg", "nowhere.csv", "loop.csv", "zeros.ulg.gz"):
+        refusal(lambda name=name: read_recording(tmp_path / name), name)
+    refusal(lambda: read_recording(tmp_path / "zeros.ulg.gz"), "unpacks to over 16 MiB")
 
 
 def test_a_folder_of_all_kinds_says_what_it_reads(flight, written, tmp_path):
@@ -268,7 +427,9 @@ def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
     signals = read_recording(path, tmp_path / "map.toml").signals
     assert [*signals] == ["velocity", "command"]
     np.testing.assert_allclose(signals["velocity"].values, flight.x[:, 7:10], atol=1e-8)
-    np.testing.assert_allclose(signals["command"].values, (flight.u - 1000) / 1000, atol=1e-8)
+    np.testing.assert_allclose(
+        signals["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8
+    )
 
 
 WHOLES = ("flight.log", "flight.gz", "flight.bbl", "flight.db3", "flight.mcap")

@@ -41,14 +41,17 @@ def message(kind, payload):
     return struct.pack("<HB", len(payload), ord(kind)) + payload
 
 
-def ulog(topics, formats=None, parameters=None, ordered=True):
-    """Bytes of a log: topic → list of packed samples, each of which begins with its time."""
+def ulog(topics, formats=None, parameters=None, ordered=True, hardware=""):
+    """Bytes of a log: topic, or topic and instance, → packed samples, each of which begins with its time."""
     parts = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", START), message("B", bytes(40))]
     parts += [message("F", f"{name}:{fields}".encode()) for name, fields in (FORMATS | (formats or {})).items()]
     for name, value in (parameters or {}).items():
         key = f"int32_t {name}".encode()
         parts.append(message("P", bytes([len(key)]) + key + struct.pack("<i", value)))
-    parts += [message("A", struct.pack("<BH", 0, at) + name.encode()) for at, name in enumerate(topics)]
+    key = f"char[{len(hardware)}] ver_hw".encode()
+    parts += [message("I", bytes([len(key)]) + key + hardware.encode())] * bool(hardware)
+    named = [(name, 0) if isinstance(name, str) else name for name in topics]
+    parts += [message("A", struct.pack("<BH", number, at) + name.encode()) for at, (name, number) in enumerate(named)]
     data = [(sample[:8], at, sample) for at, samples in enumerate(topics.values()) for sample in samples]
     for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0]) if ordered else 0):
         parts.append(message("D", struct.pack("<H", at) + sample))
@@ -155,6 +158,44 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
     np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
     np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
     refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "SDLOG_PROFILE")
+
+
+OUTPUTS = {"actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;"}
+
+
+def outputs(t, values):
+    rows = np.concatenate([values, np.zeros((len(t), 16 - values.shape[1]))], axis=1)
+    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
+    return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps, rows.tolist(), strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("rest", "full"),
+    [(1000.0, 2000.0), (0.0, 1999.0), (0.0, 8191.0), (0.0, 1.0)],
+    ids=["PWM", "DShot", "UAVCAN", "share"],
+)
+@pytest.mark.parametrize("number", [0, 1])
+def test_motors_are_found_in_any_instance_and_unit(flight, topics, written, rest, full, number):
+    """PX4 before 1.13 numbers outputs by driver; that of the other driver is constant."""
+    t, share = flight.t - flight.t[0], flight.u / 1100
+    share[:50] = 0.05  # idle on the ground
+    instances = {("actuator_outputs", number): outputs(t, rest + share * (full - rest))}
+    instances |= {("actuator_outputs", 1 - number): outputs(t, 0 * share + 900)}
+    recording = read_ulog(written(ulog(topics | instances, OUTPUTS)))
+    np.testing.assert_allclose(recording.signals["command"].values, share, atol=1e-5)
+    assert any(f"instance {1 - number} is left out" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("hardware", "unit"), [("PX4_SITL", np.pi / 30), ("PX4_SITL", 1.0), ("PX4_FMU_V5", np.pi / 30)]
+)
+def test_rotor_speeds_of_a_simulator_may_be_in_radians(flight, topics, written, hardware, unit):
+    """Gazebo's esc_rpm was in rad/s until PX4-Autopilot #22721; no rotor of a simulated vehicle is that slow."""
+    t = flight.t - flight.t[0]
+    speeds = escs(t, flight.u * np.pi / 30 / unit)
+    recording = read_ulog(written(ulog(topics | {"esc_status": speeds}, hardware=hardware)))
+    np.testing.assert_allclose(recording.signals["rotor_speed"].values[:, :4], flight.u, atol=1)
+    assert any("rad/s" in note for note in recording.notes) == (unit == 1.0)
 
 
 def test_a_moving_motor_is_never_dropped_and_another_airframe_is_refused(flight, topics, written):

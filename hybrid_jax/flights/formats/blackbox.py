@@ -6,8 +6,11 @@ deg/s times `gyro_scale`, accSmooth in 1 g / `acc_1G`, eRPM in 100 / min of the 
 
 import contextlib
 import logging
+import re
 import struct
+import tempfile
 from collections.abc import Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +21,8 @@ from hybrid_jax.flights.formats.raw import BATTERY, XYZ, Samples
 from hybrid_jax.flights.recording import Recording
 
 GRAVITY, MOST, POLES, DSHOT = 9.81, 12, 14, 2047
+MAGIC = b"H Product:Blackbox"
+ADJUSTED, RESUMED, DISARMED, ENDED = 13, 14, 15, 255  # events
 FULL = {True: (48.0, 2047.0), False: (1000.0, 2000.0)}  # motors at rest and at most: of DShot and of PWM
 
 
@@ -28,19 +33,22 @@ def read_blackbox(path: str | Path) -> Recording:
         ValueError: file, field, time and what to do, in one line; or orangebox is not installed.
     """
     try:
-        import orangebox
+        import orangebox  # noqa: F401
     except ImportError as error:
         raise ValueError(f"{path}: reading blackbox needs orangebox: pip install 'hybrid_jax[logs]'") from error
     logging.getLogger("orangebox").setLevel(logging.ERROR)
-    try:
-        count = orangebox.Parser.load(str(path)).reader.log_count
-        flights = [_frames(orangebox.Parser.load(str(path), index + 1)) for index in range(count)]
-    except OSError as error:
-        raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
-    except Exception as error:  # orangebox raises any exception for a damaged header
-        raise ValueError(f"{path}: is no blackbox log or is damaged; save it again ({type(error).__name__})") from error
+    content, flights, why = raw.unpacked(path), [], []
+    begins = [found.start() for found in re.finditer(re.escape(MAGIC), content)]
+    for begin, end in zip(begins, [*begins[1:], len(content)], strict=True):
+        try:  # each by itself, as orangebox goes through the whole file for each
+            flights.append(_frames(content[begin:end]))
+        except Exception as error:  # orangebox raises any exception for a damaged header, or for no frames
+            why.append(type(error).__name__)
     parser, rows, damage = max(flights, key=lambda flight: len(flight[1]), default=(None, np.zeros((0, 0)), ""))
-    if parser is None or not len(rows):
+    if parser is None:
+        said = f" ({why[0]})" if why else ""
+        raise ValueError(f"{path}: is no blackbox log or is damaged; save it again{said}")
+    if not len(rows):
         raise ValueError(f"{path}: holds no frames; save the log again")
     columns = dict(zip(parser.field_names, rows.T, strict=False))
     if "time" not in columns:
@@ -50,19 +58,63 @@ def read_blackbox(path: str | Path) -> Recording:
     facts = {"format": "Betaflight blackbox", "program": program, "vehicle": "multirotor"}
     facts |= {"damage": damage} if damage else {}
     notes = [] if "betaflight" in program.lower() else ["not of Betaflight: its units are assumed"]
-    notes += [f"holds {count} flights: the longest is read; save each by itself"] * (count > 1)
+    flown = sum(len(each[1]) > 1 for each in flights)
+    notes += [f"holds {flown} flights: the longest is read; save each by itself"] * (flown > 1)
+    empty = len(begins) - flown
+    notes += [f"{empty} times the vehicle was armed and nothing was recorded: left out"] * (empty > 0)
     return raw.record(path, dict(_parts(path, columns, headers)), 1e-6, notes, facts)
 
 
-def _frames(parser: Any) -> tuple[Any, np.ndarray, str]:
+@cache
+def _parser() -> Any:
+    """Orangebox's parser, which also knows the events of later firmware that it takes for damage."""
+    import orangebox
+    from orangebox.decoders import _signed_vb, _unsigned_vb
+
+    class Parser(orangebox.Parser):
+        """Of `FlightLogEvent_e` in blackbox_fielddefs.h."""
+
+        def _parse_event_frame(self, reader: Any):
+            kind = reader.value()
+            if kind not in (ADJUSTED, RESUMED, DISARMED, ENDED):
+                return super()._parse_event_frame(reader)
+            next(reader)
+            if kind == ENDED:  # some programs add the reason
+                self._end_of_log = reader.has_subsequent(b"End of log")
+                return self._end_of_log
+            if kind == ADJUSTED and next(reader) >= 128:
+                reader.seek(reader.tell() + 4)
+            elif kind == ADJUSTED:
+                _signed_vb(reader)
+            else:
+                _unsigned_vb(reader)
+            if kind == RESUMED:
+                _unsigned_vb(reader)
+            return True
+
+    return Parser
+
+
+def _frames(content: bytes) -> tuple[Any, np.ndarray, str]:
     """The parser, its frames as rows of the fields of main frames, and how the log is damaged; empty if it is not."""
-    width, rows, ended = len(parser.reader.field_defs[_intra()]), [], True
+    from orangebox.reader import Reader
+
+    with tempfile.NamedTemporaryFile() as file:  # orangebox reads files alone
+        file.write(content)
+        file.flush()
+        parser = _parser()(Reader(file.name, 1))
+    width, rows, ended, junk = len(parser.reader.field_defs[_intra()]), [], True, 0
     try:
-        rows.extend(frame.data[:width] for frame in parser.frames())
+        for frame in parser.frames():
+            if not rows and frame.type != _intra():  # nothing is known of what came before the first whole frame
+                junk = parser._ctx.invalid_frame_count
+                continue
+            junk = junk if rows else parser._ctx.invalid_frame_count
+            rows.append(frame.data[:width])
     except Exception:  # at the end of a file that was cut off; orangebox does not look for it
         ended = False
     sound = [row for row in rows if all(isinstance(value, int | float) for value in row)]
-    invalid = parser._ctx.invalid_frame_count + len(rows) - len(sound)
+    invalid = parser._ctx.invalid_frame_count - junk + len(rows) - len(sound)
     damage = "ends within a frame: cut off" if not ended else f"{invalid} frames are damaged" if invalid else ""
     return parser, np.array(sound, float).reshape(len(sound), width), damage
 
@@ -82,27 +134,26 @@ def _parts(path, columns, headers) -> Iterator[tuple[str, Samples]]:
 
     gyro, acc = ([f"{field}[{i}]" for i in range(3)] for field in ("gyroADC", "accSmooth"))
     if {*gyro} <= {*columns}:
-        yield "rates", part(gyro, _scale(path, headers) * np.pi / 180)
+        fine = 0.1 if headers.get("blackbox_high_resolution") == 1 else 1.0
+        yield "rates", part(gyro, _scale(path, headers) * fine * np.pi / 180)
     if {*acc} <= {*columns}:
         unit = _number(path, headers, "acc_1G")
         yield "specific_force", part(acc, GRAVITY / unit)
     if "vbatLatest" in columns:
         # Cells in 0.1 V until Betaflight 3, in 0.01 V from 4 on.
-        cells = headers.get("vbatcellvoltage", [0])
-        fine = max(cells if isinstance(cells, list) else [cells]) > 100
+        fine = _most(headers.get("vbatcellvoltage")) > 100
         yield "voltage", part(["vbatLatest"], 0.01 if fine else 0.1, axes=BATTERY)
     for quantity, field in (("command", "motor"), ("rotor_speed", "eRPM")):
         names = [f"{field}[{i}]" for i in range(MOST) if f"{field}[{i}]" in columns]
         axes = tuple(map(str, range(len(names))))
         if names and quantity == "command":
-            outputs = headers.get("motorOutput", [0])
-            digital = max(outputs if isinstance(outputs, list) else [outputs]) == DSHOT
+            digital = _most(headers.get("motorOutput")) == DSHOT
             low, high = FULL[digital]
             found = part(names, 1 / (high - low), low, axes)
             yield quantity, found._replace(values=np.maximum(found.values, 0.0))
         elif names and columns[names[0]].any():
-            poles = headers.get("motor_poles", POLES)
-            yield quantity, part(names, 100 * 2 / float(poles) * np.pi / 30, axes=axes)
+            poles = _number(path, headers, "motor_poles", POLES)
+            yield quantity, part(names, 100 * 2 / poles * np.pi / 30, axes=axes)
 
 
 def _scale(path, headers) -> float:
@@ -115,8 +166,15 @@ def _scale(path, headers) -> float:
     raise ValueError(f"{path}: header gyro_scale must be the bits of a float, got {str(given)[:40]!r}")
 
 
-def _number(path, headers, name: str) -> float:
-    given = headers.get(name)
+def _most(given) -> float:
+    """The largest of the numbers of a header; 0 without any."""
+    return max(
+        (each for each in (given if isinstance(given, list) else [given]) if isinstance(each, int | float)), default=0
+    )
+
+
+def _number(path, headers, name: str, usual: float | None = None) -> float:
+    given = headers.get(name, usual)
     if not isinstance(given, int | float) or given <= 0:
         raise ValueError(f"{path}: header {name} must be a positive number, got {str(given)[:40]!r}")
     return float(given)

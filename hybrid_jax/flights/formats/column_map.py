@@ -42,6 +42,7 @@ SCALES = {
     | {"share": 1.0, "pwm": 1e-3, "16bit": 1 / 65535, "dshot": 1 / 1999},
 }
 REST = {"pwm": 1000.0, "dshot": 48.0}  # values of motors at rest
+DISARMED = 0.8  # of the value at rest
 SHARES = ("share", "pwm", "16bit", "dshot")  # units of commands
 COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "specific_force": 3, "voltage": 1}
 STATES = ("position", "attitude", "velocity", "body_rates", "motors")  # what training on states needs
@@ -177,7 +178,7 @@ def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
         ValueError: file, row, field and what to do, in one line.
     """
     parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
-    t, found, notes = parts.pop("time")[:, 0], {}, []
+    t, found = parts.pop("time")[:, 0], {}
     for name, values in parts.items():
         quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), raw.XYZ
         if name == "attitude":
@@ -195,12 +196,8 @@ def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
             values = raw.body(values, frames.body)
             quantity = "body_velocity" if name == "velocity" else quantity
         source = f"columns {' '.join(stated[name].columns)}"
-        own, values = raw.uninterpolated(t, values)
-        if len(own) < len(t):
-            apart = float(np.median(np.diff(own)))
-            notes.append(f"{source}: lines between samples {apart:.3g} s apart; read as these samples")
-        found[quantity] = raw.Samples(own, values, axes, source)
-    return raw.record(path, found, notes=notes, facts={"format": "CSV"})
+        found[quantity] = raw.Samples(t, values, axes, source)
+    return raw.record(path, found, facts={"format": "CSV"})
 
 
 def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
@@ -210,9 +207,16 @@ def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
     parts, begin = {}, 0
     for name, each in stated.items():
         end = begin + len(each.columns)
-        rest = REST.get(each.unit, 0.0) if name == "motors" else 0.0
-        parts[name], begin = (table[:, begin:end] - rest) * SCALES[name][each.unit], end
+        values, begin = table[:, begin:end], end
+        parts[name] = of_unit(values, each.unit) if name == "motors" else values * SCALES[name][each.unit]
     return parts
+
+
+def of_unit(motors: Float[np.ndarray, "n m"], unit: str) -> Float[np.ndarray, "n m"]:
+    """Motors as rad/s or as shares; a little below its rest, as at 900 µs, or at 0, a motor stands."""
+    rest = REST.get(unit, 0.0)
+    disarmed = (motors == 0) | ((motors >= DISARMED * rest) & (motors < rest))
+    return np.where(disarmed, 0.0, motors - rest) * SCALES["motors"][unit]
 
 
 def _speeds(motors: Float[np.ndarray, "n m"], stated: Columns) -> Float[np.ndarray, "n m"]:

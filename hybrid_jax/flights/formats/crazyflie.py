@@ -7,6 +7,7 @@ The format: byte 0xBC, u16 version, u16 number of event types; of each, u16 id, 
 The Crazyflie's pitch, and its rate in `controller`, are counted nose up; the library's nose down.
 """
 
+import array
 import re
 import struct
 import zlib
@@ -30,11 +31,16 @@ def _named(pattern: str, axes: Iterable[str]) -> tuple[str, ...]:
     return tuple(pattern.format(axis) for axis in axes)
 
 
+ANGLES = ("roll", "pitch", "yaw")
 # Quantity → where it may stand, the first that a log has counts: variables, and the factors of their values.
 SOURCES: dict[str, tuple[tuple[tuple[str, ...], float], ...]] = {
     "position": ((_named("stateEstimate.{}", XYZ), 1.0), (_named("stateEstimateZ.{}", XYZ), 1e-3)),
     "velocity": ((_named("stateEstimate.v{}", XYZ), 1.0), (_named("stateEstimateZ.v{}", XYZ), 1e-3)),
-    "rates": ((_named("gyro.{}", XYZ), DEGREES), (_named("controller.r_{}", ("roll", "pitch", "yaw")), 1.0)),
+    "rates": (
+        (_named("gyro.{}", XYZ), DEGREES),
+        (_named("controller.r_{}", ANGLES), 1.0),
+        (_named("stateEstimateZ.rate{}", map(str.title, ANGLES)), 1e-3),
+    ),
     "specific_force": ((_named("acc.{}", XYZ), GRAVITY),),
     "voltage": ((("pm.vbatMV",), 1e-3), (("pm.vbat",), 1.0)),
     "rotor_speed": ((_named("rpm.m{}", MOTORS), np.pi / 30),),
@@ -42,7 +48,7 @@ SOURCES: dict[str, tuple[tuple[tuple[str, ...], float], ...]] = {
 }
 AXES = {"voltage": BATTERY, "rotor_speed": tuple("0123"), "command": tuple("0123")}
 QUATERNION = _named("stateEstimate.q{}", WXYZ)
-EULER = _named("stateEstimate.{}", ("roll", "pitch", "yaw"))
+EULER, COMPRESSED = _named("stateEstimate.{}", ANGLES), "stateEstimateZ.quat"
 ACCELERATION = _named("stateEstimate.a{}", XYZ)
 MIXED = _named("controller.cmd_{}", ("thrust", "roll", "pitch", "yaw"))
 # Rows M1 … M4 of thrust, roll / 2, pitch / 2 and yaw (power_distribution_quadrotor.c).
@@ -125,13 +131,18 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
 def _records(content: bytes, at: int, end: int, events: Mapping[int, Event]) -> tuple[dict[int, np.ndarray], int]:
     """The bytes of all whole records by event type, one row each, and where they end."""
     sizes = {number.to_bytes(2, "little"): event.size for number, event in events.items()}
-    starts: dict[bytes, list[int]] = {key: [] for key in sizes}
+    starts = {key: array.array("q") for key in sizes}
     while at + 2 <= end and (size := sizes.get(key := content[at : at + 2])) and at + 2 + size <= end:
         starts[key].append(at + 2)
         at += 2 + size
     data = np.frombuffer(content, np.uint8)
-    found = {key: np.array(places, int)[:, None] + np.arange(sizes[key]) for key, places in starts.items() if places}
-    return {int.from_bytes(key, "little"): data[places] for key, places in found.items()}, at
+    found = {}
+    for key, places in starts.items():
+        if places:
+            rows = found[int.from_bytes(key, "little")] = np.empty((len(places), sizes[key]), np.uint8)
+            for column in range(sizes[key]):  # one by one, as an index of every byte would take eight times the log
+                rows[:, column] = data[np.asarray(places) + column]
+    return found, at
 
 
 def _columns(event: Event, rows: np.ndarray) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray, str]]]:
@@ -164,7 +175,7 @@ def _parts(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
         for names, factor in places:
             if {*names} <= {*columns}:
                 values = _stacked(columns, names) * factor
-                if names[0] == "controller.r_roll":
+                if names[0] in ("controller.r_roll", "stateEstimateZ.rateRoll"):
                     values = values * [1, -1, 1]
                 yield quantity, Samples(columns[names[0]][0], values, AXES.get(quantity, XYZ), " ".join(names))
                 break
@@ -175,6 +186,9 @@ def _derived(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
     """Attitude, and what only follows from other variables."""
     if {*QUATERNION} <= {*columns}:
         yield "attitude", Samples(columns[QUATERNION[0]][0], _stacked(columns, QUATERNION), WXYZ, " ".join(QUATERNION))
+    elif COMPRESSED in columns:
+        ticks, values, _ = columns[COMPRESSED]
+        yield "attitude", Samples(ticks, unpack_attitude(values), WXYZ, COMPRESSED)
     elif {*EULER} <= {*columns}:
         angles = _stacked(columns, EULER) * DEGREES * [1, -1, 1]
         yield "attitude", Samples(columns[EULER[0]][0], from_euler(angles), WXYZ, " ".join(EULER))
@@ -197,6 +211,18 @@ def _derived(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
         commands = np.clip(_stacked(columns, MIXED) @ MIXER.T, 0, LIMITED) / FULL
         notes.append("commands: the mixer's, of controller.cmd_*, as neither motor.m* nor pwm.m*_pwm is logged")
         yield "command", Samples(columns[MIXED[0]][0], commands, tuple("0123"), " ".join(MIXED))
+
+
+def unpack_attitude(numbers: np.ndarray) -> np.ndarray:
+    """(w, x, y, z) of 32 bits: which of x, y, z, w is largest; of each other a sign and nine bits (quatcompress.h)."""
+    bits = numbers.astype(np.int64)
+    largest, q = bits >> 30, np.zeros((len(bits), 4))
+    for i in (3, 2, 1, 0):
+        other = i != largest
+        q[other, i] = (np.where(bits & 512, -1, 1) * (bits & 511) / 511 / np.sqrt(2))[other]
+        bits = np.where(other, bits >> 10, bits)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(1 - (q**2).sum(axis=1), 0))
+    return np.roll(q, 1, axis=1)
 
 
 def _stacked(columns, names) -> np.ndarray:

@@ -1,7 +1,9 @@
 """Samples as they stand in a log, in ticks of its clock, and how they become the signals of a `Recording`."""
 
+import bisect
 import contextlib
 import gzip
+import math
 import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -11,17 +13,26 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
-from hybrid_jax.flights.log import wrong_norms
+from hybrid_jax.flights.log import unlike_one, wrong_norms
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
 GZIP = b"\x1f\x8b"
 XYZ, WXYZ, BATTERY = ("x", "y", "z"), ("w", "x", "y", "z"), ("battery",)
 LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
-WRAPS = (16, 32)  # bits of counters that may begin anew
+STRAY = 0.01  # share of samples whose time stamps may be wrong
+APART = 0.5  # share of a log's time by which a few samples at an end must lie off to be such
+LOST = 0.5  # share of samples that may be no number, or no rotation, and are left out
+# Counters that may begin anew: what they are called, and the seconds that they count to.
+WRAPS = {f"{bits} bits of {unit}": 2**bits * tick for bits in (16, 32) for unit, tick in (("µs", 1e-6), ("ms", 1e-3))}
 FEWEST_OF_LINES = 100  # samples; of fewer, lines may be chance
 STRAIGHT = 1e-6  # of the steepest slope: by how much that of a line may change at a sample, by rounding
 BENT = 0.5  # share of samples with a bend from which on a signal was not made of lines
-OPTIONAL = ("voltage",)  # samples that are not finite are left out, not refused
+WHOLE = 1e-3  # by how much a number of steps may differ from a whole one, by rounding
+HELD = 1.5  # rows in which a value stands, on average, from which on slow samples were repeated
+REGULAR = 0.9  # share of the values that must stand in as many rows, or one more or less
+OPTIONAL = ("voltage",)  # of which any number of samples may be left out
+AS_TOLD = ("command", "voltage")  # quantities that may well keep a value
+RATIO, LARGEST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for each of its own, at most, at least
 
 
 class Samples(NamedTuple):
@@ -35,19 +46,24 @@ class Samples(NamedTuple):
 
 def is_packed(path: str | Path) -> bool:
     """Whether a file is gzip, by its first bytes."""
-    with Path(path).open("rb") as file:
+    with opened(path, packed=False) as file:
         return file.read(2) == GZIP
 
 
-def opened(path: str | Path) -> IO[bytes]:
-    """A file, plain or gzip, to read its bytes."""
-    return gzip.open(path) if is_packed(path) else Path(path).open("rb")  # pyright: ignore[reportReturnType]
+def opened(path: str | Path, packed: bool | None = None) -> IO[bytes]:
+    """A file, plain or gzip, to read its bytes; OSError for a pipe or device, which may never end."""
+    if Path(path).exists() and not Path(path).is_file():
+        raise OSError(0, "is no regular file")
+    packed = is_packed(path) if packed is None else packed
+    return gzip.open(path) if packed else Path(path).open("rb")  # pyright: ignore[reportReturnType]
 
 
 @contextlib.contextmanager
 def readable(path: str | Path) -> Iterator[IO[bytes]]:
     """A file, plain or gzip, to read; ValueError, with the file and what to do, if that cannot be done."""
     try:
+        if is_packed(path):
+            _refuse_bomb(path)
         with opened(path) as file:
             yield file
     except FileNotFoundError as error:
@@ -56,6 +72,16 @@ def readable(path: str | Path) -> Iterator[IO[bytes]]:
         raise ValueError(f"{path}: the gzip data are truncated or damaged; copy the file again") from error
     except OSError as error:
         raise ValueError(f"{path}: cannot be read: {error.strerror or error}") from error
+
+
+def _refuse_bomb(path: str | Path) -> None:
+    """Refuse gzip data that would fill the memory."""
+    size, most = 0, min(max(RATIO * Path(path).stat().st_size, SMALL), LARGEST)
+    with opened(path) as file:
+        while part := file.read(1 << 20):
+            size += len(part)
+            if size > most:
+                raise ValueError(f"{path}: unpacks to over {most / 2**20:.0f} MiB, as no log does; unpack it first")
 
 
 def unpacked(path: str | Path) -> bytes:
@@ -73,78 +99,159 @@ def record(
 ) -> Recording:
     """The recording of a file whose clock counts ticks of so many seconds, by quantity; empty parts are left out.
 
-    Repeated time stamps, and samples up to `LATE` out of order, are left out with a note.
+    Left out with a note are repeated time stamps, samples up to `LATE` out of order, a few with a time far from their
+    neighbours', and those without a number or a rotation: as they all become gaps, nothing is made up. Of a value that
+    stands in several rows, the first is kept.
 
     Raises:
         ValueError: file, source, time and what was expected, in one line.
     """
     parts = {name: part for name, part in parts.items() if len(part.ticks)}
     if not parts:
-        raise ValueError(f"{path}: holds no quantity of a flight; see docs/howto/logs.md for what to log")
-    start = min(part.ticks[0] for part in parts.values())
-    signals, said = {}, list(notes)
+        said = "".join(f" ({note})" for note in notes)
+        raise ValueError(f"{path}: holds no quantity of a flight{said}; see docs/howto/logs.md for what to log")
+    said, signals, ordered = list(notes), {}, {}
     for name, part in parts.items():
-        where = f"{path}: {part.source}"
-        t = (part.ticks - start).astype(float) * tick
-        for row in np.flatnonzero(~np.isfinite(t))[:1]:
-            raise ValueError(f"{where}: the time of sample {row} is {t[row]}, must be finite")
-        kept, left_out = _in_order(where, t, tick)
-        finite = np.isfinite(part.values).all(axis=1)
-        if name in OPTIONAL and not finite.all():
-            lost = t[~finite]
-            left_out.append(f"{name} is no number in {len(lost)} samples, the first at {lost[0]:.4g} s")
-            kept &= finite
-        said += [f"{part.source}: {line}: left out" for line in left_out]
-        if name == "attitude":
-            for row, norm in wrong_norms(part.values[kept]):
-                raise ValueError(f"{where}: the quaternion at {t[kept][row]:.6g} s has norm {norm:.4g}, must be 1")
+        kept, lines = _in_order(f"{path}: {part.source}", part.ticks, tick)
+        ordered[name] = part._replace(ticks=part.ticks[kept], values=part.values[kept])
+        said += [f"{part.source}: {line}: left out" for line in lines]
+    start = min(part.ticks[0] for part in ordered.values())
+    lost = _lost("attitude", ordered["attitude"]) if "attitude" in ordered else np.zeros(0, bool)
+    for name, part in ordered.items():
+        t, gone = (part.ticks - start).astype(float) * tick, _lost(name, part)
+        # A message without an attitude tells no position either.
+        if name != "attitude" and "attitude" in ordered and _of_one_message(part, ordered["attitude"]):
+            gone |= lost if lost.mean() <= LOST else False
+        if gone.any() and (name in OPTIONAL or gone.mean() <= LOST):
+            why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
+            said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
+            t, part = t[~gone], part._replace(values=part.values[~gone])
+        elif name == "attitude":
+            for row, norm in wrong_norms(part.values):
+                where = f"{path}: {part.source}: the quaternion at {t[row]:.6g} s"
+                raise ValueError(f"{where} has norm {norm:.4g}, must be 1")
+        own, values = own_samples(t, part.values, name not in AS_TOLD)
+        if len(own) < len(t):
+            apart = float(np.median(np.diff(own)))
+            drawn = f"values repeated, or lines between samples {apart:.3g} s apart"
+            said.append(f"{part.source}: {drawn}: read as these samples")
         try:
-            signals |= {name: Signal(t[kept], part.values[kept], part.axes, part.source)} if kept.any() else {}
+            found = Signal(own, values, part.axes, part.source)
         except ValueError as error:
             raise ValueError(f"{path}: {error}") from error
+        signals |= {name: found} if len(t) else {}
     return Recording(str(path), signals, tuple(dict.fromkeys(said)), facts or {})
 
 
-def _in_order(where: str, t: Float[np.ndarray, " n"], tick: float) -> tuple[np.ndarray, list[str]]:
-    """Which samples come after all before them, and what is to be said of the others."""
-    latest = np.maximum.accumulate(t)
-    kept = np.append(True, t[1:] > latest[:-1])
-    back = latest - t
-    row = int(back.argmax())
+def _lost(name: str, part: Samples) -> np.ndarray:
+    """Which samples are no numbers, or no rotations."""
+    lost = ~np.isfinite(np.asarray(part.values)).all(axis=1)
+    return lost | np.asarray(unlike_one(part.values)) if name == "attitude" else np.asarray(lost)
+
+
+def _of_one_message(a: Samples, b: Samples) -> bool:
+    return a.source.split()[:1] == b.source.split()[:1] and np.array_equal(a.ticks, b.ticks)
+
+
+def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, list[str]]:
+    """The samples that come after all before them, and what is to be said of the others."""
+    t = (ticks - ticks[len(ticks) // 2]).astype(float) * tick
+    for row in np.flatnonzero(~np.isfinite(t))[:1]:
+        raise ValueError(f"{where}: the time of sample {row} is {t[row]}, must be finite")
+    kept, lines = np.arange(len(t)), []
     steps = np.diff(t)
     usual = float(np.median(steps[steps > 0])) if (steps > 0).any() else 0.0
-    ticks = (usual - steps.min(initial=0.0)) / tick  # by which a counter fell
-    wrapped = [bits for bits in WRAPS if abs(ticks / 2**bits - 1) < 0.02]
-    if wrapped or back[row] > max(LATE, GAP * usual):
-        why = f"a counter of {wrapped[0]} bits began anew" if wrapped else "the clock was set back or a log appended"
-        advice = "split the file there"
-        raise ValueError(f"{where}: time goes back from {latest[row]:.6g} s to {t[row]:.6g} s: {why}; {advice}")
-    late, repeated = int((back > 0).sum()), int((~kept & (back == 0)).sum())
-    lines = [f"{late} samples out of order by up to {back[row]:.2g} s"] if late else []
-    return kept, lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
+    far, few = max(LATE, GAP * usual), max(1.0, STRAY * len(t))
+    if (np.maximum.accumulate(t) - t).max() > far:
+        kept = longest_rise(t)
+    ends = np.diff(t[kept])
+    if len(ends) > 2 * GAP and ends.max() > max(far, APART * (t[kept[-1]] - t[kept[0]])):
+        before, after = np.split(kept, [int(ends.argmax()) + 1])
+        kept = after if len(before) <= few else before if len(after) <= few else kept
+    if 0 < (stray := len(t) - len(kept)) <= few:
+        lines.append(f"{stray} samples with a time far from their neighbours'")
+    else:
+        kept = np.arange(len(t))
+    latest = np.maximum.accumulate(t[kept])
+    back = latest - t[kept]
+    row = int(back.argmax())
+    why = wrapped(usual - np.diff(t[kept]).min(initial=0.0))
+    if why or back[row] > far:
+        why = why or "the clock was set back or a log appended"
+        # From the start of the log.
+        times = f"{latest[row] - t[0]:.6g} s to {t[kept][row] - t[0]:.6g} s"
+        raise ValueError(f"{where}: time goes back from {times}: {why}; split the file there")
+    rising = np.append(True, t[kept][1:] > latest[:-1])
+    late, repeated = int((back > 0).sum()), int((~rising & (back == 0)).sum())
+    lines += [f"{late} samples out of order by up to {back[row]:.2g} s"] if late else []
+    return kept[rising], lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
 
 
-def uninterpolated(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"]):
-    """Times and values of the samples between which a program drew straight lines, or the arguments as they are.
+def wrapped(fall: float) -> str:
+    """Which counter, if any, falls by so many seconds when it begins anew."""
+    found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
+    return f"a counter of {found[0]} began anew" if found else ""
 
-    A program that puts signals of several rates on one clock writes a slow one as lines with bends at its samples. A
-    sample that fell between two times of that clock is where the lines beside it meet. A line as long as several
-    intervals keeps a sample in each; one longer than `GAP` intervals becomes a gap, which may lie under it.
+
+def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
+    """Indices of the longest sequence of times that do not fall."""
+    tops, at, before = [], [], np.full(len(t), -1)
+    for i, time in enumerate(t.tolist()):
+        place = bisect.bisect_right(tops, time)
+        # A slice, as it may be one beyond the end.
+        tops[place : place + 1], at[place : place + 1] = [time], [i]
+        before[i] = at[place - 1] if place else -1
+    chain = [at[-1]]
+    while before[chain[-1]] >= 0:
+        chain.append(int(before[chain[-1]]))
+    return np.array(chain[::-1])
+
+
+def own_samples(t: Float[np.ndarray, " n"], values: Float[np.ndarray, "n k"], repeated: bool = True):
+    """Times and values of the samples that a program repeated or drew lines between, or the arguments as they are.
+
+    A program that puts signals of several rates on one clock repeats each value of a slow one until the next comes, or
+    writes it as lines with bends at its samples. A sample that fell between two times of that clock is where the lines
+    beside it meet. A line as long as several intervals keeps a sample in each; one longer than `GAP` intervals becomes
+    a gap, which may lie under it, unless the value rests.
     """
     sound = np.isfinite(t).all() and np.isfinite(values).all() and (np.diff(t) > 0).all()
     if len(t) < FEWEST_OF_LINES or not sound:
         return t, values
+    fresh = _fresh(values) if repeated else np.ones(len(t), bool)
+    if not fresh.all():
+        return t[fresh], values[fresh]
     slope = np.diff(values, axis=0) / np.diff(t)[:, None]
     bend = np.abs(np.diff(slope, axis=0)).max(axis=1) > STRAIGHT * np.abs(slope).max()
     moving = np.abs(slope[1:]).max(axis=1) > 0
-    if not moving.any() or bend[moving].mean() > BENT:
+    if not moving.any() or bend[moving].mean() > BENT or _in_steps(values):
         return t, values
     ends = [(t[0], values[0]), *_meetings(t, values, slope, bend), (t[-1], values[-1])]
     times, rows = map(np.array, zip(*ends, strict=True))
     lengths = np.diff(times) / np.median(np.diff(times))
-    counts = np.where(lengths > GAP, 1, np.maximum(1, np.round(lengths))).astype(int)
+    rests = (np.diff(rows, axis=0) == 0).all(axis=1)
+    counts = np.where((lengths > GAP) & ~rests, 1, np.maximum(1, np.round(lengths))).astype(int)
     own = np.interp(np.arange(counts.sum() + 1), np.append(0, np.cumsum(counts)), times)
     return own, np.stack([np.interp(own, times, row) for row in rows.T], axis=1)
+
+
+def _in_steps(values: Float[np.ndarray, "n k"]) -> bool:
+    """Whether all values are multiples of a step, as of a sensor or a file with few digits."""
+    steps = np.abs(np.diff(values, axis=0))
+    least = np.min(steps, axis=0, where=steps > 0, initial=np.inf)
+    return bool(np.abs(steps / least - np.round(steps / least)).max() < WHOLE)
+
+
+def _fresh(values: Float[np.ndarray, "n k"]) -> np.ndarray:
+    """Which rows hold new values, if all stand in about as many rows; where one rests longer, as often. Else all."""
+    new = np.append(True, (np.diff(values, axis=0) != 0).any(axis=1))
+    counts = np.diff(np.flatnonzero(new))
+    counts = counts[counts <= GAP * np.median(counts)] if len(counts) else counts
+    if len(counts) < FEWEST_OF_LINES / 4 or counts.mean() < HELD:
+        return np.ones(len(new), bool)
+    regular = (np.abs(counts - counts.mean()) < 1).mean() >= REGULAR
+    since = np.arange(len(new)) - np.flatnonzero(new)[np.cumsum(new) - 1]
+    return new | (since % math.ceil(counts.mean()) == 0) if regular else np.ones(len(new), bool)
 
 
 def _meetings(t, values, slope, bend):

@@ -7,20 +7,24 @@ topics may hold one quantity: then the topics are named, as in {"odometry": "/ma
 Frames are those of REP 103 and 105: world z up, body forward-left-up, an odometry's twist in the body.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import re
+from collections.abc import Callable, Collection, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.column_map import REST, SCALES, SHARES
+from hybrid_jax.flights.formats.column_map import SCALES, SHARES, of_unit
 from hybrid_jax.flights.formats.raw import BATTERY, WXYZ, XYZ, Samples
+from hybrid_jax.flights.formats.ulog import TOPICS, motors, states
+from hybrid_jax.flights.log import unlike_one
 from hybrid_jax.flights.recording import Recording
+from hybrid_jax.vehicle import FEWEST_ROTORS
 
-# Role → message types, without package; the roles are the keys of `topics`, with "motors".
-TYPES = {"odometry": ("Odometry",), "pose": ("PoseStamped",), "imu": ("Imu",), "voltage": ("BatteryState",)}
-ROLES = (*TYPES, "motors")
+PX4 = "px4_msgs/"
+
 FIELDS = ("angular_velocities", "velocity")  # of motors, in rad/s by the definition of their messages
 _Reader = Callable[[Any], list[float]]
 
@@ -33,24 +37,49 @@ def _wxyz(q) -> list[float]:
     return [q.w, q.x, q.y, q.z]
 
 
-# Role → quantity → its axes and how it is read from a message.
-READERS: dict[str, dict[str, tuple[tuple[str, ...], _Reader]]] = {
+def _pose(at: Callable[[Any], Any]) -> dict[str, tuple[tuple[str, ...], _Reader]]:
+    return {
+        "position": (XYZ, lambda message: _xyz(at(message).position)),
+        "attitude": (WXYZ, lambda message: _wxyz(at(message).orientation)),
+    }
+
+
+_TRANSFORM: dict[str, tuple[tuple[str, ...], _Reader]] = {
+    "position": (XYZ, lambda message: _xyz(message.transform.translation)),
+    "attitude": (WXYZ, lambda message: _wxyz(message.transform.rotation)),
+}
+# Role → message type, without package → quantity → its axes and how it is read. Roles, and "motors", are the keys of
+# `topics`; those that come later count where two tell of one quantity.
+READERS: dict[str, dict[str, dict[str, tuple[tuple[str, ...], _Reader]]]] = {
     "pose": {
-        "position": (XYZ, lambda message: _xyz(message.pose.position)),
-        "attitude": (WXYZ, lambda message: _wxyz(message.pose.orientation)),
+        "PoseStamped": _pose(lambda message: message.pose),
+        "PoseWithCovarianceStamped": _pose(lambda message: message.pose.pose),
+        "Pose": _pose(lambda message: message),
+        "TransformStamped": _TRANSFORM,
     },
     "odometry": {
-        "position": (XYZ, lambda message: _xyz(message.pose.pose.position)),
-        "attitude": (WXYZ, lambda message: _wxyz(message.pose.pose.orientation)),
-        "body_velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear)),
-        "rates": (XYZ, lambda message: _xyz(message.twist.twist.angular)),
+        "Odometry": _pose(lambda message: message.pose.pose)
+        | {
+            "body_velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear)),
+            "rates": (XYZ, lambda message: _xyz(message.twist.twist.angular)),
+        }
+    },
+    "velocity": {
+        "TwistStamped": {"velocity": (XYZ, lambda message: _xyz(message.twist.linear))},
+        "TwistWithCovarianceStamped": {"velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear))},
+        "Vector3Stamped": {"velocity": (XYZ, lambda message: _xyz(message.vector))},
+        "Odometry": {"velocity": (XYZ, lambda message: _xyz(message.twist.twist.linear))},
     },
     "imu": {
-        "rates": (XYZ, lambda message: _xyz(message.angular_velocity)),
-        "specific_force": (XYZ, lambda message: _xyz(message.linear_acceleration)),
+        "Imu": {
+            "rates": (XYZ, lambda message: _xyz(message.angular_velocity)),
+            "specific_force": (XYZ, lambda message: _xyz(message.linear_acceleration)),
+        }
     },
-    "voltage": {"voltage": (BATTERY, lambda message: [message.voltage])},
+    "voltage": {"BatteryState": {"voltage": (BATTERY, lambda message: [message.voltage])}},
 }
+ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped")}  # read in a role only if `topics` says so
+ROLES = (*READERS, "motors")
 
 
 def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Recording:
@@ -72,6 +101,8 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
             types = {each.topic: each.msgtype for each in bag.connections if each.msgcount}
             chosen = _chosen(path, types, topics)
             wanted = [each for each in bag.connections if each.topic in {topic for topic, *_ in chosen.values()}]
+            of_px4 = [each for each in bag.connections if each.msgtype.startswith(PX4) and _px4(each) in TOPICS]
+            wanted += [each for each in of_px4 if each.msgcount]
             messages: dict[str, list[tuple[int, Any]]] = {each.topic: [] for each in wanted}
             for each, at, content in bag.messages(wanted) if wanted else ():
                 messages[each.topic].append((at, bag.deserialize(content, each.msgtype)))
@@ -84,22 +115,62 @@ def read_rosbag(path: str | Path, topics: Mapping[str, str] | None = None) -> Re
         ) from error
     if empty := [topic for topic, found in messages.items() if not found]:
         raise ValueError(f"{path}: topic {empty[0]} has lost its messages; ros2 bag reindex, or copy it again")
-    parts: dict[str, Samples] = {}
+    parts, notes, used = {}, [], {*messages}
     for role, (topic, field, unit) in chosen.items():
-        found = _motors(path, topic, field, unit, messages[topic]) if field else _states(role, topic, messages[topic])
+        kind = types[topic].split("/")[-1]
+        heard = messages[topic]
+        found = _motors(path, topic, field, unit, heard) if field else _states(role, kind, topic, heard)
         parts |= dict(found)
-    used = {topic for topic, *_ in chosen.values()}
-    notes = [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
+    if "velocity" in chosen:
+        _twist_in_world(parts, chosen["velocity"][0])
+    tables = {_px4(each): _px4_table(messages[each.topic]) for each in wanted if each.msgtype.startswith(PX4)}
+    own = dict(states(tables, notes)) | motors(tables, {}, 0, notes)
+    parts = {name: part._replace(ticks=1000 * part.ticks) for name, part in own.items()} | parts  # µs, the bag ns
+    notes += [f"topics that are not used: {', '.join(sorted(types.keys() - used))}"] if types.keys() - used else []
     return raw.record(path, parts, 1e-9, notes, {"format": "ROS bag"})
 
 
+def _twist_in_world(parts: dict[str, Samples], topic: str) -> None:
+    """Where a topic tells of velocity in the world, none in the body counts; rates beside it are in the world, too."""
+    parts.pop("body_velocity", None)
+    rates, attitude = parts.get("rates"), parts.get("attitude")
+    if rates and attitude and rates.source == attitude.source == topic:
+        q = np.where(unlike_one(attitude.values)[:, None], [1.0, 0, 0, 0], attitude.values)
+        parts["rates"] = rates._replace(values=rotation_of(q).inv().apply(rates.values))
+
+
+def _px4(connection) -> str:
+    """The topic of PX4 that a message of px4_msgs is of, such as vehicle_attitude of VehicleAttitude."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", connection.msgtype.split("/")[-1]).lower()
+
+
+def _px4_table(messages) -> dict[str, np.ndarray]:
+    """Field → array, as of a ULog: of arrays a field for each element."""
+    rows = [dict(_fields(message)) for _, message in messages]
+    return {name: np.array([row[name] for row in rows]) for name in rows[0] if all(name in row for row in rows)}
+
+
+def _fields(message, prefix: str = "") -> Iterator[tuple[str, Any]]:
+    for name in (each for each in vars(message) if not each.startswith("_")):
+        value = getattr(message, name)
+        for i, each in enumerate(value) if isinstance(value, list | np.ndarray) else ():
+            if hasattr(each, "__dict__"):
+                yield from _fields(each, f"{prefix}{name}[{i}].")
+            else:
+                yield f"{prefix}{name}[{i}]", each
+        if isinstance(value, bool | int | float):
+            yield prefix + name, value
+
+
 def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[str, tuple[str, str, str]]:
-    """Role → topic, and of motors field and unit; of a pose and an odometry, the odometry is read last and counts."""
+    """Role → topic, and of motors field and unit."""
     found = {}
-    for role in ("pose", "odometry", "imu", "voltage"):
-        fitting = [topic for topic, kind in types.items() if kind.split("/")[-1] in TYPES[role]]
+    for role, kinds in READERS.items():
+        known = {kind for kind in kinds if role in topics or (role, kind) not in ASKED_FOR}
+        # Of mavros: the same velocity in the body.
+        fitting = [topic for topic, kind in types.items() if kind.split("/")[-1] in known and "body" not in topic]
         if role in topics:
-            _require(path, topics[role], types)
+            _require(path, topics[role], types, role, known)
             fitting = [topics[role]]
         if len(fitting) > 1:
             first, *_ = names = sorted(fitting)
@@ -121,9 +192,14 @@ def _chosen(path, types: Mapping[str, str], topics: Mapping[str, str]) -> dict[s
     return found
 
 
-def _require(path, topic: str, types: Mapping[str, str]) -> None:
+def _require(path, topic: str, types: Mapping[str, str], role: str = "", kinds: Collection[str] = ()) -> None:
     if topic not in types:
         raise ValueError(f"{path}: has no messages of topic {topic}, only of {', '.join(sorted(types)) or 'none'}")
+    kind = types[topic].split("/")[-1]
+    if role and kind not in kinds:
+        others = [other for other, readers in READERS.items() if kind in readers]
+        mend = f'; it can be {others[0]}: topics={{"{others[0]}": "{topic}"}}' if others else ""
+        raise ValueError(f"{path}: topics: {role} must be of type {', '.join(sorted(kinds))}; {topic} is {kind}{mend}")
 
 
 def _stamps(messages) -> np.ndarray:
@@ -134,20 +210,24 @@ def _stamps(messages) -> np.ndarray:
     return np.array([at for at, _ in messages], np.int64)
 
 
-def _states(role: str, topic: str, messages) -> Iterator[tuple[str, Samples]]:
+def _states(role: str, kind: str, topic: str, messages) -> Iterator[tuple[str, Samples]]:
     ticks = _stamps(messages)
-    for quantity, (axes, read) in READERS[role].items():
+    for quantity, (axes, read) in READERS[role][kind].items():
         yield quantity, Samples(ticks, np.array([read(message) for _, message in messages], float), axes, topic)
 
 
 def _motors(path, topic: str, field: str, unit: str, messages) -> Iterator[tuple[str, Samples]]:
     fields = field.split("|")
-    name = next((name for name in fields if len(getattr(messages[0][1], name, ()))), fields[0])
-    rows = [np.asarray(getattr(message, name, ()), float).ravel() for _, message in messages]
+    name = next((name for name in fields if len(np.ravel(getattr(messages[0][1], name, ())))), fields[0])
+    try:
+        rows = [np.asarray(getattr(message, name, ()), float).ravel() for _, message in messages]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{path}: {topic}: field {name} must hold a number for each motor") from error
     counts = {len(row) for row in rows}
-    if len(counts) > 1 or not 3 <= min(counts) <= 12:
-        found = ", ".join(map(str, sorted(counts)))
-        raise ValueError(f"{path}: {topic}: field {name} holds {found} numbers, must be one for each of 3 to 12 motors")
-    values = (np.stack(rows) - REST.get(unit, 0.0)) * SCALES["motors"][unit]
+    if len(counts) > 1 or min(counts) < FEWEST_ROTORS:
+        known = ", ".join(each for each in vars(messages[0][1]) if not each.startswith("_"))
+        found = f"{', '.join(map(str, sorted(counts)))} numbers, must be one for each motor; its fields are {known}"
+        raise ValueError(f"{path}: {topic}: field {name} holds {found}")
+    values = of_unit(np.stack(rows), unit)
     quantity = "command" if unit in SHARES else "rotor_speed"
     yield quantity, Samples(_stamps(messages), values, tuple(map(str, range(values.shape[1]))), f"{topic} {name}")

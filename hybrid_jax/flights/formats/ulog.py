@@ -17,17 +17,20 @@ import numpy as np
 from hybrid_jax.flights.formats import raw
 from hybrid_jax.flights.formats.raw import BATTERY, WXYZ, XYZ, Samples
 from hybrid_jax.flights.recording import Recording
+from hybrid_jax.vehicle import FEWEST_ROTORS
 
-LOCAL, ATTITUDE, STATUS, OUTPUTS = "vehicle_local_position", "vehicle_attitude", "vehicle_status", "actuator_outputs"
-# Quantity → where it may stand, the first that a log has counts: topic and fields.
+ODOMETRY, LOCAL, ATTITUDE = "vehicle_odometry", "vehicle_local_position", "vehicle_attitude"
+STATUS, OUTPUTS = "vehicle_status", "actuator_outputs"
+# Quantity → where it may stand, the first that a log has counts: topic and fields. Of ULog and of px4_msgs in bags.
 SOURCES: dict[str, tuple[tuple[str, tuple[str, ...]], ...]] = {
-    "position": ((LOCAL, ("x", "y", "z")),),
-    "velocity": ((LOCAL, ("vx", "vy", "vz")),),
-    "attitude": ((ATTITUDE, tuple(f"q[{i}]" for i in range(4))),),
+    "position": ((LOCAL, ("x", "y", "z")), (ODOMETRY, tuple(f"position[{i}]" for i in range(3)))),
+    "velocity": ((LOCAL, ("vx", "vy", "vz")), (ODOMETRY, tuple(f"velocity[{i}]" for i in range(3)))),
+    "attitude": tuple((topic, tuple(f"q[{i}]" for i in range(4))) for topic in (ATTITUDE, ODOMETRY)),
     "rates": (
         ("vehicle_angular_velocity", tuple(f"xyz[{i}]" for i in range(3))),  # from 1.10 on
         ("sensor_combined", tuple(f"gyro_rad[{i}]" for i in range(3))),
         (ATTITUDE, ("rollspeed", "pitchspeed", "yawspeed")),  # until 1.9
+        (ODOMETRY, tuple(f"angular_velocity[{i}]" for i in range(3))),
     ),
     "specific_force": (
         ("sensor_combined", tuple(f"accelerometer_m_s2[{i}]" for i in range(3))),
@@ -42,7 +45,9 @@ TOPICS = sorted({topic for each in SOURCES.values() for topic, _ in each} | {*MO
 ROTORS = {2: 4, 13: 6, 14: 8, 15: 3, 29: 12, 35: 10}  # MAV_TYPE of multirotors → rotors
 OTHERS = {1: "fixed wing", 3: "coaxial helicopter", 4: "helicopter", 7: "airship", 10: "rover", 11: "boat"}
 OTHERS |= {12: "submarine"} | dict.fromkeys(range(19, 26), "VTOL")
-IDLE_PWM, FULL_PWM = 1000.0, 2000.0  # µs, where a log does not say
+IDLE_PWM, FULL_PWM, LEAST_PWM = 1000.0, 2000.0, 700.0  # µs, where a log does not say; less than PWM ever is
+UAVCAN, DSHOT = 8191.0, 1999.0  # outputs at full command
+SLOWEST_RPM = 1500.0  # rpm: the largest of a simulated multirotor is more
 MOST = 16  # motors or outputs in any topic
 
 
@@ -53,8 +58,7 @@ def read_ulog(path: str | Path) -> Recording:
         ValueError: file, topic, time and what to do, in one line; or pyulog is not installed.
     """
     log, damage = _load(path)
-    tables = {each.name: each.data for each in reversed(log.data_list)}  # the first instance of each topic
-    notes = [f"{each.name}: instance {each.multi_id} is left out" for each in log.data_list if each.multi_id]
+    tables, notes = _instances(log.data_list)
     kinds = {0: "generic"} | OTHERS | {kind: f"multirotor of {count} rotors" for kind, count in ROTORS.items()}
     kind = _kind(log.initial_parameters, tables)
     facts = {"format": "PX4 ULog", "vehicle": kinds.get(kind, "unknown"), "program": _release(log.msg_info_dict)}
@@ -64,9 +68,26 @@ def read_ulog(path: str | Path) -> Recording:
     if log.dropouts:
         longest = max(each.duration for each in log.dropouts)
         notes.append(f"{len(log.dropouts)} dropouts of the logger, the longest of {longest} ms")
-    parts = dict(_states(path, tables, notes))
-    parts |= _motors(path, tables, log.initial_parameters, ROTORS.get(kind, 0), notes)
+    simulated = "SITL" in facts["program"]
+    parts = dict(states(tables, notes))
+    parts |= motors(tables, log.initial_parameters, ROTORS.get(kind, 0), notes, simulated)
     return raw.record(path, parts, 1e-6, notes, facts)
+
+
+def _instances(data) -> tuple[dict[str, Any], list[str]]:
+    """Topic → the first of its instances that changes, else the first; and which that is, where there are several."""
+    tables, chosen = {}, {}
+    for each in sorted(data, key=lambda each: each.multi_id):
+        values = [column for name, column in each.data.items() if not name.startswith(("timestamp", "noutputs"))]
+        changing = sum(len(column) > 1 and bool((column != column[0]).any()) for column in values)
+        alive = changing >= (FEWEST_ROTORS if each.name == OUTPUTS else 1)
+        if each.name not in tables or (alive and not chosen[each.name][1]):
+            tables[each.name], chosen[each.name] = each.data, (each.multi_id, alive)
+    several = [(each.name, each.multi_id, chosen[each.name]) for each in data if chosen[each.name][0] != each.multi_id]
+    return tables, [
+        f"{name}: instance {number} is left out" + (f": {kept} changes" if kept and alive else "")
+        for name, number, (kept, alive) in several
+    ]
 
 
 def _load(path: str | Path) -> tuple[Any, str]:
@@ -93,54 +114,63 @@ def _load(path: str | Path) -> tuple[Any, str]:
 
 def _cut(content: bytes) -> bool:
     """Whether the last message is incomplete, which pyulog does not say."""
-    at = 16
+    at = 16  # behind the header
     if content[at + 2 : at + 3] == b"B":  # appended data begin anew at an offset, whatever was cut before it
         at = max(at, *struct.unpack("<3Q", content[at + 19 : at + 43]))
     while at + 3 <= len(content):
-        at += 3 + int.from_bytes(content[at : at + 2], "little")
+        size = int.from_bytes(content[at : at + 2], "little")
+        if not size:  # no message is empty: zeros follow
+            return True
+        at += 3 + size
     return at != len(content)
 
 
 def _kind(parameters, tables) -> int:
     """The vehicle as of MAV_TYPE; −1 where the log does not say."""
-    kind = int(parameters.get("MAV_TYPE", 0)) or int(tables.get(STATUS, {}).get("system_type", [0])[-1])
-    airframe = int(parameters.get("SYS_AUTOSTART", 0))
+    kind = _whole(parameters, "MAV_TYPE") or int(tables.get(STATUS, {}).get("system_type", [0])[-1])
+    airframe = _whole(parameters, "SYS_AUTOSTART")
     if 13000 <= airframe < 14000 or any(tables.get(STATUS, {}).get("is_vtol", ())):
         return 22
     return kind or -1
 
 
+def _whole(parameters, name: str) -> int:
+    """A parameter, 0 where it is no number."""
+    given = parameters.get(name, 0)
+    return int(given) if isinstance(given, int | float) and np.isfinite(given) else 0
+
+
 def _release(info) -> str:
-    number = int(info.get("ver_sw_release", 0))
+    number = _whole(info, "ver_sw_release")
     version = f"PX4 {number >> 24}.{number >> 16 & 255}.{number >> 8 & 255}" if number else "PX4"
     return f"{version} on {info.get('ver_hw', 'unknown hardware')}"
 
 
-def _table(path, tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
+def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
     """Ticks [µs] and fields of a topic."""
     table = tables[topic]
     # The time of the measurement where it is recorded, else that of the message.
     use_clock = clock in table and table[clock].min(initial=1) > 0
     ticks = table[clock if use_clock else "timestamp"].astype(np.int64)
-    if len(ticks) > 1 and (np.abs(ticks[-1] - ticks[0]) > 1e12):
-        raise ValueError(f"{path}: {topic}: time stamps span {1e-6 * abs(ticks[-1] - ticks[0]):.3g} s: is damaged")
     with np.errstate(invalid="ignore"):  # damaged numbers are refused later
         return ticks, np.stack([table[field] for field in fields], axis=1).astype(float)
 
 
-def _states(path, tables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
+def states(tables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
+    """The quantities of `SOURCES` in tables of topics: field → array."""
     for quantity, places in SOURCES.items():
         found = [(topic, fields) for topic, fields in places if topic in tables and {*fields} <= {*tables[topic]}]
         if not found:
             continue
         topic, fields = found[0]
-        ticks, values = _table(path, tables, topic, fields)
+        ticks, values = _table(tables, topic, fields)
         if quantity in VALID:
             ticks, values = _valid(tables[topic], quantity, ticks, values, notes)
         if quantity == "attitude":
             values = raw.attitude(values, "NED", "FRD")
         elif quantity != "voltage":
-            values = raw.world(values, "NED") if topic == LOCAL else raw.body(values, "FRD")
+            of_world = quantity in VALID
+            values = raw.world(values, "NED") if of_world else raw.body(values, "FRD")
         axes = {"attitude": WXYZ, "voltage": BATTERY}.get(quantity, XYZ)
         yield quantity, Samples(ticks, values, axes, f"{topic} {' '.join(fields)}")
 
@@ -159,15 +189,15 @@ def _valid(table, quantity: str, ticks, values, notes: list[str]) -> tuple[np.nd
     return ticks[known], values[known]
 
 
-def _motors(path, tables, parameters, expected: int, notes: list[str]) -> dict[str, Samples]:
-    """Rotor speeds and commands of all motors that the log knows."""
-    expected, found = int(parameters.get("CA_ROTOR_COUNT", 0)) or expected, {}
+def motors(tables, parameters, expected: int, notes: list[str], simulated: bool = False) -> dict[str, Samples]:
+    """Rotor speeds and commands of all motors that the tables know; `expected` rotors where they tell of none."""
+    expected, found = _whole(parameters, "CA_ROTOR_COUNT") or expected, {}
     for topic, field in MOTORS.items():
         quantity = "rotor_speed" if topic == "esc_status" else "command"
         fields = [field.format(i) for i in range(MOST) if topic in tables and field.format(i) in tables[topic]]
         if not fields or quantity in found:
             continue
-        ticks, values = _table(path, tables, topic, fields, "timestamp")
+        ticks, values = _table(tables, topic, fields, "timestamp")
         moving = [i for i in range(len(fields)) if len(np.unique(values[np.isfinite(values[:, i]), i])) > 1]
         count = max(expected, max(moving, default=-1) + 1)  # no motor is dropped: checks compare with the vehicle
         if topic == "esc_status" and not moving:
@@ -175,19 +205,35 @@ def _motors(path, tables, parameters, expected: int, notes: list[str]) -> dict[s
         if not 0 < count <= len(fields):
             notes.append(f"{topic}: {count} of {len(fields)} motors move: left out")
             continue
-        used = values[:, :count]
-        if topic == "esc_status":
-            used = np.abs(used) * np.pi / 30
-        elif topic == OUTPUTS:
-            low, full = (_pwm(parameters, end, default) for end, default in (("MIN", IDLE_PWM), ("MAX", FULL_PWM)))
-            used = np.maximum(used - low, 0.0) / (full - low)
-            notes.append(f"{OUTPUTS}: commands are shares from {low:g} to {full:g} µs")
         # PX4 writes NaN for a motor that is disarmed.
-        found[quantity] = Samples(ticks, np.nan_to_num(used, nan=0.0), tuple(map(str, range(count))), topic)
+        used = np.nan_to_num(values[:, :count], nan=0.0)
+        if topic == "esc_status":
+            used = np.abs(used)
+            in_radians = bool(simulated and used.max() < SLOWEST_RPM)
+            used = used if in_radians else used * np.pi / 30
+            notes += [f"{topic}: esc_rpm is in rad/s, as PX4_SITL writes it for Gazebo: read as such"] * in_radians
+        elif topic == OUTPUTS:
+            used, unit = _shares(used, parameters)
+            notes.append(f"{OUTPUTS}: commands are shares {unit}")
+        found[quantity] = Samples(ticks, used, tuple(map(str, range(count))), topic)
     return found
+
+
+def _shares(outputs: np.ndarray, parameters) -> tuple[np.ndarray, str]:
+    """Outputs as shares, and of what: what protocol they are for is told by their range alone."""
+    running = outputs[outputs > 0]
+    low, full = (_pwm(parameters, end, default) for end, default in (("MIN", IDLE_PWM), ("MAX", FULL_PWM)))
+    unit = f"from {low:g} to {full:g} µs"
+    if len(running) and running.max() <= 1:
+        low, full, unit = 0.0, 1.0, "from 0 to 1"
+    elif len(running) and running.max() > 1.2 * FULL_PWM:
+        low, full, unit = 0.0, UAVCAN, f"of UAVCAN's {UAVCAN:g}"
+    elif len(running) and np.quantile(running, 0.01) < LEAST_PWM:
+        low, full, unit = 0.0, DSHOT, f"of DShot's {DSHOT:g}"
+    return np.maximum(outputs - low, 0.0) / (full - low), unit
 
 
 def _pwm(parameters, end: str, default: float) -> float:
     """PWM_MIN or PWM_MAX, in later versions PWM_MAIN_MIN1 …"""
-    given = (parameters.get(name, 0) for name in (f"PWM_MAIN_{end}1", f"PWM_MAIN_{end}", f"PWM_{end}"))
+    given = (_whole(parameters, name) for name in (f"PWM_MAIN_{end}1", f"PWM_MAIN_{end}", f"PWM_{end}"))
     return float(next((value for value in given if value > 0), default))
