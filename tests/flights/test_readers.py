@@ -214,7 +214,11 @@ def test_messages_of_every_type_are_read(flight, tmp_path):
         yield at, "local", kinds["VehicleLocalPosition"](us, *map(float, ned), *map(float, vned))
         yield at, "attitude", kinds["VehicleAttitude"](us, turned[i].copy())
         yield at, "gyro", kinds["VehicleAngularVelocity"](us, frd)
-        yield at, "rotors", kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), few.u[i])
+        yield (
+            at,
+            "rotors",
+            kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), few.u[i].copy()),
+        )
         channels = np.concatenate([1000 + few.u[i], np.zeros(12)])
         yield at, "rc", kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), channels)
 
