@@ -1,0 +1,104 @@
+"""Worlds: RotorPy's equations and the logs of a flight; and what the command says of its rows."""
+
+import json
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from smoke import experiments
+
+from experiments.reporting.claims import evaluate
+from experiments.reporting.results import Results
+from experiments.worlds.__main__ import CLAIMS, ratio_table
+from experiments.worlds.cases import WORLDS
+from experiments.worlds.rotorpy import CRAZYFLIE, HUMMINGBIRD, ROTORPY, decide, derivative
+from experiments.worlds.world import BURST, CHANGES, Reference, logged
+
+FLAPPING = 1e-5  # which no vehicle of RotorPy has
+
+
+@pytest.mark.parametrize(("module", "constants"), [("hummingbird", HUMMINGBIRD), ("crazyflie", CRAZYFLIE)])
+def test_the_derivative_and_the_controller_are_those_of_rotorpy(module, constants):
+    params = pytest.importorskip(f"rotorpy.vehicles.{module}_params").quad_params | {"k_flap": FLAPPING}
+    from rotorpy.controllers.quadrotor_control import SE3Control
+    from rotorpy.vehicles.multirotor import Multirotor
+
+    rng, theirs, pilot = np.random.default_rng(0), Multirotor(params), SE3Control(params)
+    for _ in range(10):
+        x, v, rates, wind, place, velocity, acceleration = rng.normal(size=(7, 3))
+        w, i, j, k = q = (lambda q: q / np.linalg.norm(q))(rng.normal(size=4))
+        speeds, command = params["rotor_speed_max"] * rng.uniform(size=(2, 4))
+        heading, turn = rng.normal(size=2)
+        state = {"x": x, "v": v, "q": np.array([i, j, k, w]), "w": rates, "wind": wind, "rotor_speeds": speeds}
+        wanted = {"x": place, "x_dot": velocity, "x_ddot": acceleration, "yaw": heading, "yaw_dot": turn}
+        packed = theirs._s_dot_fn(0.0, theirs._pack_state(state), command)
+        asked = pilot.update(0.0, state, wanted)["cmd_motor_speeds"]
+        with jax.enable_x64(True):
+            ours, now = jnp.concatenate([x, q, v, rates]), Reference(*map(jnp.asarray, wanted.values()))
+            found, lagging = derivative(constants._replace(flapping=FLAPPING), ours, speeds, command, wind)
+            own = decide(constants, ours, now)
+        np.testing.assert_allclose(found, packed[[0, 1, 2, 9, 6, 7, 8, 3, 4, 5, 10, 11, 12]], rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(lagging, packed[16:], rtol=1e-10)
+        np.testing.assert_allclose(own, asked, rtol=1e-10)
+
+
+@pytest.mark.parametrize("world", ROTORPY, ids=lambda world: world.name)
+def test_a_vehicle_flies_after_every_change(world):
+    usual = world.fly("nothing", "moving", 1, 3.0, jax.random.key(0)).states
+    for change in CHANGES:
+        states = world.fly(change, "moving", 1, 3.0, jax.random.key(0)).states
+        assert np.abs(states[0, :, :3] - usual[0, :, :3]).max() < 3.0  # m
+        assert (change == "nothing") == np.array_equal(states, usual)
+
+
+def test_a_log_has_sampled_or_averaged_speeds_and_wild_samples():
+    """A motor lags by 5 ms, so that the mean over 10 ms is nearer to the next sample than to the last."""
+    flown = WORLDS["hummingbird"].fly("nothing", "moving", 2, 5.0, jax.random.key(0))
+    last, following = flown.sampled[:, :-1], flown.sampled[:, 1:]
+    assert np.abs(flown.averaged[:, :-1] - following).mean() < np.abs(flown.averaged[:, :-1] - last).mean()
+    clean, sampled, wild = (
+        logged(flown, jax.random.key(1), 10, **options)
+        for options in ({"noise": 0.0}, {"averaged": False}, {"burst": True})
+    )
+    np.testing.assert_array_equal(clean.x0[0], flown.states[0, 0].astype(np.float32))
+    np.testing.assert_array_equal(sampled.u[0], flown.sampled[0, :10].astype(np.float32))
+    np.testing.assert_array_equal(wild.x0[1], wild.x[0, -1])  # windows share the sample between them
+    away = np.abs(wild.x - clean.x)[..., 0].reshape(2, -1)
+    assert away[:, BURST].mean() > 20 * away[:, : BURST.start - 1].mean()
+
+
+def rows(**ratios):
+    """Three draws of some cases in one world, with an error over the source's of each."""
+    tags = {"world": "iris", "flight": "moving", "seed": 0, "chosen": "theta", "made_for": True}
+    found = [
+        {**tags, "change": change, "draw": draw, "ratio": ratio}
+        for change, each in ratios.items()
+        for draw, ratio in enumerate(each)
+    ]
+    return Results(found, ("world", "change", "flight", "draw", "seed"))
+
+
+@pytest.mark.parametrize(
+    ("ratios", "holds"), [((1.0, 1.0, 1.15), True), ((1.1, 1.1, 1.1), False), ((0.5, 0.5, 1.3), False)]
+)
+def test_the_law_is_about_means_and_about_each_adaptation(ratios, holds):
+    (verdict,) = evaluate(CLAIMS, rows(nothing=ratios))
+    assert verdict.holds is holds
+
+
+def test_the_worst_case_comes_first():
+    assert [line[1] for line in ratio_table(rows(nothing=(1.0, 1.0, 1.0), drag=(0.1, 0.1, 9.0))).lines] == [
+        "drag",
+        "nothing",
+    ]
+
+
+@pytest.mark.slow
+def test_the_command_writes_a_row_for_each_case(tmp_path):
+    (run,) = experiments("worlds", "worlds", folder=tmp_path)
+    assert run.returncode == 0, run.stderr
+    report = json.loads((tmp_path / "out" / "worlds" / "report.json").read_text())
+    assert [(row["world"], row["change"], row["flight"]) for row in report["rows"]] == [
+        ("hummingbird", "nothing", "short")
+    ]
