@@ -31,6 +31,7 @@ from hybrid_jax.adaptation.auto import Auto, candidate, extended
 from hybrid_jax.adaptation.expectation import expected_errors
 from hybrid_jax.adaptation.selection import BLOCKS, blocks_of, geometric_mean, predict_block
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
@@ -211,10 +212,11 @@ def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test:
 
 def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
     """Of other flights, quantities and horizons the share whose error is in its 80 % interval; None without flights."""
-    expected = expected_errors(ends, (1.0, 2.0), rigid=True).values()  # names of the horizons, which do not matter
+    options = (1.0, 2.0), RIGID_BODY_SPACE  # names of the horizons, which do not matter
+    expected = expected_errors(ends, *options).values()
     inside = []
     for of_flight in flown:
-        truth = expected_errors(of_flight[None], (1.0, 2.0), rigid=True).values()
+        truth = expected_errors(of_flight[None], *options).values()
         for known, own in zip(expected, truth, strict=True):
             inside += [low <= own[name][0] <= high for name, (_, low, high) in known.items()]
     return float(np.mean(inside)) if inside else None

@@ -15,8 +15,8 @@ from experiments.online.config import NOISE
 from experiments.runner import command
 from experiments.runner.options import NotNegative, Positive, check_numbers
 from hybrid_jax import AbstractVectorField, Model, OnlineAdaptation, checks, load, rotation
-from hybrid_jax.dynamics.base import infer_batch
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.dynamics.base import infer_batch, state_space
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.export import (
@@ -29,7 +29,7 @@ from hybrid_jax.export import (
 from hybrid_jax.export.program import sizes_of, vehicle_in
 from hybrid_jax.io.datasets import load_dataset
 from hybrid_jax.networks import smoothed
-from hybrid_jax.state import INPUT_SIZE, STATE_NAMES, STATE_SIZE
+from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 
 NAME = "export"
 COUNT = 10_000  # states over which a smooth model is compared
@@ -132,7 +132,7 @@ def export(config: Config) -> None:
 
 def _adaptation(config: Config, field: AbstractVectorField, dt: float) -> OnlineAdaptation | str:
     """The filter, or why there is none; ValueError for options that do not fit the model."""
-    options, rigid = config.adaptation, moves_a_rigid_body(field)
+    options, rigid = config.adaptation, state_space(field) == RIGID_BODY_SPACE
     check_numbers("--adaptation.", options)
     try:
         ravel_parameters(field)
@@ -204,7 +204,7 @@ def _change(config: Config, field: AbstractVectorField, beta: float) -> str:
     before, after = (np.asarray(eqx.filter_jit(infer_batch)(one, *columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
-    named = STATE_NAMES[entry] if len(off) == STATE_SIZE else f"x[{entry}]"
+    named = state_space(field, len(off)).names[entry]
     size = np.sqrt(np.mean(np.square(before[entry])))
     return f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}, in {named}, of RMS {size:.2g}; {len(x)} of {where}"
 

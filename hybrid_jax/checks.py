@@ -62,15 +62,15 @@ def finite(name: str, array: Numbers) -> Numbers:
     return array
 
 
-def unit_quaternions(name: str, states: Numbers) -> None:
-    """Refuse states (..., 13) whose quaternion is not of norm 1."""
+def unit_quaternions(name: str, states: Numbers, part: slice = QUATERNION) -> None:
+    """Refuse states (..., d) whose quaternion, by default that of a rigid body, is not of norm 1."""
     if is_traced(states):
         return
-    norms = np.linalg.norm(np.asarray(states)[..., QUATERNION], axis=-1)
+    norms = np.linalg.norm(np.asarray(states)[..., part], axis=-1)
     bad = ~(np.abs(norms - 1) <= UNIT)
     if bad.any():
         place = tuple(np.argwhere(bad)[0].tolist())
-        where = ", ".join(map(str, (*place, f"{QUATERNION.start}:{QUATERNION.stop}")))
+        where = ", ".join(map(str, (*place, f"{part.start}:{part.stop}")))
         raise ValueError(f"{name}[{where}] must be a unit quaternion (w, x, y, z), its norm is {norms[place]:.3g}")
 
 

@@ -72,6 +72,15 @@ def from_axis_angle(axis: Vector, angle: Float[Array, ""]) -> Quaternion:
     return jnp.concatenate([jnp.cos(half)[None], jnp.sin(half) * jnp.asarray(axis)])
 
 
+def from_rotation_vector(v: Vector) -> Quaternion:
+    """The rotation by |v| [rad] about v; the inverse of `rotation_vector`."""
+    square = v @ v
+    small = square < 1e-8  # there the next term of the series is below single precision
+    angle = jnp.sqrt(jnp.where(small, 1.0, square))
+    factor = jnp.where(small, 0.5 - square / 48, jnp.sin(angle / 2) / angle)
+    return jnp.concatenate([jnp.where(small, 1 - square / 8, jnp.cos(angle / 2))[None], factor * v])
+
+
 def rotation_vector(q: Quaternion) -> Vector:
     """Rotation vector [rad] of q, at most π long and equal for q and −q; q need not have length 1.
 

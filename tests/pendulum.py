@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.io.structure import portable
+from hybrid_jax.state_space import Angle, Quantity, StateSpace
 from hybrid_jax.trajectories import Trajectories
 
 GRAVITY = 9.81
@@ -27,6 +28,20 @@ class Pendulum(AbstractVectorField):
     def __call__(self, x, u):
         angle, rate = x
         return jnp.stack([rate, u[0] - GRAVITY / jnp.exp(self.log_length) * jnp.sin(angle) - self.damping * rate])
+
+
+@portable
+class Whirling(Pendulum):
+    """The pendulum, with an angle that is the same after a turn."""
+
+    @property
+    def state_space(self):
+        return StateSpace((Angle("angle", labels=("angle",)), Quantity("rate", unit="rad/s", labels=("rate",))))
+
+
+def whirling(length=LENGTH, damping=0.0):
+    """As `pendulum`, on the circle."""
+    return Whirling(jnp.log(jnp.asarray(length)), damping)
 
 
 def pendulum(length=LENGTH, damping=0.0):

@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
-from pendulum import pendulum
+from pendulum import pendulum, whirling
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.base import AbstractVectorField
@@ -156,6 +156,28 @@ def _pendulum(wrap=lambda network: network) -> System:
     )
 
 
+def _circle() -> System:
+    """A pendulum that whirls, with angles that are given within half a turn."""
+    system = _system(
+        truth=whirling(0.5, 0.8),
+        changed=whirling(0.7, 0.8),
+        model=hj.Hybrid(whirling(0.6), hj.residual_network(2, 1, jax.random.key(1), hidden=16)),
+        start=lambda rng, n: rng.uniform(-1, 1, (n, 2)) * [np.pi, 8.0],
+        inputs=lambda rng, shape: 3 * rng.normal(size=(*shape, 1)),
+        dt=0.05,
+    )
+    space, names = system.truth.state_space, ("train", "validation", "target", "test")
+    wrapped = {name: wrap(space, getattr(system, name)) for name in names}
+    assert all(np.abs(np.diff(one.x[..., 0])).max() > 6 for one in wrapped.values())  # it jumps
+    return replace(system, **wrapped)
+
+
+def wrap(space, data):
+    """The windows with states as they are usually given."""
+    usual = jnp.vectorize(space.normalise, signature="(d)->(d)")
+    return replace(data, x0=usual(data.x0), x=usual(data.x))
+
+
 def car_start(rng, n):
     """Anywhere within 100 m, at 10 to 25 m/s."""
     low, high = [-100, -100, -np.pi, 10, -1, -0.4], [100, 100, np.pi, 25, 1, 0.4]
@@ -236,6 +258,7 @@ def _convolution() -> System:
 
 SYSTEMS: dict[str, Callable[[], System]] = {
     "pendulum": cache(_pendulum),
+    "circle": cache(_circle),
     "car": cache(_car),
     "iris": cache(_iris),
     "multirotor": cache(_multirotor),

@@ -23,7 +23,7 @@ def public() -> Iterator[tuple[str, object]]:
     listed = re.findall(r"^::: (\S+)\n.*members: \[(.*?)\]", page, flags=re.MULTILINE)
     names = {module: re.split(r",\s*", members) for module, members in listed}
     for module in map(import_module, [*PACKAGES, *names]):
-        for name in names.get(module.__name__) or module.__all__:
+        for name in names.get(module.__name__) or getattr(module, "__all__", ()):
             found = getattr(module, name)
             if not name.startswith("_") and not isinstance(found, ModuleType):
                 yield getattr(found, "__module__", module.__name__), found

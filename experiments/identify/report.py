@@ -11,18 +11,15 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.plots import STYLE, save_figure
 from experiments.reporting.tables import Table
-from hybrid_jax.adaptation.adapting import UNITS
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, prediction_errors
 from hybrid_jax.identification.recordings import Layout
 
-ACTUATOR_UNITS = {"curve": "N or rad/s", "time_constant": "s", "time_constants": "s", "delay": "s"}
-
 
 def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Recording], layout: Layout, names):
     """Rows of the result, its tables and its notes."""
-    units = UNITS | ACTUATOR_UNITS | {"centre_of_mass": "m"}
+    units = found.field.parameter_units
     rows: list[dict[str, Any]] = []
     for name, interval in found.intervals.items():
         value, low, high = (float(each) for each in interval)

@@ -8,7 +8,8 @@ from jaxtyping import Int
 
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.models import RECIPES
-from hybrid_jax.extrapolation import Motion, motion
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.extrapolation import Features
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.windows import count_windows, flight_of, folds, hold_out, manoeuvre_of, require_length
 from hybrid_jax.trajectories import Trajectories
@@ -145,7 +146,7 @@ def non_overlapping(indices: np.ndarray, sizes: Sequence[int], spacing: int) -> 
     return np.array([index for _, index in kept[1:]], int)
 
 
-def motion_of_logs(logs: Sequence[FlightLog]) -> Motion:
-    """`motion` of every sample of some logs."""
+def motion_of_logs(logs: Sequence[FlightLog]) -> Features:
+    """Features of every sample of some logs."""
     x, u = (np.concatenate([getattr(log, name) for log in logs]) for name in "xu")
-    return motion(x, u, rigid=True)
+    return RIGID_BODY_SPACE.features(x, u)

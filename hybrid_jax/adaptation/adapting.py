@@ -19,17 +19,23 @@ from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
-from hybrid_jax.dynamics.base import AbstractVectorField, trainable
-from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, without_disturbance, without_zeros
-from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body, uncorrected
-from hybrid_jax.estimation.least_squares import check_windows
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, state_space, trainable
+from hybrid_jax.dynamics.disturbance import (
+    disturbance_of,
+    disturbance_units,
+    physics_of,
+    without_disturbance,
+    without_zeros,
+)
+from hybrid_jax.dynamics.rigid_body import uncorrected
 from hybrid_jax.estimation.uncertainty import check_level, covariance_of, intervals, named_parameters
-from hybrid_jax.extrapolation import WARN, motion_of, shares_outside
+from hybrid_jax.extrapolation import WARN, features_of, shares_outside
 from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.runtime import FAST_COMPILE, jit_with, load_lapack
+from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.training.objective import Settings
@@ -53,12 +59,6 @@ METHODS: Mapping[str, Method] = {
     "linear_residual": Ridge(ridge.linear_residual),
     "source": Source(),
 }
-
-# Of a rigid body's parameters, and of its disturbance; another class may have a class attribute `units` like this.
-UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
-UNITS |= {"mass": "kg", "centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
-UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s"}
-UNITS |= {f"disturbance[v{axis}]": "m/s²" for axis in "xyz"} | {f"disturbance[w{axis}]": "rad/s²" for axis in "xyz"}
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class Adaptation:
         candidates: of "auto": the error on left-out windows, without unit, by name.
         chosen: of "auto": the name of the candidate that was taken.
         expected: of "auto": errors on a flight that was not seen, by horizon and quantity: value, low, high.
-        rigid: whether the states are those of a rigid body.
+        units: of the quantities in `expected`.
         outside: by quantity the share of samples, 0 to 1, unlike those that the source learned from.
     """
 
@@ -128,7 +128,7 @@ class Adaptation:
     candidates: dict[str, float] = attribute(default_factory=dict)
     chosen: str | None = None
     expected: Expected = attribute(default_factory=dict)
-    rigid: bool = False
+    units: dict[str, str] = attribute(default_factory=dict)
     outside: dict[str, float] = attribute(default_factory=dict)
 
     @property
@@ -153,7 +153,7 @@ class Adaptation:
             lines.append(f"Chosen by the error on left-out windows: {chosen} (others: {others}).")
         if self.expected:
             lines.append("RMSE to expect on a flight not seen (80% intervals, from blocks left out of these windows):")
-            lines += lines_of(self.expected, self.rigid)
+            lines += lines_of(self.expected, self.units)
         for name, share in self.outside.items():
             if share > WARN:
                 lines.append(
@@ -208,13 +208,13 @@ def adapt(
         ValueError: an unknown method, malformed, too few or other windows, or a field that the method cannot adapt.
     """
     name, method = _named(method)
-    check_windows(field, windows)
+    windows = check_windows(field, windows)
     if learned_from is not None:
-        check_windows(field, learned_from, "learned_from")
+        learned_from = check_windows(field, learned_from, "learned_from")
         check_like(learned_from, windows, "learned_from")
     check_level(level)
     train, held_out = _split(windows, validation, getattr(method, "uses_validation", True))
-    check_windows(field, held_out, "validation")
+    held_out = check_windows(field, held_out, "validation")
     check_like(held_out, train, "validation")
     check_dt(held_out, train, "validation")
     settings = Settings(objective=scaled_loss(field, train)) if settings is None else settings
@@ -240,8 +240,8 @@ def adapt(
     adapted = solution.field
     if disturbance_of(field) is None:
         adapted = uncorrected(without_zeros(adapted))  # what windows need
-    rigid = moves_a_rigid_body(field)
-    choice = {} if solution.choice is None else _chosen(solution.choice, train, rigid)
+    space = state_space(field, windows.x0.shape[-1])
+    choice = {} if solution.choice is None else _chosen(solution.choice, train, space)
     status = Status(int(solution.status))
     without = None if exact and choice.get("chosen") not in NETWORKS else NOT_LEAST_SQUARES
     without = NOT_FINITE if status == Status.DIVERGED else without
@@ -257,7 +257,9 @@ def adapt(
         steps=int(solution.steps),
         status=status,
         level=level,
-        outside={} if learned_from is None else shares_outside(*(motion_of(w, rigid) for w in (learned_from, windows))),
+        outside={}
+        if learned_from is None
+        else shares_outside(*(features_of(w, space) for w in (learned_from, windows))),
         **choice,
         **_parameters(adapted, train, settings, level, without, free),
     )
@@ -266,7 +268,7 @@ def adapt(
 _mse = jit_with(FAST_COMPILE)(rollout_mse)
 
 
-def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any]:
+def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[str, Any]:
     """The attributes of `Adaptation` that say what was chosen, and the errors to expect of it."""
     seconds = windows.horizon * windows.dt
     chain = seconds * longest_chain(windows, choice.errors.mse.shape[1])
@@ -274,8 +276,8 @@ def _chosen(choice: Choice, windows: Trajectories, rigid: bool) -> dict[str, Any
     return {
         "candidates": dict(zip(choice.names, geometric_mean(choice.errors.mse).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
-        "expected": expected_errors(ends, (round(seconds, 9), round(chain, 9)), rigid),
-        "rigid": rigid,
+        "expected": expected_errors(ends, (round(seconds, 9), round(chain, 9)), space),
+        "units": {one.name: one.unit for one in space.quantities},
     }
 
 
@@ -318,9 +320,9 @@ def _parameters(
     if not 0 < _size(field) <= NAMED:
         return {"parameters": {}, "without_intervals": NOT_LEAST_SQUARES}
     own = physics_of(without_disturbance(field))
-    known = UNITS if isinstance(own, RigidBody) else getattr(own, "units", {})
+    known = (own.parameter_units if isinstance(own, AbstractVectorField) else {}) | disturbance_units(field)
     values = named_parameters(field)
-    units = {name: known.get(name, known.get(name.split("[")[0])) for name in values}
+    units = {name: known.get(name, known.get(name.split("[")[0])) or None for name in values}
     alone = {name: Parameter(float(value), unit=units[name]) for name, value in values.items()}
     if without is not None:
         return {"parameters": alone, "without_intervals": without}

@@ -15,7 +15,7 @@ from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
-from hybrid_jax.dynamics.rigid_body import corrected, moves_a_rigid_body
+from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
@@ -23,15 +23,11 @@ from hybrid_jax.status import ended
 from hybrid_jax.training.objective import Settings
 from hybrid_jax.trajectories import Trajectories
 
-# What each candidate fits, as groups of parameters.
-OF_A_SYSTEM: Mapping[str, tuple[str, ...]] = {
+# What each candidate fits, as groups of parameters. Those apply of which the field has all groups.
+CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "source": (),
     "theta": ("theta",),
     "disturbance": ("theta", "disturbance"),
-}
-OF_A_RIGID_BODY: Mapping[str, tuple[str, ...]] = {
-    "source": (),
-    "theta": ("theta",),
     "force": ("theta", "force"),
     "drag": ("theta", "drag"),
     "efficiency": ("theta", "efficiency"),
@@ -42,8 +38,9 @@ OF_A_RIGID_BODY: Mapping[str, tuple[str, ...]] = {
     "all": ("theta", "force", "torque", "drag", "efficiency"),
 }
 NETWORKS = ("last_layer", "network")  # candidates that change the network
-# Parameters of a corrected rigid body by the beginning of their names; the others are its own, θ_p.
-GROUPS = {"disturbance[v": "force", "disturbance[w": "torque", "efficiency[": "efficiency", "added_drag[": "drag"}
+# Parameters of a corrected rigid body; the others are its own, θ_p.
+GROUPS = {"efficiency": "efficiency", "added_drag": "drag"}
+GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
@@ -129,15 +126,15 @@ def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """For each candidate, which of the parameters of an extended field it fits (p,)."""
     names = [*named_parameters(field)]
-    if not moves_a_rigid_body(field):
-        group = ["disturbance" if name.startswith("disturbance[") else "theta" for name in names]
-        return {name: np.array([each in fitted for each in group]) for name, fitted in OF_A_SYSTEM.items()}
-    group = [next((g for start, g in GROUPS.items() if name.startswith(start)), "theta") for name in names]
+    steady = {name for name in names if name.startswith("disturbance[")}
+    groups = GROUPS if steady <= GROUPS.keys() else GROUPS | dict.fromkeys(steady, "disturbance")
+    group = [groups.get(name, groups.get(name.split("[")[0], "theta")) for name in names]
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     found = {}
-    for name, fitted in OF_A_RIGID_BODY.items():
-        free = np.array([each in fitted for each in group])
-        found[name] = free & ~lost if "efficiency" in fitted else free
+    for name, fitted in CANDIDATES.items():
+        if set(fitted) <= {*group, "theta"}:
+            free = np.array([each in fitted for each in group])
+            found[name] = free & ~lost if "efficiency" in fitted else free
     return found
 
 

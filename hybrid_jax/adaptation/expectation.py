@@ -6,21 +6,14 @@ import numpy as np
 import scipy  # not scipy.stats, which takes half a second to import
 from jaxtyping import Float
 
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state_space import StateSpace
 
 LEVEL = 0.8
 ALIKE = 2  # so many blocks of one flight count as one: neighbours are alike, and another flight differs more
-# States of a rigid body, the factor from the norm of their error to the quantity, and its unit.
-QUANTITIES = {
-    "position": (POSITION, 1.0, "m"),
-    "velocity": (VELOCITY, 1.0, "m/s"),
-    "rotation": (QUATERNION, 2.0, "rad"),  # of a small angle θ the quaternion differs by θ / 2
-    "body rates": (BODY_RATES, 1.0, "rad/s"),
-}
 Expected = Mapping[str, Mapping[str, tuple[float, float, float]]]  # horizon → quantity → value, low, high
 
 
-def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], rigid: bool) -> Expected:
+def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, float], space: StateSpace) -> Expected:
     """RMSE at the end of a window and of windows that touch, with the 80 % interval for a flight of as many blocks.
 
     The mean over the blocks of another flight is taken to vary as that over these, so that their difference has twice
@@ -30,8 +23,8 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
     Args:
         squares: for each block the mean squared error of each state at the end of a window, and of those that touch.
         seconds: how long these are.
+        space: of these states.
     """
-    groups = QUANTITIES if rigid else {f"x[{i}]": (slice(i, i + 1), 1.0, "") for i in range(squares.shape[-1])}
     blocks = len(squares)
     reach = scipy.special.stdtrit(blocks - 1, (1 + LEVEL) / 2) * np.sqrt(2 * ALIKE / blocks) if blocks > 1 else np.inf
 
@@ -42,17 +35,16 @@ def expected_errors(squares: Float[np.ndarray, "b 2 d"], seconds: tuple[float, f
         return float(rmse), float(rmse * np.exp(-away)), float(rmse * np.exp(away))
 
     return {
-        f"{seconds[horizon]:g} s": {name: around(group, factor, horizon) for name, (group, factor, _) in groups.items()}
+        f"{seconds[horizon]:g} s": {one.name: around(part, one.scale, horizon) for part, one in space.parts}
         for horizon in range(2 if seconds[1] > seconds[0] else 1)
     }
 
 
-def lines_of(expected: Expected, rigid: bool) -> list[str]:
+def lines_of(expected: Expected, units: Mapping[str, str]) -> list[str]:
     """A line for each horizon."""
 
     def text(name: str, value: float, low: float, high: float) -> str:
-        unit = f" {QUANTITIES[name][2]}" if rigid else ""
-        return f"{name} {value:.3g} ({low:.2g} to {high:.2g}){unit}"
+        return f"{name} {value:.3g} ({low:.2g} to {high:.2g}) {units[name]}".rstrip()
 
     return [
         f"  after {horizon}: {', '.join(text(name, *errors) for name, errors in found.items())}"

@@ -7,7 +7,7 @@ root of one that gives the thrust [N] of a rotor: W = √(f / k) with the nomina
 γ is 0 of a vehicle that corrects for its battery, and near 1 of one that does not.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import equinox as eqx
@@ -18,12 +18,14 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual
-from hybrid_jax.dynamics.rigid_body import RigidBody
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.state import STATE_SIZE
+from hybrid_jax.state_space import Quantity
 from hybrid_jax.vehicle import Vehicle, as_tuple, require_numbers
 
 NAMES = ("curve", "time_constant", "time_constants", "voltage_exponent", "delay")  # of learnable parameters
 GIVES = ("speed", "thrust")
+UNITS = {"time_constant": "s", "time_constants": "s", "delay": "s"}
 EXCLUSIVE = {"curve": ("mass", "k", "k_rotors"), "time_constants": ("time_constant",)}
 SLOWEST_SHARE = 1e-3  # of the speed of hover: below, the root of a thrust has no slope
 Numbers = Array | np.ndarray
@@ -106,6 +108,17 @@ class Actuated(AbstractVectorField):
         """How many states follow the 13 of the body."""
         lags = {"time_constant", "time_constants"} & self.deviations.keys() or self.actuator.time_constants[0]
         return self._vehicle.rotors if lags else 0
+
+    @property
+    def state_space(self):
+        if not self.rotor_states:
+            return RIGID_BODY_SPACE
+        speeds = Quantity("rotor speeds", self.rotor_states, "rad/s", tuple(f"w{i}" for i in range(self.rotor_states)))
+        return replace(RIGID_BODY_SPACE, quantities=(*RIGID_BODY_SPACE.quantities, speeds))
+
+    @property
+    def parameter_units(self):
+        return self.body.parameter_units | UNITS | {"curve": "rad/s" if self.actuator.gives == "speed" else "N"}
 
     @property
     def state_size(self) -> int:

@@ -7,6 +7,7 @@ of an `AbstractVectorField`, whose defaults serve code for one sample; a subclas
 
 from abc import abstractmethod
 from collections.abc import Callable, Iterable
+from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
@@ -26,6 +27,8 @@ from hybrid_jax.dynamics.batching import (
     training_mode,
     with_moved_stats,
 )
+from hybrid_jax.state_space import StateSpace
+from hybrid_jax.trajectories import Trajectories, check
 
 Columns = Float[Array, "d c"]  # derivatives of d numbers in c directions
 
@@ -81,6 +84,69 @@ class AbstractVectorField(eqx.Module):
     def fuse_for_inference(self) -> "AbstractVectorField":
         """The same map in inference mode, in a layout that is faster for few samples at a time."""
         return self
+
+    @property
+    def state_space(self) -> StateSpace:
+        """What its state is: by default what the first field inside it says that knows, else nothing."""
+        return _space_inside(self)
+
+    @property
+    def parameter_units(self) -> dict[str, str]:
+        """Units such as "kg m²" of its learned parameters, by name; by default those of the fields inside it."""
+        inside = (part.parameter_units for part in _fields_inside(self))
+        return {name: unit for units in inside for name, unit in units.items()}
+
+
+def _fields_inside(tree) -> list[AbstractVectorField]:
+    """The outermost fields in a tree, which is none of them."""
+
+    def is_inside(node) -> bool:
+        return node is not tree and isinstance(node, AbstractVectorField)
+
+    return [node for node in jax.tree.leaves(tree, is_leaf=is_inside) if is_inside(node)]
+
+
+def _space_inside(tree) -> StateSpace:
+    spaces = (part.state_space for part in _fields_inside(tree))
+    return next((space for space in spaces if space.quantities), StateSpace())
+
+
+def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
+    """What a state is to a field, or to what is no `AbstractVectorField` but has one inside.
+
+    Args:
+        field: any field.
+        d: how many numbers a state has: those of which the field says nothing are quantities of their own.
+    """
+    own = field.state_space if isinstance(field, AbstractVectorField) else _space_inside(field)
+    return own if d is None else own.padded(d)
+
+
+def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> Trajectories:
+    """The windows, where need be with other numbers for the same states, so that none jumps.
+
+    An angle that is given within a turn, or the sign of a quaternion, may jump where the state does not. Traced windows
+    are returned as they are.
+
+    Args:
+        field: it says what a state is.
+        windows: of any system.
+        name: what messages call them.
+
+    Raises:
+        ValueError: malformed windows, or states that are none to the field.
+    """
+    check(windows, name)
+    space = state_space(field, windows.x0.shape[-1])
+    for part, states in (("x0", windows.x0), ("x", windows.x)):
+        space.check(f"{name}: {part}", states)
+    return continuous(field, windows)
+
+
+def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
+    """As `check_windows`, of windows that were checked."""
+    x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
+    return windows if x is windows.x else replace(windows, x=x)
 
 
 def _methods_of(field) -> type[AbstractVectorField]:

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField, AbstractWrapper
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 
 
@@ -26,6 +27,10 @@ class Kinematics(AbstractVectorField):
     """ṗ = v and q̇ = ½ q ⊗ [0, ω], which hold without any knowledge of forces, with v̇ = ω̇ = 0."""
 
     accepts_batch: ClassVar[bool] = True
+
+    @property
+    def state_space(self):
+        return RIGID_BODY_SPACE
 
     def __call__(self, x: Float[Array, " 13 *b"], u: Float[Array, " rotors *b"]) -> Float[Array, " 13 *b"]:
         accelerations = jnp.zeros((6, *x.shape[1:]), x.dtype)

@@ -3,6 +3,7 @@
 Least squares finds it together with θ_p: `fit_least_squares(with_disturbance(hybrid), windows).field`.
 """
 
+from collections.abc import Sequence
 from typing import ClassVar
 
 import equinox as eqx
@@ -12,12 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
-from hybrid_jax.dynamics.grids import Grid
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
-from hybrid_jax.state import STATE_SIZE, VELOCITY
-
-ACCELERATIONS = STATE_SIZE - VELOCITY.start  # v̇ and ω̇ of a rigid body; ṗ and q̇ follow from v and ω exactly
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, state_space
 
 
 class ConstantDisturbance(AbstractVectorField):
@@ -79,8 +75,8 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
 
     Args:
         field: physics, or physics and a residual.
-        indices: the disturbed states; by default v̇ and ω̇ of a rigid body, each component of physics on a `Grid` (one
-            number for all points), and every state of another system.
+        indices: the disturbed states; by default those that the state space of the physics says, such as v̇ and ω̇ of
+            a rigid body, or each component of physics on a `Grid` (one number for all points).
 
     Raises:
         ValueError: the field has a disturbance of other states that is not zero.
@@ -93,15 +89,16 @@ def with_disturbance(field: AbstractVectorField, indices: tuple[int, ...] | None
         field = without_disturbance(field)
     physics = physics_of(field)
     dtypes = (leaf.dtype for leaf in jax.tree.leaves(eqx.filter(physics, eqx.is_inexact_array)))
-    if indices is None and getattr(physics, "rotor_states", 0):
-        indices = tuple(range(VELOCITY.start, STATE_SIZE))
-    dtype = jnp.result_type(*dtypes, jnp.float32)
-    if indices is None and isinstance(grid := getattr(physics, "grid", None), Grid):
-        even = ConstantDisturbance(jnp.zeros(grid.components, dtype), points=grid.points)
-        return with_physics(field, Hybrid(physics, even))
-    shape = (ACCELERATIONS,) if moves_a_rigid_body(physics) else ()
-    zero = jnp.zeros(shape if indices is None else (len(indices),), dtype)
-    return with_physics(field, disturbed(physics, zero, indices))
+    space, shape, points = state_space(physics), (), 1
+    if indices is not None:
+        shape = (len(indices),)
+    elif space.disturbed is not None:
+        own = range(space.size)[space.disturbed]
+        shape, indices = (len(own),), None if own.stop == space.size else tuple(own)
+    elif (sizes := {one.size for one in space.quantities if one.uniform}) and len(sizes) == 1:
+        shape, points = (len(space.quantities),), sizes.pop()
+    zero = ConstantDisturbance(jnp.zeros(shape, jnp.result_type(*dtypes, jnp.float32)), indices, points)
+    return with_physics(field, Hybrid(physics, zero))
 
 
 def without_disturbance(field: AbstractVectorField) -> AbstractVectorField:
@@ -136,14 +133,37 @@ def disturbance_of(field: AbstractVectorField) -> ConstantDisturbance | None:
     return physics.residual if isinstance(physics, Hybrid) else None  # pyright: ignore[reportReturnType]
 
 
+def disturbance_units(field: AbstractVectorField) -> dict[str, str]:
+    """A name for each number of the field's disturbance, disturbance[vx] or disturbance[0], and its unit, or ""."""
+    if (found := disturbance_of(field)) is None:
+        return {}
+    space = state_space(field)
+    if found.points > 1 or not space.size:
+        return {f"disturbance[{i}]": "" for i in _indices(field, found)}
+    return {f"disturbance[{space.names[i]}]": _per_second(space.units[i]) for i in _indices(field, found)}
+
+
+def _indices(field: AbstractVectorField, found: ConstantDisturbance) -> Sequence[int]:
+    """Of the disturbed states; of a grid, of the disturbed components."""
+    if found.indices is not None:
+        return found.indices
+    k = jnp.size(found.value)
+    return range(k) if found.points > 1 else range(max(state_space(field).size, k))[-k:]
+
+
+def _per_second(unit: str) -> str:
+    return f"{unit}²" if unit.endswith("/s") else f"{unit}/s" if unit else ""
+
+
 def without_zeros(field: AbstractVectorField) -> AbstractVectorField:
     """The field with a constant disturbance of those states alone where it is not zero; outside of compiled code."""
     found = disturbance_of(field)
     if found is None or np.asarray(found.value).all():
         return field
-    size = np.shape(found.value)[0]
     kept = np.flatnonzero(found.value)
     if not len(kept):
         return without_disturbance(field)
-    indices = found.indices or tuple(range(STATE_SIZE - size, STATE_SIZE))
-    return eqx.tree_at(disturbance_of, field, ConstantDisturbance(found.value[kept], tuple(indices[i] for i in kept)))
+    if found.points > 1:
+        return field
+    indices = np.asarray(_indices(field, found))[kept].tolist()
+    return eqx.tree_at(disturbance_of, field, ConstantDisturbance(found.value[kept], tuple(indices)))

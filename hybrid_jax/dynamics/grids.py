@@ -16,6 +16,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.state_space import Quantity, StateSpace
 from hybrid_jax.trajectories import Trajectories, check
 
 REAL_AXIS = 2.785  # RK4 is stable for z = λ dt from −2.785 to 0 (Hairer and Wanner, Solving ODEs II, Sec. IV.2)
@@ -59,6 +60,12 @@ class Grid:
     def size(self) -> int:
         """d, the numbers in a state."""
         return self.components * self.points
+
+    @property
+    def state_space(self) -> StateSpace:
+        """One quantity for each component."""
+        components = (Quantity(f"component {i}", self.points, uniform=True) for i in range(self.components))
+        return StateSpace(tuple(components))
 
     @property
     def axes(self) -> range:
@@ -192,6 +199,10 @@ class Diffusion(AbstractVectorField):
     def __call__(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> Float[Array, " d *b"]:
         spread = self.grid.laplacian(self.grid.fields(x))
         return (jnp.exp(self.log_diffusivity).reshape(-1, *(1,) * (spread.ndim - 1)) * spread).reshape(x.shape)
+
+    @property
+    def state_space(self):
+        return self.grid.state_space
 
     def linearize(self, x, u, dx, du):
         return self(x, u), self(dx, u)  # it is linear

@@ -6,11 +6,10 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 STATES = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
 MEASURED = (*STATES, "body_velocity", "specific_force", "rotor_speed")
-TANGENT = STATE_SIZE - 1  # numbers of a small change of the body's state: p, rotation vector, v, ω
 
 
 def measure(
@@ -31,15 +30,5 @@ def measure(
 
 def difference(quantity: str, y: Float[Array | np.ndarray, " k"], predicted: Float[Array, " k"]) -> Float[Array, " e"]:
     """y less what was predicted; of attitudes the rotation vector between them in the body [rad] (3)."""
-    if quantity != "attitude":
-        return jnp.asarray(y) - predicted
-    w, *vector = rotation.multiply(rotation.conjugate(predicted), jnp.asarray(y))
-    return 2 * jnp.where(w < 0, -1.0, 1.0) * jnp.stack(vector)
-
-
-def moved(x: Float[Array, "13"], change: Float[Array, "12"]) -> Float[Array, "13"]:
-    """The state after a small change: of position, a rotation vector in the body [rad], velocity and body rates."""
-    half = change[3:6] / 2
-    turn = rotation.normalise(jnp.concatenate([jnp.ones(1, half.dtype), half]))
-    parts = x[POSITION] + change[:3], rotation.multiply(x[QUATERNION], turn), x[VELOCITY.start :] + change[6:]
-    return jnp.concatenate(parts)
+    y = jnp.asarray(y)
+    return rotation.attitude_error(predicted, y) if quantity == "attitude" else y - predicted

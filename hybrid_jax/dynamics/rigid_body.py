@@ -1,5 +1,6 @@
 """f_p: the Newton–Euler equations of a multirotor, by default with unknown Ix, Iy and k (paper, Eq. 10)."""
 
+from dataclasses import dataclass
 from typing import ClassVar
 
 import equinox as eqx
@@ -14,11 +15,36 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import expand_trailing
 from hybrid_jax.dynamics.terms import CORRECTIONS, LOGARITHMIC, Terms, check_names, nominal_values, shape_of, units_of
 from hybrid_jax.rotation import Rows
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, STATE_SIZE, VELOCITY
+from hybrid_jax.state_space import Attitude, Quantity, StateSpace
 from hybrid_jax.vehicle import Vehicle
 
 LEARNED = ("Ix", "Iy", "k")
+UNITS = {"Ix": "kg m²", "Iy": "kg m²", "Iz": "kg m²", "k": "N s²", "k_rotors": "N s²", "torque_coefficient": "N m s²"}
+UNITS |= {"mass": "kg", "centre_of_mass": "m", "drag": "N s/m", "cable_pull": "1/m", "aerodynamic_moment": "N s"}
+UNITS |= {"added_drag": "1/s", "rate_damping": "N m s", "velocity_lag": "s"}
 INERTIAS = {"mass": VELOCITY, "Ix": BODY_RATES.start, "Iy": BODY_RATES.start + 1, "Iz": BODY_RATES.start + 2}
+
+
+@dataclass(frozen=True)
+class RigidBodySpace(StateSpace):
+    """That of state.py: position, attitude, velocity and body rates; see `RIGID_BODY_SPACE`."""
+
+    def features(self, x, u):
+        lengths = {"speed [m/s]": x[:, VELOCITY], "body rates [rad/s]": x[:, BODY_RATES]}
+        norms = {name: np.linalg.norm(each, axis=1) for name, each in lengths.items()}
+        return norms | {"rotor speed [rad/s]": u.ravel(), "tilt [rad]": rotation.tilt(x[:, QUATERNION])}
+
+
+RIGID_BODY_SPACE = RigidBodySpace(
+    (
+        Quantity("position", 3, "m", STATE_NAMES[POSITION]),
+        Attitude("attitude", labels=STATE_NAMES[QUATERNION]),
+        Quantity("velocity", 3, "m/s", STATE_NAMES[VELOCITY]),
+        Quantity("body rates", 3, "rad/s", STATE_NAMES[BODY_RATES]),
+    ),
+    disturbed=slice(VELOCITY.start, STATE_SIZE),  # ṗ and q̇ follow from v and ω exactly
+)
 
 
 class RigidBody(AbstractVectorField):
@@ -69,6 +95,14 @@ class RigidBody(AbstractVectorField):
         checks.instance("terms", self.terms, Terms)
         checks.instance("deviations", self.deviations, dict)
         check_names(tuple(name for name in self.deviations if name not in CORRECTIONS))
+
+    @property
+    def state_space(self):
+        return RIGID_BODY_SPACE
+
+    @property
+    def parameter_units(self):
+        return UNITS
 
     def theta(self) -> dict[str, Float[Array, "..."]]:
         """The learned parameters in SI units, by name; see `Vehicle` and `Terms`."""
@@ -182,40 +216,29 @@ def corrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field with corrections of its rigid bodies that change nothing yet; itself if it has none, or has them."""
 
     def larger(node):
-        if not is_body(node) or node.deviations.keys() & CORRECTIONS:
+        if not _is_body(node) or node.deviations.keys() & CORRECTIONS:
             return node
         dtype = jnp.result_type(*jax.tree.leaves(node) or [float])
         zero = {name: jnp.zeros(shape_of(node.vehicle, name), dtype) for name in CORRECTIONS}
         return RigidBody(node.deviations | zero, node.vehicle, node.terms, node.wrench)
 
-    return jax.tree.map(larger, field, is_leaf=is_body)
+    return jax.tree.map(larger, field, is_leaf=_is_body)
 
 
 def uncorrected(field: AbstractVectorField) -> AbstractVectorField:
     """The field without corrections of rigid bodies that are zero; outside of compiled code."""
 
     def smaller(node):
-        if not is_body(node) or any(np.any(node.deviations.get(name, 0)) for name in CORRECTIONS):
+        if not _is_body(node) or any(np.any(node.deviations.get(name, 0)) for name in CORRECTIONS):
             return node
         kept = {name: value for name, value in node.deviations.items() if name not in CORRECTIONS}
         return RigidBody(kept, node.vehicle, node.terms, node.wrench)
 
-    return jax.tree.map(smaller, field, is_leaf=is_body)
+    return jax.tree.map(smaller, field, is_leaf=_is_body)
 
 
-def is_body(node) -> bool:
+def _is_body(node) -> bool:
     return isinstance(node, RigidBody)
-
-
-def moves_a_rigid_body(field) -> bool:
-    """Whether a field contains a rigid body, so that its state is that of state.py."""
-    return any(map(is_body, jax.tree.leaves(field, is_leaf=is_body)))
-
-
-def check_start(field, x0: Float[Array | np.ndarray, "*n 13"]) -> None:
-    """Raise ValueError if an initial state of a rigid body holds no unit quaternion; accept states of other fields."""
-    if x0.shape[-1:] == (STATE_SIZE,) and moves_a_rigid_body(field):
-        checks.unit_quaternions("x0", x0)
 
 
 def nominal(vehicle: Vehicle) -> dict[str, float]:

@@ -14,13 +14,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_learned
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, minimise, move_of_rows
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.status import Status
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes
+from hybrid_jax.trajectories import Trajectories
 
 LEAST = 0.1  # of what rounding does to the states: a step of which less is expected is the last
 
@@ -73,16 +72,9 @@ def fit_least_squares(
     Raises:
         ValueError: the physics has no parameter, or windows that are malformed or not of this field.
     """
-    check_windows(field, windows)
+    windows = check_windows(field, windows)
     checks.count("max_steps", max_steps)
     return fit_free(sized(field, windows.x0.shape[-1]), windows, solver, max_steps, scale)
-
-
-def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> None:
-    """Refuse malformed windows, and those of a rigid body without unit quaternions."""
-    check(windows, name)
-    if moves_a_rigid_body(field):
-        check_attitudes(windows, name)
 
 
 def check_determined(field: AbstractVectorField, n: int, fitted: int | None = None) -> None:

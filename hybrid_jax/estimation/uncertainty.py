@@ -19,11 +19,11 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import (
     disturbance_of,
+    disturbance_units,
     physics_of,
     sized,
     with_disturbance,
 )
-from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation import least_squares
 from hybrid_jax.estimation.least_squares import LeastSquaresFit, Scale, Solver, fit_free, ravel_parameters
 from hybrid_jax.estimation.normal_equations import (
@@ -37,7 +37,6 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     normal_equations,
 )
-from hybrid_jax.state import STATE_NAMES
 from hybrid_jax.trajectories import Trajectories
 
 Kind = Literal["sandwich", "homoscedastic"]
@@ -95,7 +94,7 @@ def covariance_of(
     Raises:
         ValueError: malformed windows, or no more than parameters; an unknown kind, or homoscedastic with an `error`.
     """
-    least_squares.check_windows(field, windows)
+    windows = least_squares.check_windows(field, windows)
     fitted = ravel_parameters(field)[0].size if free is None else jnp.sum(free)
     if not checks.is_traced(fitted):
         least_squares.check_determined(field, len(windows), int(fitted))
@@ -190,15 +189,12 @@ def named_parameters(field: AbstractVectorField) -> dict[str, Float[Array, ""]]:
     Where the class has a method `theta() -> dict[str, Array]`, such as `RigidBody`, that gives names and values in
     physical units; each entry must be a monotonic function of one parameter. Otherwise names are those of the fields of
     the class. Entries of arrays are k_rotors[0], aerodynamic_moment[0,2], …; those of a constant disturbance have the
-    names of a rigid body's states, or indices: disturbance[vx], disturbance[0].
+    names that the state space gives to states, or their places: disturbance[vx], disturbance[0].
     """
     physics, disturbance = physics_of(field), disturbance_of(field)
     if isinstance(physics, Hybrid) and disturbance is not None:
-        found, values = named_parameters(physics.physics), jnp.atleast_1d(disturbance.value)
-        labels = disturbance.indices or range(len(values))
-        if isinstance(physics.physics, RigidBody):
-            labels = [STATE_NAMES[i] for i in disturbance.indices or range(-len(values), 0)]
-        return found | {f"disturbance[{label}]": value for label, value in zip(labels, values, strict=True)}
+        names, values = disturbance_units(physics), jnp.atleast_1d(disturbance.value)
+        return named_parameters(physics.physics) | dict(zip(names, values, strict=True))
     leaves = jax.tree_util.tree_leaves_with_path(eqx.filter(physics, trainable(physics)))
     values = {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
     if (theta := getattr(type(physics), "theta", None)) is not None:
@@ -257,7 +253,7 @@ def select_disturbance(
     own = parameters.size - disturbance_of(larger).value.size  # pyright: ignore[reportOptionalMemberAccess]
     none = eqx.tree_at(disturbance_of, larger, replace_fn=partial(jax.tree.map, jnp.zeros_like))
     # Both are fits of the larger field, so that one program serves them.
-    least_squares.check_windows(field, windows)
+    windows = least_squares.check_windows(field, windows)
     checks.count("max_steps", max_steps)
     every = np.ones(parameters.size, bool), np.arange(parameters.size) < own
     options = windows, solver, max_steps, scale

@@ -23,7 +23,6 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.dynamics.measurement import TANGENT
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
@@ -31,7 +30,14 @@ from hybrid_jax.estimation.normal_equations import NormalEquations, masked
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
-from hybrid_jax.identification.prediction_error import Problem, all_errors, normal_equations, rms, slopes_between
+from hybrid_jax.identification.prediction_error import (
+    TANGENT,
+    Problem,
+    all_errors,
+    normal_equations,
+    rms,
+    slopes_between,
+)
 from hybrid_jax.identification.recordings import Layout, Windows, cut
 from hybrid_jax.status import Status
 

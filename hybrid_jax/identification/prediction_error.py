@@ -16,7 +16,8 @@ from hybrid_jax.chunks import in_chunks
 from hybrid_jax.dynamics.actuators import Actuated, held_means
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.dynamics.measurement import TANGENT, difference, measure, moved
+from hybrid_jax.dynamics.measurement import difference, measure
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.identification import slow_commands
@@ -26,6 +27,7 @@ from hybrid_jax.matrices import solve
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 CHUNK = 64  # windows at a time
+TANGENT = RIGID_BODY_SPACE.tangent_size
 
 
 class Problem(NamedTuple):
@@ -61,7 +63,7 @@ def errors_of(
     """
     _, unravel = ravel_parameters(field)
     field, ahead = unravel(theta), layout.ahead
-    physics, x = physics_of(field), moved(jnp.asarray(window.start), change[:TANGENT])
+    physics, x = physics_of(field), RIGID_BODY_SPACE.retract(jnp.asarray(window.start), change[:TANGENT])
     delay = physics.delay if isinstance(physics, Actuated) else 0.0
     u = held_means(inputs.t, inputs.values, window.edges, delay)
     if strayed is not None:

@@ -10,7 +10,8 @@ import scipy
 from jaxtyping import Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.measurement import MEASURED, TANGENT
+from hybrid_jax.dynamics.measurement import MEASURED
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.flights.checks.airborne import airborne
 from hybrid_jax.flights.recording import AXES, Recording, Signal
 from hybrid_jax.identification import slow_commands
@@ -208,7 +209,7 @@ def initial_states(
     and heading are exact by choice of the origin. With `initial="sample"` the last sample stands, taken as exact.
     """
     n, signals = len(starts), recording.signals
-    x, spread = np.zeros((n, STATE_SIZE)), np.zeros((n, TANGENT))
+    x, spread = np.zeros((n, STATE_SIZE)), np.zeros((n, RIGID_BODY_SPACE.tangent_size))
     x[:, QUATERNION.start] = 1
     spread[:, 3:5], spread[:, 6:9], spread[:, 9:] = UNKNOWN["tilt"], UNKNOWN["velocity"], UNKNOWN["rates"]
     if "position" in signals:

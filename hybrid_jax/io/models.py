@@ -14,8 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.rigid_body import check_start
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import checked, rollout, rollout_batch
 from hybrid_jax.io.archive import Arrays, load_archive, named_leaves, save_archive, to_numpy, with_leaves
 from hybrid_jax.io.structure import Structure, decode, static_values
@@ -56,7 +55,7 @@ class Model:
             raise ValueError(f"the model is a {name}, which needs more than x0 and u; use the methods of its `field`")
         x0, u = (checks.floating(name, value).astype(float) for name, value in (("x0", x0), ("u", u)))
         checked(self.field, x0, u, dt, None, windows=x0.ndim == 2)
-        check_start(self.field, x0)
+        state_space(self.field, x0.shape[-1]).check("x0", x0)
         predicted = (rollout if x0.ndim == 1 else rollout_batch)(self.field, x0, u, dt)
         diverged = ~np.isfinite(predicted).all(axis=-1)
         if diverged.any():

@@ -22,10 +22,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import disturbance_of, physics_of, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable
@@ -34,11 +33,10 @@ from hybrid_jax.online.change_test import ChangeTest
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
 from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
 from hybrid_jax.online.multiple_model import Verdict
-from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify, nearer
+from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, named_priors
 from hybrid_jax.online.tuning import Tuning
-from hybrid_jax.rotation import normalise
-from hybrid_jax.state import QUATERNION
+from hybrid_jax.state_space import StateSpace
 
 FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
 Judged = tuple[ChangeTest, Bool[Array, ""], Verdict]
@@ -63,7 +61,7 @@ class OnlineAdaptation(AbstractEstimator):
             a rigid body: logarithms), one number for all or by name: of one entry, efficiency[0], or of all of an
             array, efficiency. Zero holds a parameter.
         disturbance: standard deviation of the constant part of ẋ at each disturbed state; 0 for none.
-        indices: of the disturbed states; by default those that the field has, or v̇ and ω̇ of a rigid body.
+        indices: of the disturbed states; by default those that the field has, or that its state space says.
         process: standard deviation of what the model leaves out of ẋ, as white noise, of each state [1/√s].
         initial: share of the prior that is uncertain at the start, before a change.
         hypotheses: of which one may hold at a time, each on a change of a few parameters, found by how well it
@@ -110,9 +108,9 @@ class OnlineAdaptation(AbstractEstimator):
         checks.instance("tuning", self.tuning, Tuning)
         indices = None if indices is None else checks.places("indices", indices)
         if np.any(disturbance):
-            known = disturbance_of(field) is not None or moves_a_rigid_body(physics_of(field))
+            known = disturbance_of(field) is not None or state_space(physics_of(field)).disturbed is not None
             if indices is None and not known:
-                raise ValueError("indices must say which states are disturbed, as the system is no rigid body")
+                raise ValueError("indices must say which states are disturbed, as the field's state space does not")
             field = with_disturbance(field, indices)
         self.field, self.dt, self.initial = field, float(dt), float(initial)
         self.noise, self.process = (tuple(np.ravel(numbers).tolist()) for numbers in (noise, process))
@@ -164,7 +162,7 @@ class OnlineAdaptation(AbstractEstimator):
         x, u = jnp.asarray(x, state.x.dtype), jnp.asarray(u, state.x.dtype)
         if x.shape != state.x.shape:
             raise ValueError(f"x must be one sample {state.x.shape}, as the state is, got shape {x.shape}")
-        x = nearer(x, state.x) if moves_a_rigid_body(self.field) else x
+        x = self._space(x).nearest(x, state.x)
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)
         belief, free = self._predicted(state, model, sample)
@@ -222,8 +220,8 @@ class OnlineAdaptation(AbstractEstimator):
     def _variances(self, x) -> Float[Array, " d"]:
         return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
 
-    def _unit(self, x):
-        return x.at[QUATERNION].set(normalise(x[QUATERNION])) if moves_a_rigid_body(self.field) else x
+    def _space(self, x) -> StateSpace:
+        return state_space(self.field, len(x))
 
     def _rates(self, u):
         """ẋ as a function of x and θ."""
@@ -238,7 +236,8 @@ class OnlineAdaptation(AbstractEstimator):
     def _filter_model(self, sample: Sample, each: Each) -> FilterModel:
         x = sample.x
         added = self.dt * jnp.broadcast_to(jnp.square(jnp.asarray(self.process, x.dtype)), x.shape)
-        return FilterModel(self._rates(sample.u), self._unit, self._variances(x), added, self.dt, self.tuning, each)
+        rates, unit = self._rates(sample.u), self._space(x).normalise
+        return FilterModel(rates, unit, self._variances(x), added, self.dt, self.tuning, each)
 
     def _predicted(self, state: OnlineState, model: FilterModel, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
         """The filter of all parameters before the sample, and the variances without data."""

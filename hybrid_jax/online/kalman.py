@@ -31,7 +31,7 @@ class FilterModel(NamedTuple):
 
     Attributes:
         field: ẋ as a function of x and θ, under the input of the period.
-        unit: makes of x one with a unit quaternion.
+        unit: the state x as it is usually given, such as with a unit quaternion; see `StateSpace.normalise`.
         variances: of a sample.
         process_noise: variance that a period adds to x.
         dt: length of a period [s].

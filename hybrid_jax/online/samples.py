@@ -5,8 +5,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from hybrid_jax.state import QUATERNION
-
 HUGE = 1e15  # a number beyond it, or NaN, was not measured
 
 
@@ -70,9 +68,3 @@ def classify(x, u, elapsed, history: SampleHistory, dt: float, gap: float) -> tu
     last, unseen = jnp.where(jnp.abs(x) < HUGE, x, history.last), jnp.where(seen, 0.0, 1.0)
     sample = Sample(x, held, seen, acted, restart, jnp.asarray(elapsed, x.dtype))
     return sample, SampleHistory(last, equal, silent, unseen)
-
-
-def nearer(x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:
-    """x of a rigid body with the sign of its quaternion that is nearer."""
-    other = jnp.sum(x[QUATERNION] * to[QUATERNION]) < 0
-    return x.at[QUATERNION].set(jnp.where(other, -x[QUATERNION], x[QUATERNION]))

@@ -19,9 +19,9 @@ import optax
 from jaxtyping import Array, Bool, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.dynamics.disturbance import sized
-from hybrid_jax.dynamics.rigid_body import RigidBody
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.estimation.least_squares import ravel_parameters, rounding
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.planning.fisher_information import Information, information_of, told_apart
@@ -217,7 +217,7 @@ def _design(model, bounds, seconds: float, window: float, dt: float, bandwidth: 
         raise ValueError(f"bounds must be FlightBounds or InputBounds, got {checks.short_repr(bounds)}")
     parts = jax.tree.leaves(model, is_leaf=lambda node: isinstance(node, RigidBody))
     bodies = [part for part in parts if isinstance(part, RigidBody)]
-    if not bodies or any(getattr(part, "rotor_states", 0) for part in (model, *bodies)):
+    if not bodies or state_space(model) != RIGID_BODY_SPACE:
         raise ValueError("bounds must be InputBounds, as the model is no multirotor that is told its rotor speeds")
     vehicle = bodies[0].vehicle
     least, most = bounds.rotor_speed

@@ -12,17 +12,12 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.dynamics.disturbance import physics_of
-from hybrid_jax.dynamics.grids import Grid
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
 from hybrid_jax.integrate import rollout_batch
 from hybrid_jax.metrics import mean_over
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.training.objective import Settings, TrajectoryLoss
 from hybrid_jax.trajectories import Trajectories, check
 
-MULTIROTOR = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body rates": BODY_RATES}
 FLOOR = 1e-3  # least scale of a state over its size: one that hardly changes must not outweigh the others
 
 
@@ -118,13 +113,13 @@ def channels_from(
     Args:
         baseline: the field whose errors are the scales.
         windows: of the data that the field will be trained on.
-        parts: entries of each channel; by default those of state.py for a state of 13, otherwise each is a channel.
+        parts: entries of each channel; by default the quantities of the baseline's state space.
 
     Raises:
         ValueError: malformed windows, or a channel in which the baseline makes no error.
     """
     size = check(windows, "windows").x.shape[-1]
-    parts = _parts(size, size == STATE_SIZE) if parts is None else parts
+    parts = {one.name: part for part, one in state_space(baseline, size).parts} if parts is None else parts
     predicted = rollout_batch(baseline, windows.x0, windows.u, windows.dt)
     difference = np.asarray(predicted[:, -1], float) - np.asarray(windows.x[:, -1], float)
     scales = {name: _rms(difference[:, part]) for name, part in parts.items()}
@@ -135,18 +130,11 @@ def channels_from(
 
 
 def scaled_loss(field: AbstractVectorField, windows: Trajectories) -> ChannelLoss:
-    """A loss relative to the RMS change over a window of each state, each vector in the state of a rigid body, or each
-    component of physics on a `Grid`."""
-    parts = _parts(windows.x0.shape[-1], moves_a_rigid_body(field), getattr(physics_of(field), "grid", None)).values()
+    """A loss relative to the RMS change over a window of each quantity in the field's state space."""
+    parts = [part for part, _ in state_space(field, windows.x0.shape[-1]).parts]
     x0, end = np.asarray(windows.x0, float), np.asarray(windows.x[:, -1], float)
     scales = [max(_rms(end[:, part] - x0[:, part]), FLOOR * _rms(end[:, part])) or 1.0 for part in parts]
     return ChannelLoss(tuple(Channel(part.start, part.stop, s) for part, s in zip(parts, scales, strict=True)))
-
-
-def _parts(size: int, of_multirotor: bool, grid: Grid | None = None) -> Mapping[str, slice]:
-    if grid is not None and grid.size == size:
-        return {f"component {i}": slice(i * grid.points, (i + 1) * grid.points) for i in range(grid.components)}
-    return MULTIROTOR if of_multirotor else {f"x[{i}]": slice(i, i + 1) for i in range(size)}
 
 
 def _rms(vectors: Float[np.ndarray, "n k"]) -> float:

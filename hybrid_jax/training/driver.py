@@ -15,8 +15,7 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, trainable
-from hybrid_jax.dynamics.rigid_body import moves_a_rigid_body
+from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, check_windows, trainable
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
@@ -25,7 +24,7 @@ from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
 from hybrid_jax.training.objective import Learner, Settings, TrajectoryLoss, check_minibatch, compiler_options
-from hybrid_jax.trajectories import Trajectories, check, check_attitudes, check_dt
+from hybrid_jax.trajectories import Trajectories, check, check_dt
 
 WEIGHT = 1e-3  # λ, where none is given
 RATE = 1e-2
@@ -143,9 +142,10 @@ def checked_arguments(
     if settings is None:
         settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
     checks.instance("settings", settings, Settings)
-    data = settings.objective.prepare(train, "train")
-    validated_on = settings.objective.prepare(validation, "validation")
-    _check_field(field, {"train": train, "validation": validation}, settings)
+    windows = {"train": train, "validation": validation}
+    windows = {n: check_windows(field, w, n) if isinstance(w, Trajectories) else w for n, w in windows.items()}
+    data, validated_on = (settings.objective.prepare(w, name) for name, w in windows.items())
+    _check_field(field, windows, settings)
     checks.key("key", key)
     check_minibatch(field, settings)
     if len(data) < settings.batch_size:
@@ -181,8 +181,6 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
                 raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
             check_dt(windows, data["train"], name)
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
-        if moves_a_rigid_body(field):
-            check_attitudes(windows, name)
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:

@@ -15,7 +15,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, continuous, trainable
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
@@ -108,7 +108,7 @@ def fit_gauss_newton(
         ValueError: malformed windows or others than the field's; no parameters, or too many; an unknown penalty, or
             one of a field that is no `Hybrid`; a weight that is negative.
     """
-    check(windows, "windows")
+    windows = continuous(field, check(windows, "windows"))
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)

@@ -14,7 +14,7 @@ from pushes import Push, pushes
 import hybrid_jax as hj
 from hybrid_jax.adaptation import Auto, FineTune, adapt
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, weights_of, with_change
-from hybrid_jax.adaptation.auto import OF_A_RIGID_BODY, extended, free_parameters
+from hybrid_jax.adaptation.auto import CANDIDATES, extended, free_parameters
 from hybrid_jax.adaptation.selection import blocks_of, correlated, fit_candidates, predict_block, simplest
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.estimation.least_squares import fit_free, fit_least_squares, ravel_parameters
@@ -196,7 +196,7 @@ def test_a_step_of_the_last_layer_leaves_the_others():
 def test_candidates_of_a_rigid_body_fit_what_their_names_say():
     field = extended(hj.rigid_body(hj.IRIS), 13)
     names, free = [*named_parameters(field)], free_parameters(field)
-    assert [*free] == [*OF_A_RIGID_BODY]
+    assert [*free] == [name for name in CANDIDATES if name != "disturbance"]
     assert len(names) == ravel_parameters(field)[0].size == 3 + 4 + 3 + 6
 
     def fitted(name):

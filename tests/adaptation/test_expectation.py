@@ -11,7 +11,11 @@ from test_auto import flown, hybrid
 import hybrid_jax as hj
 from hybrid_jax.adaptation.expectation import expected_errors, lines_of
 from hybrid_jax.adaptation.selection import longest_chain, predict_block
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.rotation import from_axis_angle
+from hybrid_jax.state_space import StateSpace
+
+LINE = StateSpace().padded(1)
 
 
 def test_the_interval_holds_another_flight_s_error_in_four_of_five_cases():
@@ -20,14 +24,14 @@ def test_the_interval_holds_another_flight_s_error_in_four_of_five_cases():
     flights = rng.gamma(2.0, size=(1000, 2, 10, 1, 1)) * np.exp(0.25 * rng.normal(size=(1000, 2, 1, 1, 1)))
     held = []
     for seen, other in flights:
-        ((_, low, high),) = expected_errors(np.broadcast_to(seen, (10, 2, 1)), (0.1, 0.1), False)["0.1 s"].values()
+        ((_, low, high),) = expected_errors(np.broadcast_to(seen, (10, 2, 1)), (0.1, 0.1), LINE)["0.1 s"].values()
         held.append(low <= np.sqrt(other.mean()) <= high)
     assert 0.7 <= np.mean(held) <= 0.9
 
 
 def test_the_value_is_the_rmse_over_all_blocks():
     squares = np.random.default_rng(0).gamma(2.0, size=(7, 2, 3))
-    found = expected_errors(squares, (0.1, 1.0), False)
+    found = expected_errors(squares, (0.1, 1.0), StateSpace().padded(3))
     assert [*found] == ["0.1 s", "1 s"]
     for horizon, errors in enumerate(found.values()):
         for i, (value, low, high) in enumerate(errors.values()):
@@ -39,13 +43,13 @@ def test_a_small_rotation_is_given_in_radians():
     turned = from_axis_angle(jnp.array([0.0, 0.6, 0.8]), jnp.asarray(0.02)) - jnp.array([1.0, 0, 0, 0])
     squares = np.zeros((2, 2, 13))
     squares[..., 3:7] = np.square(turned)
-    found = expected_errors(squares, (0.1, 0.1), True)
-    assert found["0.1 s"]["rotation"][0] == pytest.approx(0.02, rel=1e-3)
-    assert "rotation 0.02 (0.02 to 0.02) rad" in lines_of(found, True)[0]
+    found = expected_errors(squares, (0.1, 0.1), RIGID_BODY_SPACE)
+    assert found["0.1 s"]["attitude"][0] == pytest.approx(0.02, rel=1e-3)
+    assert "attitude 0.02 (0.02 to 0.02) rad" in lines_of(found, dict.fromkeys(found["0.1 s"], "rad"))[0]
 
 
 def test_one_block_bounds_nothing():
-    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), False)["0.1 s"].values()
+    ((value, low, high),) = expected_errors(np.ones((1, 2, 1)), (0.1, 0.1), LINE)["0.1 s"].values()
     assert (value, low, high) == (1.0, 0.0, np.inf)
 
 

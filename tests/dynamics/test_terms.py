@@ -11,10 +11,10 @@ from jax.flatten_util import ravel_pytree
 from matrices import newton_euler
 
 from hybrid_jax import Hybrid, load, rotation, save
-from hybrid_jax.dynamics.base import Frozen, infer_batch, train_batch, trainable
+from hybrid_jax.dynamics.base import Frozen, infer_batch, state_space, train_batch, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import disturbed
-from hybrid_jax.dynamics.rigid_body import RigidBody, moves_a_rigid_body, rigid_body, with_vehicle
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body, with_vehicle
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.integrate import rollout_batch
@@ -220,7 +220,7 @@ def test_it_survives_a_file_and_its_states_are_checked(tmp_path):
     save(tmp_path / "model.npz", field)
     assert eqx.tree_equal(load(tmp_path / "model.npz").field, field)
     assert sum(jax.tree.leaves(trainable(field.physics))) == len(ALL)
-    assert moves_a_rigid_body(field.physics)
+    assert state_space(field) is RIGID_BODY_SPACE
 
 
 def test_single_precision_stays_single():

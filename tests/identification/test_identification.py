@@ -12,7 +12,8 @@ from surface import refusal
 
 import hybrid_jax as hj
 from hybrid_jax.dynamics.actuators import Actuator, actuated
-from hybrid_jax.dynamics.measurement import difference, measure, moved
+from hybrid_jax.dynamics.measurement import difference, measure
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.fitting import identify, identify_in_turn, prediction_errors
 from hybrid_jax.identification.recordings import Layout, initial_states, on_grid
@@ -154,7 +155,7 @@ def test_the_accelerometer_feels_thrust_and_no_gravity_and_changes_of_attitude_a
     force = measure("specific_force", field, x, jnp.full(4, IRIS.hover_speed))
     np.testing.assert_allclose(force, [0, 0, 9.81], atol=1e-4)
     np.testing.assert_allclose(measure("specific_force", field, x, jnp.zeros(4)), 0, atol=1e-5)
-    turned = moved(x, jnp.zeros(12).at[3:6].set(jnp.array([0.01, -0.02, 0.03])))
+    turned = RIGID_BODY_SPACE.retract(x, jnp.zeros(12).at[3:6].set(jnp.array([0.01, -0.02, 0.03])))
     np.testing.assert_allclose(difference("attitude", turned[3:7], x[3:7]), [0.01, -0.02, 0.03], rtol=1e-3)
 
 

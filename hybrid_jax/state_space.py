@@ -1,0 +1,285 @@
+"""What the numbers of a state mean, and how to change a state and compare two of them where they are no vectors.
+
+A state is a row of quantities. Most are vectors; an angle wraps around, and an attitude is a unit quaternion. A field
+says what its state is by its attribute `state_space`; one that says nothing has vectors alone. What a quantity of your
+own is, a subclass of `Quantity` says.
+"""
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from itertools import accumulate
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks, rotation
+
+Numbers = jax.Array | np.ndarray
+Change = Float[Array, " e"]  # of a state or a quantity, in the tangent space
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Numbers of a state that are one vector. A subclass says what is different of a manifold.
+
+    Attributes:
+        name: such as "velocity".
+        size: how many numbers of the state it is.
+        unit: of its numbers, such as "m/s"; empty if it has none.
+        labels: a short name of each number, such as ("vx", "vy", "vz"); empty for their places in the state.
+        scale: of the quantity, in its unit, for a small difference of its numbers of norm 1.
+        uniform: whether its numbers are values of one quantity at many points, so that a constant disturbance is one
+            number for all.
+
+    Raises:
+        ValueError: a size that is no count, or as many labels as it has not.
+    """
+
+    name: str
+    size: int = 1
+    unit: str = ""
+    labels: tuple[str, ...] = ()
+    scale: float = 1.0
+    uniform: bool = False
+
+    def __post_init__(self):
+        checks.count("size", self.size)
+        if len(self.labels) not in (0, self.size):
+            raise ValueError(f"labels must be {self.size} of {self.name}, or none, got {self.labels}")
+
+    @property
+    def tangent_size(self) -> int:
+        """How many numbers a small change has."""
+        return self.size
+
+    @property
+    def is_vector(self) -> bool:
+        """Whether changes are added and differences subtracted."""
+        return type(self) is Quantity
+
+    def retract(self, x: Float[Array, " n"], change: Change) -> Float[Array, " n"]:
+        """The value after a change.
+
+        Args:
+            change: a tangent vector at x.
+        """
+        return x + change
+
+    def difference(self, y: Float[Array, " n"], x: Float[Array, " n"]) -> Change:
+        """The change that leads from x to y: `retract(x, difference(y, x))` is y.
+
+        Args:
+            y: the other value (n).
+        """
+        return y - x
+
+    def normalise(self, x: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The numbers by which the value near to x is usually given."""
+        return x
+
+    def nearest(self, x: Float[Array, " n"], to: Float[Array, " n"]) -> Float[Array, " n"]:
+        """The same value as x, by those of its numbers that are nearest to others.
+
+        Args:
+            to: these others (n).
+        """
+        return x
+
+    def continuous(self, path: Float[np.ndarray, "t n"]) -> Float[np.ndarray, "t n"]:
+        """The same values one after the other, without jumps from one way to give them to another.
+
+        Args:
+            path: values in the order of time (t, n).
+        """
+        return path
+
+    def check(self, name: str, x: Numbers, part: slice) -> None:
+        """Refuse states that have no such value.
+
+        Args:
+            name: what the message calls the states.
+            x: the states (…, d).
+            part: which of their numbers are the quantity's.
+
+        Raises:
+            ValueError: one of them has none.
+        """
+
+
+@dataclass(frozen=True)
+class Angle(Quantity):
+    """Angles [rad] that differ by whole turns are the same."""
+
+    unit: str = "rad"
+
+    def difference(self, y, x):
+        return self.normalise(y - x)
+
+    def normalise(self, x):
+        return x - 2 * jnp.pi * jnp.floor(x / (2 * jnp.pi) + 0.5)
+
+    def nearest(self, x, to):
+        return to + self.normalise(x - to)
+
+    def continuous(self, path):
+        return np.unwrap(path, axis=-2)
+
+
+@dataclass(frozen=True)
+class Attitude(Quantity):
+    """An attitude by its unit quaternion (w, x, y, z), body → world; changes are rotation vectors in the body [rad]."""
+
+    size: int = 4
+    unit: str = "rad"
+    scale: float = 2.0  # of a small angle θ the quaternion differs by θ / 2
+
+    @property
+    def tangent_size(self):
+        return 3
+
+    def retract(self, x, change):
+        return rotation.normalise(rotation.multiply(x, rotation.from_rotation_vector(change)))
+
+    def difference(self, y, x):
+        return rotation.attitude_error(x, y)
+
+    def normalise(self, x):
+        return rotation.normalise(x)
+
+    def nearest(self, x, to):
+        return jnp.where(jnp.sum(x * to) < 0, -x, x)
+
+    def continuous(self, path):
+        turned = np.sum(path[..., 1:, :] * path[..., :-1, :], axis=-1) < 0
+        signs = np.cumprod(np.where(turned, -1, 1), axis=-1)[..., None].astype(path.dtype)
+        return np.concatenate([path[..., :1, :], signs * path[..., 1:, :]], axis=-2)
+
+    def check(self, name, x, part):
+        checks.unit_quaternions(name, x, part)
+
+
+@dataclass(frozen=True)
+class StateSpace:
+    """Quantities one after the other, d numbers in all.
+
+    Attributes:
+        quantities: in the order of the state; none if nothing is known of it.
+        disturbed: the states on which a constant disturbance acts if nothing else is said, one after the other; None
+            for all.
+    """
+
+    quantities: tuple[Quantity, ...] = ()
+    disturbed: slice | None = None
+
+    @property
+    def size(self) -> int:
+        """d; 0 if nothing is known of the state."""
+        return sum(quantity.size for quantity in self.quantities)
+
+    @property
+    def parts(self) -> tuple[tuple[slice, Quantity], ...]:
+        """Each quantity and which numbers of the state it is."""
+        ends = accumulate(quantity.size for quantity in self.quantities)
+        return tuple((slice(end - one.size, end), one) for end, one in zip(ends, self.quantities, strict=True))
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """A name for each number of the state: its label, or its place."""
+        return tuple(
+            one.labels[i - part.start] if one.labels else str(i)
+            for part, one in self.parts
+            for i in range(part.start, part.stop)
+        )
+
+    @property
+    def units(self) -> tuple[str, ...]:
+        """The unit of each number of the state."""
+        return tuple(one.unit for one in self.quantities for _ in range(one.size))
+
+    @property
+    def tangent_size(self) -> int:
+        """How many numbers a small change of the state has."""
+        return sum(quantity.tangent_size for quantity in self.quantities)
+
+    def padded(self, d: int) -> "StateSpace":
+        """With d numbers: further ones are quantities of their own, x[i]. Nothing is known of states of fewer.
+
+        Args:
+            d: how many numbers a state has.
+        """
+        if d == self.size:
+            return self
+        known = self if d > self.size else StateSpace()
+        return replace(known, quantities=(*known.quantities, *(Quantity(f"x[{i}]") for i in range(known.size, d))))
+
+    def retract(self, x: Float[Array, " d"], change: Change) -> Float[Array, " d"]:
+        """The state after a change.
+
+        Args:
+            change: a tangent vector at x (e), that of one quantity after the other.
+        """
+        ends = [*accumulate((one.tangent_size for one in self.quantities), initial=0)]
+        pairs = zip(self.parts, ends, strict=False)
+        return jnp.concatenate([q.retract(x[at], change[i : i + q.tangent_size]) for (at, q), i in pairs])
+
+    def difference(self, y: Float[Array, " d"], x: Float[Array, " d"]) -> Change:
+        """The change (e) that leads from x to y.
+
+        Args:
+            y: the other state (d).
+        """
+        return jnp.concatenate([one.difference(y[part], x[part]) for part, one in self.parts])
+
+    def normalise(self, x: Float[Array, " d"]) -> Float[Array, " d"]:
+        """The state by the numbers by which it is usually given, as with quaternions of norm 1."""
+        for part, one in self._curved():
+            x = x.at[part].set(one.normalise(x[part]))
+        return x
+
+    def nearest(self, x: Float[Array, " d"], to: Float[Array, " d"]) -> Float[Array, " d"]:
+        """The same state as x, by those of its numbers that are nearest to another's.
+
+        Args:
+            to: the other state (d).
+        """
+        for part, one in self._curved():
+            x = x.at[part].set(one.nearest(x[part], to[part]))
+        return x
+
+    def continuous(self, x0: Numbers, x: Numbers) -> Numbers:
+        """Trajectories whose numbers do not jump where the state does not; traced ones are returned as they are.
+
+        Args:
+            x0: the states at the start (…, d), which stay.
+            x: the states that follow (…, t, d).
+        """
+        if checks.is_traced(x0) or checks.is_traced(x):
+            return x
+        for part, one in self._curved():
+            path = np.concatenate([np.asarray(x0)[..., None, part], np.asarray(x)[..., part]], axis=-2)
+            if not np.array_equal(found := one.continuous(path), path):
+                x = np.array(x)
+                x[..., part] = found[..., 1:, :]
+        return x
+
+    def check(self, name: str, x: Numbers) -> None:
+        """Refuse states that are none, such as those of a rigid body without a unit quaternion.
+
+        Args:
+            name: what the message calls them.
+            x: states (…, d).
+
+        Raises:
+            ValueError: it says where, and what is expected there.
+        """
+        for part, one in self._curved():
+            one.check(name, x, part)
+
+    def features(self, x: Float[np.ndarray, "n d"], u: Float[np.ndarray, "n m"]) -> dict[str, np.ndarray]:
+        """What decides whether a model has seen the like of a sample, by name; by default each number of x and of u."""
+        return {f"{name}[{i}]": column for name, part in (("x", x), ("u", u)) for i, column in enumerate(part.T)}
+
+    def _curved(self) -> Iterator[tuple[slice, Quantity]]:
+        return ((part, one) for part, one in self.parts if not one.is_vector)

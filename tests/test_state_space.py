@@ -1,0 +1,118 @@
+"""A state space changes states and compares them; a field on a manifold of a user's own is learned as any other."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from pendulum import pendulum, whirling
+from systems import windows, wrap
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.base import Frozen, check_windows, state_space
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, rigid_body
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.state_space import Angle, Attitude, Quantity, StateSpace
+
+pytestmark = pytest.mark.usefixtures("double_precision")  # laws hold to round-off
+CIRCLE = whirling().state_space
+SPACES = {
+    "line": StateSpace((Quantity("place", 2, "m"),)),
+    "circle": CIRCLE,
+    "body": RIGID_BODY_SPACE,
+    "joint": StateSpace((Attitude("attitude"), Angle("angles", 2), Quantity("speed"))),
+}
+
+
+@pytest.fixture(params=SPACES)
+def space(request):
+    return SPACES[request.param]
+
+
+def whirls(count):
+    """Windows of a pendulum that starts anywhere, at up to 8 rad/s."""
+    starts = np.random.default_rng(0).uniform(-1, 1, (count, 2)) * [np.pi, 8.0]
+    made = windows(whirling(), lambda *_: starts, lambda rng, shape: np.zeros((*shape, 1)), 0.05, count, seed=0)
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float), made)
+
+
+def states(space, count=2, seed=0):
+    return [space.normalise(4 * x) for x in jax.random.normal(jax.random.key(seed), (count, space.size))]
+
+
+def test_a_difference_leads_from_one_state_to_the_other(space):
+    for seed in range(5):
+        y, x = states(space, seed=seed)
+        change = space.difference(y, x)
+        assert change.shape == (space.tangent_size,)
+        reached = space.retract(x, change)
+        np.testing.assert_allclose(space.nearest(y, reached), reached, atol=1e-12)
+        np.testing.assert_allclose(space.retract(x, 0 * change), x, atol=1e-12)
+
+
+def test_derivatives_are_those_of_the_tangent_space(space):
+    x, _ = states(space)
+    slope = jax.jacfwd(lambda change: space.difference(space.retract(x, change), x))(jnp.zeros(space.tangent_size))
+    np.testing.assert_allclose(slope, np.eye(space.tangent_size), atol=1e-7)
+
+
+def test_the_usual_and_the_nearest_numbers_are_of_the_same_state(space):
+    y, x = states(space)
+    for same in (space.nearest(y, x), space.normalise(space.nearest(y, x))):
+        np.testing.assert_allclose(space.difference(same, y), 0, atol=1e-7)
+    np.testing.assert_allclose(space.nearest(x, x), x, atol=1e-12)
+
+
+def test_further_numbers_are_quantities_of_their_own():
+    padded = RIGID_BODY_SPACE.padded(15)
+    assert (padded.size, padded.names[-3:], padded.units[-3:]) == (15, ("wz", "13", "14"), ("rad/s", "", ""))
+    assert StateSpace().padded(2).names == ("0", "1")
+    assert not any(isinstance(one, Attitude) for one in RIGID_BODY_SPACE.padded(4).quantities)
+    with pytest.raises(ValueError, match="labels must be 2 of pair"):
+        Quantity("pair", 2, labels=("one",))
+
+
+def test_a_field_inside_another_says_what_the_state_is():
+    body = rigid_body(hj.IRIS)
+    for field in (hj.Hybrid(body, pendulum()), Frozen(body), lambda x, u: x):
+        assert (state_space(field) is RIGID_BODY_SPACE) == hasattr(field, "state_space")
+    assert state_space(body, 2) == StateSpace().padded(2)
+
+
+def test_windows_of_the_same_states_are_the_same_windows():
+    data = whirls(20)
+    jumping = wrap(CIRCLE, data)
+    joined = check_windows(whirling(), jumping)
+    assert check_windows(whirling(), joined) is joined
+    assert check_windows(pendulum(), jumping) is jumping
+    turns = (joined.x - data.x) / (2 * np.pi)
+    np.testing.assert_allclose(turns[..., 0], np.broadcast_to(turns[:, :1, 0].round(), turns.shape[:2]), atol=1e-6)
+
+
+def test_a_quaternion_may_change_its_sign():
+    x = np.tile(np.eye(13)[3], (1, 4, 1))
+    data = hj.Trajectories(x[:, 0], np.zeros((1, 4, 4)), x, 0.01)
+    flipped = data.x.copy()
+    flipped[:, 1:3, 3:7] *= -1
+    joined = check_windows(rigid_body(hj.IRIS), hj.Trajectories(data.x0, data.u, flipped, data.dt))
+    np.testing.assert_array_equal(joined.x, data.x)
+
+
+def test_a_pendulum_that_whirls_is_learned_from_angles_that_jump():
+    jumping = [wrap(CIRCLE, whirls(count)) for count in (60, 20)]
+    assert rollout_mse(whirling(), jumping[0]) < 1e-10 < 1 < rollout_mse(pendulum(), jumping[0])
+    result = hj.adapt(whirling(0.7), jumping[0], method="least_squares")
+    assert result.parameters["log_length"].value == pytest.approx(np.log(0.5), abs=1e-5)
+    assert hj.fit(whirling(0.6), *jumping, jax.random.key(0), max_epochs=40).best_mse < 1e-3
+
+
+def test_a_filter_follows_an_angle_through_its_turns():
+    dt, field, truth = 0.02, whirling(0.6), whirling(0.5)
+    online = hj.OnlineAdaptation(field, dt=dt, noise=1e-3)
+    path = hj.rollout(truth, jnp.array([0.0, 12.0]), jnp.zeros((300, 1)), dt)
+    assert path[-1, 0] > 6 * np.pi
+    update, state = eqx.filter_jit(online.update), online.begin(jnp.array([0.0, 12.0]))
+    for x in path:
+        state = update(state, CIRCLE.normalise(x), jnp.zeros(1))
+    assert abs(state.x[0]) < np.pi + 0.1
+    assert online.model(state).log_length == pytest.approx(np.log(0.5), abs=1e-3)
