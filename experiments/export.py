@@ -1,6 +1,6 @@
 """Export a trained model to StableHLO files, CasADi functions and C: python -m experiments.export --help"""
 
-from dataclasses import dataclass, field
+from dataclasses import astuple, dataclass, field
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -11,7 +11,7 @@ import numpy as np
 import tyro
 from jaxtyping import Float
 
-from experiments.online.config import NOISE
+from experiments.paper.conditions import Noise
 from experiments.runner import command
 from experiments.runner.options import NotNegative, Positive, check_numbers
 from hybrid_jax import AbstractVectorField, Model, OnlineAdaptation, checks, load, rotation
@@ -34,7 +34,7 @@ from hybrid_jax.state import INPUT_SIZE, STATE_SIZE
 NAME = "export"
 COUNT = 10_000  # states over which a smooth model is compared
 PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
-# Of a rigid body, as in docs/howto/online.md; NOISE is that of motion capture and a gyroscope.
+# Of a rigid body, as in docs/howto/online.md; the noise is that of motion capture and a gyroscope.
 PROCESS = (0.0, 0.0, 0.003, 0.005)
 PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
 
@@ -140,7 +140,8 @@ def _adaptation(config: Config, field: AbstractVectorField, dt: float) -> Online
         if options != Adaptation():
             raise
         return str(error)
-    d, default = sizes_of(field, config.state_size, config.input_size)[0], options.noise or (NOISE if rigid else ())
+    d = sizes_of(field, config.state_size, config.input_size)[0]
+    default = options.noise or (astuple(Noise()) if rigid else ())
     if not default:
         return "--adaptation.noise must say how exactly the states are measured"
     noise, process = (

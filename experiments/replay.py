@@ -17,7 +17,7 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from experiments.closed_loop.flights import PATHS
+from experiments.flying.scenario import PATHS
 from experiments.reporting.names import label
 from experiments.reporting.plots import COLOURS
 from experiments.runner import command

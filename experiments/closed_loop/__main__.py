@@ -3,13 +3,14 @@
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
+import jax
 from matplotlib.figure import Figure
 from rich.console import Console
 
-from experiments.closed_loop import figures, flights, models
+from experiments.closed_loop import figures, models
 from experiments.closed_loop.claims import Evidence, Speed, claims
 from experiments.closed_loop.config import ABLATED, PRESETS, ClosedLoopConfig
-from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, results_of
+from experiments.closed_loop.flights import DOMAINS, Flown, ModelSet, Scenario, fly_all, results_of
 from experiments.closed_loop.models import Trained
 from experiments.closed_loop.path_figures import flown_paths, rendered
 from experiments.closed_loop.results import (
@@ -22,7 +23,8 @@ from experiments.closed_loop.results import (
     speed_table,
     tables,
 )
-from experiments.closed_loop.timing import on_one_core
+from experiments.closed_loop.timing import call_times
+from experiments.flying.timing import on_one_core
 from experiments.paper.config import Config
 from experiments.reporting.claims import evaluate, verdict_table
 from experiments.reporting.names import label
@@ -33,7 +35,7 @@ from experiments.runner import command
 from experiments.runner.run_record import environment
 from experiments.runner.stages import Stages, stages_of
 from hybrid_jax.adaptation import LeastSquares
-from hybrid_jax.control import Controller, Hardware
+from hybrid_jax.control import Hardware
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
 from hybrid_jax.sweep import hosts
@@ -41,7 +43,8 @@ from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
 NAME = "closed_loop"
-Training = dict[str, Stages]  # of each trained model
+FLIGHTS = "flights"
+Training = dict[str, Stages]  # of each trained model, and of FLIGHTS
 Places = Sequence[tuple[str, float]]  # reference, distance from home [m]
 MODELS = {"physics": "physics_only", "hybrid": "hybrid", "no_physics": "no_physics"}  # as flown → as trained
 DISTURBANCES = {"needed": LeastSquares(), "always": LeastSquares(disturbance=True)}
@@ -92,8 +95,8 @@ def head(config: ClosedLoopConfig) -> str:
 
 def experiment(config: ClosedLoopConfig, console: Console) -> None:
     training: Training = {}
-    trained = train_all(config, console, training)
-    flown = fly_models(config, trained, console)
+    trained, training[FLIGHTS] = train_all(config, console, training), stages_of(config, console)
+    flown = fly_models(config, trained, training)
     ablation = fly_ablation(config, console, training) if config.ablation else []
     if hosts.is_main_process():
         write(config, trained, flown, ablation, training)
@@ -116,13 +119,13 @@ def train_all(config: ClosedLoopConfig, console: Console, training: Training) ->
     return trained
 
 
-def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], console: Console) -> list[Flown]:
+def fly_models(config: ClosedLoopConfig, trained: dict[str, Trained], training: Training) -> list[Flown]:
     """Fly every model along every reference, before and after the changes; after them also away from home."""
     changed = {domain.name: models.model_set(domain, trained, config.ends) for domain in DOMAINS}
     sets = {SOURCE.name: models.model_set(SOURCE, trained, ()), **changed}
     home = scenarios(config, sets, [(name, 0.0) for name in config.references])
     away = scenarios(config, changed, [(name, config.away) for name in config.flown_away])
-    return fly_all(config, config.controller(), [*home, *away], console)
+    return fly_all([*home, *away], config.controller(), config.seconds, training[FLIGHTS], config.hardware())
 
 
 def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training) -> list[Flown]:
@@ -133,7 +136,8 @@ def fly_ablation(config: ClosedLoopConfig, console: Console, training: Training)
     found = []
     for unit in (True, False) if "quaternion" in config.ablation else (True,):
         sets = {domain.name: models.variants(config.ablation, domain, trained, own, unit) for domain in DOMAINS}
-        found += fly_all(config, config.controller(unit), scenarios(config, sets, places), console)
+        own_scenarios = scenarios(config, sets, places)
+        found += fly_all(own_scenarios, config.controller(unit), config.seconds, training[FLIGHTS], config.hardware())
     return found
 
 
@@ -143,18 +147,16 @@ def scenarios(config: ClosedLoopConfig, sets: Mapping[str, ModelSet], places: Pl
     return [Scenario(domain, *place, sets[domain.name], config.bandwidth) for domain in own for place in places]
 
 
-def fly_all(config: ClosedLoopConfig, controller: Controller, own: list[Scenario], console: Console) -> list[Flown]:
-    cache = config.cache / NAME
-    return flights.flown(own, controller, config.seconds, cache, console, config.fresh, config.hardware())
-
-
 def speeds(config: ClosedLoopConfig, trained: dict[str, Trained]) -> dict[str, dict[str, float]]:
     """Time of one call on one core: with physics alone, with the paper's network and with the invariant one."""
     few = min(config.sizes)
     fields = {Agent("nominal").name: rigid_body(IRIS)}
     for model in ("hybrid", "invariant"):
         fields[Agent(model, few).name] = lane(trained[model].adapted[PARAMETER_SHIFT.name, few], 0)
-    return on_one_core(fields, config.controller(), config.calls)
+    times = on_one_core(
+        call_times, [jax.device_get(field) for field in fields.values()], config.controller(), config.calls
+    )
+    return dict(zip(fields, times, strict=True))
 
 
 def write(
@@ -174,9 +176,6 @@ def write(
     notes = [f"{name}: {note}" for name, stages in training.items() for note in stages.notes()]
     notes += [f"least squares: {note}" for note in models.disturbance_counts(trained["least_squares"])]
     seconds = {f"{name}, {stage}": taken for name, own in training.items() for stage, taken in own.seconds.items()}
-    for each in every:  # the ablation repeats some
-        stage = f"flights {each.scenario.name}"
-        seconds[stage] = seconds.get(stage, 0.0) + each.seconds
     titled = [verdict_table(verdicts, "Hypotheses"), *tables(rows), *gap_tables(rows), *ablation_tables(ablated)]
     report = Report(
         experiment=NAME,

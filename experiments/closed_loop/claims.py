@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from experiments.closed_loop.results import LEARNED, ORACLE, REFERENCES, SOURCES, Agent, away, gaps, uncrashed
+from experiments.closed_loop.results import LEARNED, ORACLE, SOURCES, Agent, away, gaps, uncrashed
+from experiments.flying.scenario import REFERENCES
 from experiments.reporting.claims import Claim, Part, Undecided, all_of, every
 from experiments.reporting.names import EXTERNAL_FORCE, LABELS, PARAMETER_SHIFT, UNCHANGED
 from experiments.reporting.results import Results

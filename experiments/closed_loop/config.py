@@ -3,13 +3,12 @@
 from dataclasses import dataclass, replace
 from typing import Literal, get_args
 
-from experiments.online.config import NOISE
+from experiments.flying.scenario import Reference, hardware
 from experiments.paper.config import QUICK, SMOKE, Config, ResidualInputs, preset_like
 from experiments.runner.options import Count, NotNegative, Positive, distinct
 from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.vehicle import IRIS
 
-Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
 Option = Literal["networks", "offset", "statistics", "quaternion"]
 ABLATED: tuple[Reference, ...] = ("hover", "figure_eight", "low_pass")
 
@@ -89,8 +88,7 @@ class ClosedLoopConfig(Config):
 
     def hardware(self) -> Hardware:
         """Between controller and vehicle."""
-        m, quaternion, speed, rate = (self.noise * size for size in NOISE)
-        return Hardware(self.latency, self.rotor_lag, (m, quaternion, speed, rate))
+        return hardware(self.noise, self.latency, self.rotor_lag)
 
     def controller(self, unit_quaternion: bool = True) -> Controller:
         return Controller(IRIS, unit_quaternion=unit_quaternion, rotor_lag=self.rotor_lag)

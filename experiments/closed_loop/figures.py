@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from experiments.closed_loop.claims import COST_TOLERANCE
-from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, REFERENCES, Agent, away, by_agent, gaps
+from experiments.closed_loop.results import DOMAINS, ERROR, ORACLE, Agent, away, by_agent, gaps
+from experiments.flying.scenario import REFERENCES
 from experiments.reporting import plots
 from experiments.reporting.plots import COLOURS, STYLE, Line, legend_below, name_lines, note, subplots
 from experiments.reporting.results import Results

@@ -6,75 +6,55 @@ One program is compiled for each structure of prediction model; no flight is sim
 import time
 from collections import Counter, defaultdict
 from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from rich.console import Console
 
 from experiments.closed_loop.results import NUMBERS, TAGS, Agent, away
+from experiments.flying import programs
+from experiments.flying.plant import World, plant_of, world_of
+from experiments.flying.scenario import PATHS, sampled
 from experiments.reporting.results import Results
-from experiments.runner.progress import Line, clock
+from experiments.runner.cache import identity_of
+from experiments.runner.stages import Found, Stages
 from hybrid_jax import control
-from hybrid_jax.control import Controller, Hardware, sample
-from hybrid_jax.control.cost import Scalar
-from hybrid_jax.control.references import Path as Reference
+from hybrid_jax.control import Controller, Hardware
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.io.archive import Arrays, digest, load_archive, named_leaves, save_archive
-from hybrid_jax.io.datasets import versions
-from hybrid_jax.io.files import backup_path
-from hybrid_jax.io.models import describe
-from hybrid_jax.runtime import cores
-from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain, Quadrotor
-from hybrid_jax.sim.forces import Parameters, Wrench
+from hybrid_jax.io.archive import Arrays
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, Domain
 from hybrid_jax.state import POSITION, STATE_SIZE
-from hybrid_jax.sweep import hosts
-from hybrid_jax.sweep.lanes import LaneMap, count, lane, stack
+from hybrid_jax.sweep.lanes import LaneMap, count, lane
 
-FORMAT = "hybrid_jax closed loop 1"
-RECIPE = 7  # raise it when the same flights give other numbers
-MADE_BY = ("jax", "hybrid_jax")
-ALTITUDE = 1.5  # m
 DOMAINS = (PARAMETER_SHIFT, EXTERNAL_FORCE)  # the two changes
-FORCES = EXTERNAL_FORCE.forces  # all that act in any domain
-WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of all
 CALL_EVERY = 50  # calls between two whose open-loop cost is computed
 DRAW_EVERY = 5  # states between two that are kept for figures
+SPENT = ("seconds", "processor_seconds", "devices")
 ModelSet = Mapping[Agent, AbstractVectorField]  # stacked over seeds
 
 
-def _crossing(t: Scalar) -> tuple[Float[Array, "3"], Scalar]:
-    """A low pass that crosses home after 5 s."""
-    position, yaw = control.low_pass(speed=2.0)(t)
-    return position - jnp.array([10.0, 0.0, 0.0]), yaw
-
-
-PATHS: Mapping[str, Reference] = {
-    "hover": control.hover((0.0, 0.0, ALTITUDE)),
-    "figure_eight": control.figure_eight(3.5, altitude=ALTITUDE),
-    "fast_figure_eight": control.figure_eight(6.0, altitude=ALTITUDE),
-    "step": control.step((1.0, 1.0, 0.5), yaw=np.pi / 2, altitude=ALTITUDE),
-    "low_pass": _crossing,
-    "upset": control.hover((0.0, 0.0, ALTITUDE)),  # the initial state has a body rate
-}
-
-
 class Flight(NamedTuple):
-    """The arrays that define one flight."""
+    """The arrays that define one flight.
 
-    model: AbstractVectorField  # of the controller
-    vehicle: Parameters  # the true one
-    shares: Float[Any, " f"]  # of each of FORCES, 1 where it acts
-    path: Int[Any, ""]  # index into PATHS
-    home: Float[Any, "3"]  # offset of the reference [m, world]
-    bandwidth: Float[Any, ""]  # of the disturbance observer [rad/s]; 0 for none
-    seed: Int[Any, ""]  # of the noise, the same for all agents
+    Attributes:
+        model: of the controller.
+        world: the true system.
+        path: number in PATHS.
+        home: offset of the reference [m, world].
+        bandwidth: of the disturbance observer [rad/s]; 0 for none.
+        seed: of the noise, the same for all agents.
+    """
+
+    model: AbstractVectorField
+    world: World
+    path: Int[Any, ""]
+    home: Float[Any, "3"]
+    bandwidth: Float[Any, ""]
+    seed: Int[Any, ""]
 
     def structure(self) -> tuple:
         """What flights must have in common to be stacked: the tree of the model, and its shapes and dtypes."""
@@ -84,13 +64,21 @@ class Flight(NamedTuple):
 
 @dataclass(frozen=True)
 class Scenario:
-    """Flights of a set of models in one domain along one of PATHS."""
+    """Flights of a set of models in one domain along one of PATHS.
+
+    Attributes:
+        domain: the true system.
+        reference: a key of PATHS.
+        distance: from home [m], equally far in x and y.
+        models: that fly.
+        bandwidth: of the disturbance observers [rad/s].
+    """
 
     domain: Domain
     reference: str
-    distance: float  # from home [m], equally far in x and y
+    distance: float
     models: ModelSet
-    bandwidth: float  # of the disturbance observers [rad/s]
+    bandwidth: float
 
     @property
     def name(self) -> str:
@@ -103,34 +91,46 @@ class Scenario:
     def flights(self) -> Iterator[Flight]:
         """In the order of `keys`."""
         home = np.array([self.distance, self.distance, 0.0], np.float32) / np.float32(np.sqrt(2))
-        vehicle = self.domain.quadrotor().parameters
-        shares = np.array([force in self.domain.forces for force in FORCES], np.float32)
-        path = np.asarray(list(PATHS).index(self.reference), np.int32)
+        world, path = world_of(self.domain), np.asarray(list(PATHS).index(self.reference), np.int32)
         for agent, seed in self.keys():
             bandwidth = np.asarray(self.bandwidth * agent.observer, np.float32)
-            noise = np.asarray(seed, np.int32)
-            yield Flight(lane(self.models[agent], seed), vehicle, shares, path, home, bandwidth, noise)
+            yield Flight(lane(self.models[agent], seed), world, path, home, bandwidth, np.asarray(seed, np.int32))
+
+    def described(self) -> list[Any]:
+        """What the results depend on, beside the controller and the hardware; see `identity_of`."""
+        return [self.name, self.bandwidth, [asdict(agent) for agent in self.models], *self.models.values()]
 
 
 @dataclass(frozen=True)
 class Flown:
-    """The results of a scenario."""
+    """The results of a scenario.
+
+    Attributes:
+        scenario: that was flown.
+        arrays: by name, one value per flight; see `_simulate`.
+        seconds: wall-clock time of the simulation, without compiling.
+        processor_seconds: likewise on all cores.
+        devices: how many there were.
+    """
 
     scenario: Scenario
-    arrays: Arrays  # by name, one value per flight; see `_simulate`
-    seconds: float  # wall-clock time of the simulation, without compiling
-    processor_seconds: float  # on all cores
-    devices: int  # number of them
+    arrays: Arrays
+    seconds: float
+    processor_seconds: float
+    devices: int
 
     def rows(self) -> list[dict[str, Any]]:
-        """One row per flight: its tags and NUMBERS."""
+        """One row per flight: its tags, and NUMBERS, away from home and in the ablation RMSE alone."""
         place = {"reference": self.scenario.reference, "distance": self.scenario.distance}
         return [
             {"domain": self.scenario.domain.name, **asdict(agent), **place, "seed": seed}
-            | {name: float(self.arrays[name][i].mean()) for name in NUMBERS}
+            | {name: float(self.arrays[name][i].mean()) for name in self._numbers(agent)}
             | {"crashed": bool(self.arrays["crashed"][i])}
             for i, (agent, seed) in enumerate(self.scenario.keys())
         ]
+
+    def _numbers(self, agent: Agent) -> tuple[str, ...]:
+        return NUMBERS[:1] if self.scenario.distance or agent.variant else NUMBERS
 
     def states(self, agent: Agent, seed: int = 0) -> np.ndarray:
         """The states of one flight, every `DRAW_EVERY` periods."""
@@ -141,103 +141,52 @@ def results_of(scenarios: Sequence[Flown]) -> Results:
     return Results([row for each in scenarios for row in each.rows()], TAGS)
 
 
-def flown(
+def fly_all(
     scenarios: list[Scenario],
     controller: Controller,
     seconds: float,
-    folder: Path,
-    console: Console,
-    fresh: bool,
+    stages: Stages,
     hardware: Hardware | None = None,
 ) -> list[Flown]:
-    """The results of all scenarios in flights of so many seconds, found in the cache `folder` or flown now.
+    """The results of all scenarios in flights of so many seconds, each a stage that is found in the cache or flown now.
 
-    The hardware is that of `control.fly`; the controller must have its rotor lag. With `fresh`, results of other
-    versions are moved aside and flown again.
+    The hardware is that of `control.fly`; the controller must have its rotor lag.
     """
     hardware = Hardware() if hardware is None else hardware
-    references = np.stack([np.asarray(sample(path, controller, seconds)) for path in PATHS.values()])
+    references = sampled(controller, seconds)
     starts = references[:, 0].copy()
     spinning = list(PATHS).index("upset")
     starts[spinning] = control.add_body_rates(jnp.asarray(references[spinning, 0]))
-    shared = references, starts
     most: Counter[tuple] = Counter()  # programs have places for the largest scenario
     for scenario in scenarios:
         most |= Counter(flight.structure() for flight in scenario.flights())
-    programs = {}
-    for key, n in most.items():
-        width = min(WIDTH.get(jax.default_backend(), -(-n // jax.device_count())), n)
-        programs[key] = LaneMap(partial(_simulate, controller, hardware), width, min_capacity=n)
-    compiled: set[tuple] = set()
+    fly = partial(_fly, partial(_simulate, controller, hardware), most, {}, (references, starts))
     found = []
     for scenario in scenarios:
-        path = (
-            folder / f"{scenario.name.replace(' ', '-')}-{_identity(scenario, controller, hardware, shared)[:16]}.npz"
-        )
-        about, arrays = hosts.from_first(lambda path=path: _cached(path, console, fresh))
-        origin = "as found in the cache"
-        if about is None:
-            with Line(scenario.name, console) as line:
-                arrays, spent = _fly(scenario, programs, compiled, shared, line)
-            about = spent | {"devices": jax.device_count(), "versions": versions(*MADE_BY)}
-            origin = clock(about["seconds"])
-            if hosts.is_main_process():
-                save_archive(path, FORMAT, about, arrays)
-        console.print(f"{scenario.name}: {len(scenario.keys())} flights, {origin}", highlight=False, soft_wrap=True)
-        found.append(Flown(scenario, arrays, *(about[name] for name in ("seconds", "processor_seconds", "devices"))))
+        name = f"flights {scenario.name}"
+        identity = identity_of(asdict(controller), asdict(hardware), seconds, *scenario.described())
+        ((_, arrays),) = stages.kept(name, {"": partial(fly, scenario)}, identity).values()
+        found.append(Flown(scenario, arrays, *(arrays[key].item() for key in SPENT)))
     return found
 
 
-def _identity(scenario: Scenario, controller: Controller, hardware: Hardware, shared: tuple) -> str:
-    """What the results depend on; without hardware as it was before there was any, so that they are found again."""
-    models = list(scenario.models.values())
-    fixed = [RECIPE, CALL_EVERY, DRAW_EVERY, asdict(controller), *map(describe, models)]
-    fixed += [asdict(hardware)] if hardware != Hardware() else []
-    flights = [flight._replace(model=None, seed=None) for flight in scenario.flights()]
-    return digest(fixed, named_leaves({"flights": flights, "models": models, "shared": shared}))
+def _fly(simulate, most: Mapping[tuple, int], made: dict[tuple, LaneMap], shared: tuple, scenario: Scenario) -> Found:
+    """Results of all flights of a scenario, one per entry, and SPENT, the time that they took without compiling.
 
-
-def _cached(path: Path, console: Console, fresh: bool) -> tuple[dict[str, Any] | None, Arrays]:
-    if not path.exists():
-        return None, {}
-    about, arrays = load_archive(path, FORMAT)
-    if fresh and about["versions"] != versions(*MADE_BY):
-        backup = path.rename(backup_path(path, "before"))
-        console.print(f"{path}: moved aside to {backup.name}", highlight=False)
-        return None, {}
-    return about, arrays
-
-
-def _fly(
-    scenario: Scenario, programs: Mapping[tuple, LaneMap], compiled: set[tuple], shared: tuple, line: Line
-) -> tuple[Arrays, dict[str, Any]]:
-    """Results of all flights of a scenario, one per row, and the time they took without compiling [s].
-
-    The structures of the programs that were compiled for them are added to `compiled`.
+    Programs of structures that are not yet in `made` are compiled and added to it.
     """
     groups, flights = defaultdict(list), list(scenario.flights())
     for i, flight in enumerate(flights):
         groups[flight.structure()].append(i)
-    runs = {
-        key: partial(programs[key], stack([flights[i] for i in own]), shared, np.ones(len(own)))
-        for key, own in groups.items()
-    }
-    new = [run for key, run in runs.items() if key not in compiled]
-    line.say(f"compiling {len(new)} programs for {len(flights)} flights")
-    # Processes of one run must compile in the same order.
-    with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
-        # Compile by flying nothing. XLA computes a single chunk nevertheless, so no program is run twice for this.
-        list(pool.map(lambda run: run([]), new))
-    compiled.update(runs)  # not |=, which for keys of a dict makes another set
+    members = {key: [flights[i] for i in own] for key, own in groups.items()}
+    new = {key: own for key, own in members.items() if key not in made}
+    made.update(programs.compiled(simulate, new, most, shared))
     began, worked = time.perf_counter(), time.process_time()
-    found, flown = [], 0
-    for run, own in zip(runs.values(), groups.values(), strict=True):
-        line.show_share("flying", flown / len(flights))
-        found.append(run(range(len(own))))
-        flown += len(own)
-    spent = {"seconds": time.perf_counter() - began, "processor_seconds": time.process_time() - worked}
+    found = [programs.fly(made[key], own, shared) for key, own in members.items()]
+    spent = time.perf_counter() - began, time.process_time() - worked, jax.device_count()
     order = np.argsort(np.concatenate(list(groups.values())))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[order], *found), spent
+    arrays = jax.tree.map(lambda *parts: np.concatenate(parts)[order], *found)
+    return [], arrays | dict(zip(SPENT, map(np.asarray, spent), strict=True))
 
 
 def _simulate(
@@ -250,16 +199,7 @@ def _simulate(
     """Fly one flight: `Performance`, open-loop costs of some calls and their relative error, and states."""
     offset = jnp.zeros(STATE_SIZE).at[POSITION].set(flight.home)
     reference, x0 = references[flight.path] + offset, starts[flight.path] + offset
-
-    def force(x, u, t, parameters) -> Wrench:
-        wrenches = [each(x, u, t, parameters) for each in FORCES]
-        return Wrench(*(jnp.tensordot(flight.shares, jnp.stack(parts), 1) for parts in zip(*wrenches, strict=True)))
-
-    truth = Quadrotor(flight.vehicle, (force,))
-
-    def plant(x, u, t):
-        return truth.step(x, u, t, controller.period)
-
+    plant = plant_of(flight.world, controller.period)
     key = jax.random.fold_in(jax.random.key(flight.seed), flight.path) if any(hardware.noise) else None
     own = control.fly(plant, flight.model, reference, x0, controller, flight.bandwidth, hardware=hardware, key=key)
     calls = range(CALL_EVERY, len(own.u) - hardware.delay(controller.period), CALL_EVERY)

@@ -1,12 +1,7 @@
 """Time of one call of the controller, which a flight computer would make every 10 ms."""
 
-import os
-import signal
 import time
-from collections.abc import Mapping
-from concurrent.futures import ProcessPoolExecutor
-from functools import partial
-from multiprocessing import get_context
+from collections.abc import Sequence
 
 import equinox as eqx
 import jax
@@ -14,36 +9,17 @@ import numpy as np
 
 from hybrid_jax.control import Controller, advance, figure_eight, sample
 from hybrid_jax.dynamics.base import AbstractVectorField
-from hybrid_jax.runtime import configure
 
 WARM_UP = 10  # calls that are not counted
 
 
-def on_one_core(
-    fields: Mapping[str, AbstractVectorField], controller: Controller, calls: int
-) -> dict[str, dict[str, float]]:
-    """`call_times` of each field, in a process with one CPU core: more do not make its small matrix products faster.
-
-    A system that cannot bind a process to a core (macOS) leaves it all of them.
-    """
-    # Spawned, not forked: JAX already runs threads here and has fixed the devices.
-    timed = partial(call_times, controller=controller, calls=calls)
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core) as process:
-        times = process.map(timed, map(jax.device_get, fields.values()))
-        return dict(zip(fields, times, strict=True))
+def call_times(fields: Sequence[AbstractVectorField], controller: Controller, calls: int) -> list[dict[str, float]]:
+    """With each field: median and 99th percentile of wall-clock time, mean processor time of all cores [ms]."""
+    return [_call_times(field, controller, calls) for field in fields]
 
 
-def use_one_core() -> None:
-    """Bind this process to one core and configure JAX, before its first array."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
-    if hasattr(os, "sched_setaffinity"):
-        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
-    jax.config.update("jax_platforms", "cpu")
-    configure()
-
-
-def call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:
-    """Calls along a figure-8: median and 99th percentile of wall-clock time, mean processor time of all cores [ms]."""
+def _call_times(field: AbstractVectorField, controller: Controller, calls: int) -> dict[str, float]:
+    """Calls along a figure-8."""
     control, simulate = eqx.filter_jit(controller), eqx.filter_jit(advance)
     reference = sample(figure_eight(3.5), controller, controller.period * (WARM_UP + calls))
     plan, x = controller.begin(), reference[0]

@@ -5,10 +5,10 @@ from pathlib import Path
 
 from rich.console import Console
 
-from experiments.closed_loop.flights import PATHS
+from experiments.flying.scenario import PATHS
 from experiments.online import agents, figures
 from experiments.online.config import PRESETS, OnlineConfig
-from experiments.online.flights import Run, Setting, flown, setting
+from experiments.online.flights import Run, Setup, fly_all, setup
 from experiments.online.results import Evidence, claims, results_of, tables
 from experiments.online.timing import step_time
 from experiments.reporting.claims import evaluate, verdict_table
@@ -16,6 +16,7 @@ from experiments.reporting.plots import save_figures
 from experiments.reporting.report import Report, write_report
 from experiments.runner import command
 from experiments.runner.run_record import environment
+from experiments.runner.stages import stages_of
 
 NAME = "online"
 
@@ -42,20 +43,18 @@ then counts as infinite. The settings of filter, observer and L1 were chosen on 
 
 
 def experiment(config: OnlineConfig, console: Console) -> None:
-    own = setting(config.hardware(), config.seconds)
-    bandwidths = {"observer": config.bandwidth, "l1": config.l1_cutoff}
-    run = flown(own, config.agents, config.changes, config.references, config.seeds, bandwidths, console)
+    own, stages = setup(config), stages_of(config, console)
+    run = fly_all(own, config, stages)
     rows = results_of(run, own)
     step = step_time(config.hardware(), own.period)
-    spent = sum(taken for name, taken in run.seconds.items() if name.startswith("flying"))
-    evidence = Evidence(rows, step, spent, run.processor_seconds, len(rows))
+    evidence = Evidence(rows, step, run.seconds, run.processor_seconds, len(rows))
     verdicts = evaluate(claims(list(config.changes)), evidence)
     out = config.out / NAME
     drawn, notes = draw(run, own, config, out)
     report = Report(
         experiment=NAME,
         config=config.described(),
-        environment=environment(run.seconds),
+        environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
         figures=save_figures(out, drawn, config.paper) | notes,
@@ -67,7 +66,7 @@ def experiment(config: OnlineConfig, console: Console) -> None:
     write_report(out, report, Console(), config.paper)
 
 
-def draw(run: Run, own: Setting, config: OnlineConfig, out: Path):
+def draw(run: Run, own: Setup, config: OnlineConfig, out: Path):
     """Figures with captions by name, and those of the animated picture by file."""
     reference = "figure_eight" if "figure_eight" in config.references else config.references[0]
     drawn = {"errors": (figures.errors(run, own, reference), "Errors around the change")}

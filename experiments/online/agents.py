@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from experiments.flying.plant import wind_force
 from hybrid_jax.control import Hardware, Observer, advance
 from hybrid_jax.control.observer import MOTION
 from hybrid_jax.dynamics.base import AbstractVectorField, ravel_learned
@@ -22,7 +23,7 @@ from hybrid_jax.online.hypotheses import Hypothesis
 from hybrid_jax.rotation import body_z
 from hybrid_jax.sim.changes import DOUBLED_DRAG, OFF_CENTRE_LOAD, WEAK_ROTOR
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.forces import DRAG_COEFFICIENT, LOST_THRUST, parameters_of, weak_rotor, wind
+from hybrid_jax.sim.forces import DRAG_COEFFICIENT, LOST_THRUST, weak_rotor
 from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 
@@ -93,12 +94,18 @@ def with_theta(theta: Float[Array | np.ndarray, " 12"]) -> AbstractVectorField:
     return ravel_learned(nominal())[1](jnp.asarray(theta, float))
 
 
-class Told(AbstractEstimator):
-    """A model, a disturbance observer of bandwidth ≥ 0, and what an oracle is told of the wind."""
+class FixedModel(AbstractEstimator):
+    """A model that does not learn.
+
+    Attributes:
+        observer: of the disturbance, with the model; bandwidth 0 for none.
+        share: 1 if it knows the wind, else 0.
+        clock: of the wind when the flight begins [s].
+    """
 
     observer: Observer
-    share: Float[Array, ""]  # 1 if it knows the wind
-    clock: Float[Array, ""]  # of the wind at the start of the flight [s]
+    share: Float[Array, ""]
+    clock: Float[Array, ""]
 
     def begin(self, x):
         return self.observer.begin(x), jnp.zeros((), x.dtype)
@@ -107,7 +114,7 @@ class Told(AbstractEstimator):
         return self.observer.update(state[0], x, u), state[1] + self.observer.period
 
     def model(self, state):
-        force = wind(jnp.zeros(13), jnp.zeros(4), self.clock + state[1], parameters_of(IRIS)).force
+        force = wind_force(self.clock + state[1])
         known = self.share * jnp.concatenate([force, jnp.zeros(3)]) / IRIS.mass
         return disturbed(self.observer.field, state[0].disturbance + known)
 
@@ -156,10 +163,12 @@ class L1(AbstractEstimator):
         return jnp.sqrt(jnp.clip(squares, 1.0, IRIS.max_rotor_speed**2))
 
 
-def told(field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0) -> Told:
+def fixed_model(
+    field: AbstractVectorField, period: float, clock: float, bandwidth: float = 0.0, share: float = 0.0
+) -> FixedModel:
     """An agent that does not learn, or by an observer alone."""
     numbers: list[Any] = [np.asarray(number, np.float32) for number in (bandwidth, share, clock)]
-    return Told(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
+    return FixedModel(Observer(as_numpy(with_disturbance(field)), numbers[0], period), *numbers[1:])
 
 
 def online(hardware: Hardware, period: float) -> OnlineAdaptation:

@@ -3,13 +3,12 @@
 from dataclasses import dataclass
 from typing import Literal, get_args
 
+from experiments.flying.scenario import Reference, hardware
 from experiments.runner.options import NotNegative, Positive, Run, distinct
 from hybrid_jax.control import Hardware
 
 Change = Literal["inertia", "load", "wind", "weak_rotor", "drag", "nothing"]
 Agent = Literal["unadapted", "observer", "l1", "least_squares", "online", "oracle"]
-Reference = Literal["hover", "figure_eight", "fast_figure_eight", "step", "low_pass", "upset"]
-NOISE = (0.001, 0.002, 0.02, 0.02)  # m, of quaternions, m/s, rad/s: motion capture and a gyroscope
 
 
 @dataclass(frozen=True)
@@ -46,7 +45,7 @@ class OnlineConfig(Run):
         self.hardware().delay(0.01)
 
     def hardware(self) -> Hardware:
-        return Hardware(self.latency, self.rotor_lag, tuple(self.noise * size for size in NOISE))  # type: ignore
+        return hardware(self.noise, self.latency, self.rotor_lag)
 
 
 PRESETS = {

@@ -10,13 +10,12 @@ from matplotlib.animation import FuncAnimation, PillowWriter
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
-from experiments.closed_loop.results import REFERENCES
+from experiments.flying.scenario import REFERENCES
 from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, PARTS, true_theta
-from experiments.online.flights import CHANGE, SHARED, SHOWN_EVERY, Run, Setting
+from experiments.online.flights import CHANGE, SHOWN_EVERY, Run, Setup
 from experiments.reporting.plots import PAGE, STYLE, legend_below, subplots, tick_errors
 from hybrid_jax.sim.forces import WIND_MEAN
 from hybrid_jax.state import POSITION
-from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
 
 COLOURS = {
@@ -51,27 +50,25 @@ AXES = {
 
 
 def indices(run: Run, **tags) -> list[int]:
-    return [i for i, own in enumerate(run.tags) if all(own[name] == value for name, value in tags.items())]
+    return [i for i, own in enumerate(run.trials) if tags.items() <= own._asdict().items()]
 
 
 def whole(run: Run, i: int, name: str) -> np.ndarray:
     """A quantity of a flight from its beginning on."""
-    tags = run.tags[i]
-    early = run.beginnings[str(SHARED.get(tags["agent"], tags["agent"])), tags["reference"], tags["seed"]]
-    return np.concatenate([getattr(early, name), getattr(lane(run.flown, i), name)])
+    return np.concatenate([getattr(run.before[run.trials[i].start], name), getattr(run.after, name)[i]])
 
 
 @mpl.rc_context(STYLE)
-def errors(run: Run, setting: Setting, reference: str) -> Figure:
+def errors(run: Run, setup: Setup, reference: str) -> Figure:
     """Distance from the reference over time, the root mean square over seeds, a panel for each change."""
-    changes = list(dict.fromkeys(tags["change"] for tags in run.tags))
+    changes = list(dict.fromkeys(trial.change for trial in run.trials))
     figure, panels = subplots((PAGE, 1.9 * -(-len(changes) // 2) + 0.9), -(-len(changes) // 2), 2, sharex=True)
     for panel, change in zip(panels.flat, changes, strict=False):
-        for agent in dict.fromkeys(tags["agent"] for tags in run.tags):
+        for agent in dict.fromkeys(trial.agent for trial in run.trials):
             own = np.stack(
                 [whole(run, i, "error") for i in indices(run, change=change, agent=agent, reference=reference)]
             )
-            times = setting.period * (np.arange(own.shape[1]) + 1 - setting.periods)
+            times = setup.period * (np.arange(own.shape[1]) + 1 - setup.periods)
             shown = times > -BEFORE
             rms = 100 * np.sqrt(np.mean(np.square(own), axis=0))
             width = 1.6 if agent in ("online", "oracle") else 1.0
@@ -85,14 +82,14 @@ def errors(run: Run, setting: Setting, reference: str) -> Figure:
 
 
 @mpl.rc_context(STYLE)
-def parameters(run: Run, setting: Setting, reference: str) -> Figure:
+def parameters(run: Run, setup: Setup, reference: str) -> Figure:
     """Estimates of one flight with their 95 % intervals, and the truth."""
-    changes = list(dict.fromkeys(tags["change"] for tags in run.tags))
+    changes = list(dict.fromkeys(trial.change for trial in run.trials))
     figure, panels = subplots((PAGE, 1.9 * -(-len(changes) // 2) + 0.9), -(-len(changes) // 2), 2, sharex=True)
     for panel, change in zip(panels.flat, changes, strict=False):
         i = indices(run, change=change, agent="online", reference=reference, seed=0)[0]
         theta, std = whole(run, i, "theta"), whole(run, i, "std")
-        times = setting.period * (np.arange(len(theta)) + 1 - setting.periods)
+        times = setup.period * (np.arange(len(theta)) + 1 - setup.periods)
         shown = times > -BEFORE
         for (index, name), colour in zip(SHOWN[change], ("#0072B2", "#D55E00"), strict=False):
             middle, away = theta[shown, index], Z * std[shown, index]
@@ -122,9 +119,7 @@ def _truth(change: str, index: int) -> float:
     return WIND_MEAN / IRIS.mass if change == "wind" else 0.0
 
 
-def animate(
-    path: Path, run: Run, setting: Setting, change: str, reference: str, wanted: Float[np.ndarray, "n 13"]
-) -> None:
+def animate(path: Path, run: Run, setup: Setup, change: str, reference: str, wanted: Float[np.ndarray, "n 13"]) -> None:
     """An animated picture of the flights of seed 0 in real time: from above, and the error over time."""
     flights = {}
     for agent in ANIMATED:
@@ -132,12 +127,12 @@ def animate(
         flights[agent] = whole(run, i, "states")[:, POSITION], 100 * whole(run, i, "error")
     figure = Figure(figsize=(6.4, 3.4), layout="constrained")
     above, beside = figure.subplots(1, 2, width_ratios=(1.3, 1))
-    count = 2 * setting.periods
+    count = 2 * setup.periods
     above.plot(*wanted[:count, :2].T, color="0.7", linestyle="--", linewidth=1, label="reference")
     above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     top = max(error.max() for _, error in flights.values())
     beside.set(xlabel="time after the change [s]", ylabel="error [cm]", ylim=(0, 1.05 * top))
-    beside.set_xlim(-CHANGE / 2, setting.periods * setting.period)
+    beside.set_xlim(-CHANGE / 2, setup.periods * setup.period)
     beside.axvline(0, color="0.7", linestyle=":")
     drawn = []
     for agent, (place, error) in flights.items():
@@ -151,15 +146,15 @@ def animate(
     figure.legend(loc="outside lower left", ncols=3, fontsize=7)
 
     def frame(i: int):
-        t = (i - setting.periods) * setting.period
+        t = (i - setup.periods) * setup.period
         figure.suptitle(f"{CHANGE_NAMES[change]}: {'before' if t < 0 else 'after'} the change, {t:+.1f} s")
-        times = setting.period * (np.arange(i) + 1 - setting.periods)
+        times = setup.period * (np.arange(i) + 1 - setup.periods)
         for place, error, trail, vehicle, line in drawn:
             here = place[: i // SHOWN_EVERY + 1, :2]
             trail.set_data(*here[-150:].T)
             vehicle.set_data(*here[-1:].T)
             line.set_data(times, error[:i])
 
-    frames = range(max(0, setting.periods - round(CHANGE / 2 / setting.period)), count - 1, FRAME_EVERY)
+    frames = range(max(0, setup.periods - round(CHANGE / 2 / setup.period)), count - 1, FRAME_EVERY)
     moving = FuncAnimation(figure, frame, frames=frames)  # pyright: ignore[reportArgumentType]
     moving.save(path, PillowWriter(fps=FRAMES_PER_SECOND))

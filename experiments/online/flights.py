@@ -2,10 +2,9 @@
 
 import math
 import time
-from collections.abc import Iterator, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Mapping
 from functools import partial
+from itertools import product
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -13,146 +12,191 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
-from rich.console import Console
 
-from experiments.closed_loop.flights import PATHS, WIDTH
+from experiments.flying import programs
+from experiments.flying.plant import World, plant_of, world_of
+from experiments.flying.scenario import PATHS, sampled
 from experiments.online import agents
 from experiments.online.agents import CHANGES, PARTS
-from experiments.runner.progress import Line
-from hybrid_jax.control import Controller, Hardware, Loop, sample
+from experiments.online.config import OnlineConfig
+from experiments.runner.stages import Stages
+from hybrid_jax.control import Controller, Hardware, Loop
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.online.estimator import OnlineAdaptation
-from hybrid_jax.sim.domain import Quadrotor
-from hybrid_jax.sim.flight import CLOCK, fly
-from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, weak_rotor, wind
+from hybrid_jax.sim import flight as random_flight
+from hybrid_jax.sim.forces import wind
 from hybrid_jax.state import POSITION
 from hybrid_jax.sweep.lanes import LaneMap, lane, stack
 from hybrid_jax.trajectories import Trajectories, windows_of
 from hybrid_jax.vehicle import IRIS
 
-FORCES = (drag, ground_effect, wind, weak_rotor)
 CHANGE = 4.0  # s, when the vehicle changes
 WINDOW = 10  # periods of a window of least squares
 SHOWN_EVERY = 2  # periods between two samples that are kept for figures
-SHARED = {"unadapted": "unadapted", "least_squares": "unadapted", "oracle": "unadapted"}  # the same before the change
+SAME_BEFORE = {"least_squares": "unadapted", "oracle": "unadapted"}  # agents that are another before the change
+KINDS = {"fixed": ("unadapted", "observer", "least_squares", "oracle"), "l1": ("l1",), "online": ("online",)}
 
 
-class Half(NamedTuple):
-    """Half a flight: the part before or after the change."""
+class Setup(NamedTuple):
+    """What all flights have in common.
 
-    estimator: Any
-    start: Any  # a `Moment`
-    vehicle: Parameters
-    shares: Float[Any, " f"]  # of each of FORCES, 1 where it acts
-    path: Int[Any, ""]
-    clock: Float[Any, ""]  # of the wind when the flight began [s]
-    first: Int[Any, ""]  # period
-
-
-class Flown(NamedTuple):
-    """A flight after the change: numbers at each period."""
-
-    error: Float[Any, " t"]  # distance from the reference [m]
-    altitude: Float[Any, " t"]  # m
-    states: Float[Any, "s 13"]
-    theta: Float[Any, "t p"]  # estimated change of θ in the physics' own parametrisation; nothing if not adapted
-    std: Float[Any, "t p"]
-    nis: Float[Any, " t"]
-    changes: Float[Any, " t"]
-
-
-class Setting(NamedTuple):
-    """What all flights have in common."""
+    Attributes:
+        controller: that flies.
+        hardware: between it and the vehicle.
+        references: of all PATHS.
+        periods: of the segment before the change, and of that after it.
+        bandwidths: of the agents that have one, by name [rad/s].
+    """
 
     controller: Controller
     hardware: Hardware
-    references: Float[np.ndarray, "k n 13"]  # of all PATHS
-    periods: int  # of half a flight
+    references: Float[np.ndarray, "k n 13"]
+    periods: int
+    bandwidths: Mapping[str, float]
 
     @property
     def period(self) -> float:
         return self.controller.period
 
 
-def setting(hardware: Hardware, seconds: float) -> Setting:
-    """Flights of CHANGE + seconds; both halves run the same program, so that the first is as long as the second."""
+def setup(config: OnlineConfig) -> Setup:
+    """Both segments run the same program, so that the first is as long as the second."""
+    hardware = config.hardware()
     controller = Controller(IRIS, rotor_lag=hardware.rotor_lag)
-    periods = round(seconds / controller.period)
-    references = [np.asarray(sample(path, controller, 2 * seconds + 1)) for path in PATHS.values()]
-    return Setting(controller, hardware, np.stack(references), periods)
+    references = sampled(controller, 2 * config.seconds + 1)
+    bandwidths = {"observer": config.bandwidth, "l1": config.l1_cutoff}
+    return Setup(controller, hardware, references, round(config.seconds / controller.period), bandwidths)
 
 
-def plant_of(half: Half, period: float):
-    """The simulated vehicle, as a function that `Loop.tick` takes."""
+class Trial(NamedTuple):
+    """The tags of a flight."""
 
-    def force(x, u, t, parameters) -> Wrench:
-        wrenches = [each(x, u, t, parameters) for each in FORCES]
-        return Wrench(*(jnp.tensordot(half.shares, jnp.stack(parts), 1) for parts in zip(*wrenches, strict=True)))
+    agent: str
+    change: str
+    reference: str
+    seed: int
 
-    truth = Quadrotor(half.vehicle, (force,))
-    return lambda x, u, t: truth.step(x, u, t + half.clock, period)
+    @property
+    def start(self) -> tuple[str, str, int]:
+        """Agent, reference and seed of the segment before the change, which several trials share."""
+        return SAME_BEFORE.get(self.agent, self.agent), self.reference, self.seed
 
 
-def simulate(own: Setting, half: Half, references: Float[Array, "k n 13"]):
-    """Fly half a flight; returns where it ended and what is known of it."""
-    loop = Loop(own.controller, own.hardware, half.estimator)
-    plant, reference = plant_of(half, own.period), references[half.path]
+class Segment(NamedTuple):
+    """The part of a flight before or after the change.
+
+    Attributes:
+        estimator: that adapts the controller's model.
+        moment: the closed loop at its start.
+        world: the true system.
+        path: number in PATHS.
+        first: number of its first period.
+    """
+
+    estimator: Any
+    moment: Any
+    world: World
+    path: Int[Any, ""]
+    first: Int[Any, ""]
+
+
+class Record(NamedTuple):
+    """What is kept of a segment at each period.
+
+    Attributes:
+        error: distance from the reference [m].
+        altitude: [m].
+        states: true ones, of each SHOWN_EVERY-th period.
+        theta: estimated change of θ in the physics' own parametrisation; NaN if nothing is estimated.
+        std: its standard deviation.
+        nis: normalised innovation squared.
+        changes: how many were found so far.
+    """
+
+    error: Float[Any, " t"]
+    altitude: Float[Any, " t"]
+    states: Float[Any, "s 13"]
+    theta: Float[Any, "t p"]
+    std: Float[Any, "t p"]
+    nis: Float[Any, " t"]
+    changes: Float[Any, " t"]
+
+
+class Run(NamedTuple):
+    """All flights.
+
+    Attributes:
+        trials: in the order of `after`.
+        after: records after the change, stacked.
+        before: records before it, by `Trial.start`.
+        seconds: of all flights on the clock, without compiling.
+        processor_seconds: likewise on all cores.
+    """
+
+    trials: list[Trial]
+    after: Record
+    before: dict[tuple[str, str, int], Record]
+    seconds: float = math.nan
+    processor_seconds: float = math.nan
+
+
+def simulate(own: Setup, segment: Segment, references: Float[Array, "k n 13"]):
+    """Fly a segment; returns the moment at its end and a `Record`."""
+    loop = Loop(own.controller, own.hardware, segment.estimator)
+    plant, reference = plant_of(segment.world, own.period), references[segment.path]
 
     def tick(now, i):
         after = loop.tick(plant, reference, now, i)[0]
         error = jnp.linalg.norm((after.x - reference[i + 1])[POSITION])
-        return after, (error, after.x, learned(half.estimator, after.estimate))
+        return after, (error, after.x, _estimated(segment.estimator, after.estimate))
 
-    end, (error, x, known) = jax.lax.scan(tick, half.start, half.first + jnp.arange(own.periods))
-    return end, Flown(error, x[:, 2], x[::SHOWN_EVERY], *known)
+    end, (error, x, estimated) = jax.lax.scan(tick, segment.moment, segment.first + jnp.arange(own.periods))
+    return end, Record(error, x[:, 2], x[::SHOWN_EVERY], *estimated)
 
 
-def learned(estimator, state) -> tuple[Array, ...]:
-    """θ, its standard deviation, NIS and changes found; zeros for an agent that does not estimate them."""
+def _estimated(estimator, state) -> tuple[Array, ...]:
+    """θ, its standard deviation, NIS and changes found, of an agent that estimates them."""
     if not isinstance(estimator, OnlineAdaptation):
-        return jnp.zeros(0), jnp.zeros(0), jnp.zeros(()), jnp.zeros(())
+        nothing = jnp.full(PARTS + len(agents.DISTURBANCE), jnp.nan)
+        return nothing, nothing, jnp.zeros(()), jnp.zeros(())
     theta, covariance = estimator.estimate(state)
     return theta, jnp.sqrt(jnp.diagonal(covariance)), state.nis, state.changes
 
 
-def before(own: Setting, name: str, path: str, seed: int, key, bandwidths: Mapping[str, float]) -> Half:
-    """The first half of a flight; agents that are the same before the change share it."""
-    clock: Any = np.float32(np.random.default_rng(seed).uniform(0, CLOCK))
+def before(own: Setup, agent: str, path: str, seed: int, key) -> Segment:
+    """The segment before the change."""
+    clock: Any = np.float32(np.random.default_rng(seed).uniform(0, random_flight.CLOCK))
     field = agents.nominal()
     estimators = {
-        "unadapted": lambda: agents.told(field, own.period, clock),
-        "observer": lambda: agents.told(field, own.period, clock, bandwidths["observer"]),
-        "l1": lambda: agents.L1(field, 5.0, np.asarray(bandwidths["l1"], np.float32), own.period),
+        "unadapted": lambda: agents.fixed_model(field, own.period, clock),
+        "observer": lambda: agents.fixed_model(field, own.period, clock, own.bandwidths["observer"]),
+        "l1": lambda: agents.L1(field, 5.0, np.asarray(own.bandwidths["l1"], np.float32), own.period),
         "online": lambda: agents.online(own.hardware, own.period),
     }
-    estimator, index = estimators[name](), list(PATHS).index(path)
-    start = Loop(own.controller, own.hardware, estimator).begin(
-        jnp.asarray(own.references[index, 0]), own.controller.begin(), key
-    )
-    return agents.as_numpy(
-        Half(estimator, start, *world("nothing"), np.asarray(index, np.int32), clock, np.asarray(0, np.int32))
-    )
+    estimator, index = estimators[agent](), list(PATHS).index(path)
+    loop = Loop(own.controller, own.hardware, estimator)
+    start = loop.begin(jnp.asarray(own.references[index, 0]), own.controller.begin(), key)
+    world, zero = world_of(CHANGES["nothing"], clock), np.asarray(0, np.int32)
+    return agents.as_numpy(Segment(estimator, start, world, np.asarray(index, np.int32), zero))
 
 
-def world(change: str) -> tuple[Parameters, Float[np.ndarray, " f"]]:
-    """The true vehicle, and which of FORCES act."""
-    domain = CHANGES[change]
-    parameters = agents.as_numpy(domain.quadrotor().parameters)
-    return parameters, np.array([force in domain.forces for force in FORCES], np.float32)
-
-
-def after(own: Setting, first: Half, moment: Any, change: str, estimator: Any) -> Half:
-    """The second half: another vehicle, and an estimator that may know more."""
-    vehicle, shares = world(change)
+def after(own: Setup, trial: Trial, first: Segment, moment: Any, fitted: Mapping[str, Any]) -> Segment:
+    """The segment after the change: another vehicle, and an estimator that may know more."""
+    domain, clock, estimator = CHANGES[trial.change], float(first.world.clock), first.estimator
+    if trial.agent == "oracle":
+        field = agents.as_numpy(agents.with_theta(agents.true_theta(domain)))
+        estimator = agents.fixed_model(field, own.period, clock, share=float(wind in domain.forces))
+    if trial.agent == "least_squares":
+        estimator = agents.fixed_model(lane(fitted[trial.change], trial.seed), own.period, clock)
     start = np.asarray(own.periods, np.int32)
-    return first._replace(estimator=estimator, start=moment, vehicle=vehicle, shares=shares, first=start)
+    return Segment(estimator, moment, world_of(domain, clock), first.path, start)
 
 
 def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorField:
     """`nominal` with a disturbance, fitted to ten seconds of random flight after a change, stacked over seeds."""
-    flights = fly(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
+    flights = random_flight.fly(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
     noisy = jax.vmap(jax.vmap(hardware.measure))(
         jnp.asarray(flights.states, jnp.float32),
         jax.random.split(jax.random.key(1), flights.states.shape[:2]),
@@ -170,127 +214,49 @@ def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorFi
     return stack([agents.as_numpy(each) for each in found])
 
 
-class Program:
-    """Half flights of one kind of estimator on all devices."""
-
-    def __init__(self, own: Setting, most: int):
-        width = min(WIDTH.get(jax.default_backend(), most), most)
-        self.map = LaneMap(partial(simulate, own), width, min_capacity=most, compiler=None)
-        self.shared = (own.references,)
-
-    def __call__(self, halves: Sequence[Half], active: bool = True):
-        return self.map(stack(halves), self.shared, np.ones(len(halves)), range(len(halves) if active else 0))
-
-
-def kinds(names: Sequence[str]) -> dict[str, list[str]]:
-    """Agents by the kind of their estimator, of those that fly."""
-    found = {"told": ["unadapted", "observer", "least_squares", "oracle"], "l1": ["l1"], "online": ["online"]}
-    return {kind: own for kind, of in found.items() if (own := [name for name in of if name in names])}
-
-
-class Run(NamedTuple):
-    """All flights: tags of each, results stacked in that order, and times."""
-
-    tags: list[dict[str, Any]]
-    flown: Flown
-    beginnings: dict[tuple[str, str, int], Flown]  # before the change, by agent, reference and seed
-    seconds: dict[str, float]  # on the clock, of each stage
-    processor_seconds: float = math.nan  # of all flights, on all cores, without compiling
-
-
-class Fleet(NamedTuple):
-    """What flies, before it flies."""
-
-    own: Setting
-    changes: Sequence[str]
-    firsts: Mapping[str, Mapping[tuple[str, int], Half]]  # by agent, then by reference and seed
-    fitted: Mapping[str, Any]  # by least squares on the ground, by change
-
-    def first_spots(self, members: Sequence[str]) -> list[tuple[str, str, int]]:
-        """Agent, reference and seed of each flight before the change that these agents need."""
-        names = dict.fromkeys(SHARED.get(name, name) for name in members)
-        return [(name, *place) for name in names for place in self.firsts[name]]
-
-    def begun(self, members: Sequence[str]) -> list[Half]:
-        return [self.firsts[name][path, seed] for name, path, seed in self.first_spots(members)]
-
-    def second_spots(self, members: Sequence[str]) -> list[tuple[str, str, str, int]]:
-        """Agent, change, reference and seed of each flight after the change."""
-        places = next(iter(self.firsts.values()))
-        return [(name, change, *place) for name in members for change in self.changes for place in places]
-
-    def second(self, spot: tuple[str, str, str, int], moment: Any) -> Half:
-        """The flight after the change, from where the one before it ended."""
-        name, change, path, seed = spot
-        first = self.firsts[SHARED.get(name, name)][path, seed]
-        return after(self.own, first, moment, change, changed(self.own, name, change, seed, first, self.fitted))
-
-
-def flown(
-    own: Setting,
-    names: Sequence[str],
-    changes: Sequence[str],
-    references: Sequence[str],
-    seeds: int,
-    bandwidths: Mapping[str, float],
-    console: Console,
-) -> Run:
+def fly_all(own: Setup, config: OnlineConfig, stages: Stages) -> Run:
     """Fly every agent along every reference, through every change, with every seed."""
-    seconds: dict[str, float] = {}
     fitted: dict[str, Any] = {}
-    if "least_squares" in names:
-        with _stage("least squares on the ground", seconds, console) as line:
-            for change in changes:
-                line.say(change)
-                fitted[change] = ground_fits(change, seeds, own.hardware)
-    keys = jax.random.split(jax.random.PRNGKey(0), len(references) * seeds).reshape(len(references), seeds, -1)
-    places = {(path, seed): keys[i, seed] for i, path in enumerate(references) for seed in range(seeds)}
+    if "least_squares" in config.agents:
+        jobs = [partial(ground_fits, change, config.seeds, own.hardware) for change in config.changes]
+        fitted = dict(zip(config.changes, stages.parts("least squares on the ground", jobs), strict=True))
+    places = list(product(config.references, range(config.seeds)))
+    # As plain arrays, of which segments are stacked.
+    keys = dict(zip(places, jax.random.key_data(jax.random.split(jax.random.key(0), len(places))), strict=True))
+    trials: dict[str, list[Trial]] = {}
+    for kind, members in KINDS.items():
+        if flying := [agent for agent in members if agent in config.agents]:
+            tags = product(flying, config.changes, places)
+            trials[kind] = [Trial(agent, change, *place) for agent, change, place in tags]
     firsts = {
-        name: {place: before(own, name, *place, key, bandwidths) for place, key in places.items()}
-        for name in dict.fromkeys(SHARED.get(name, name) for name in names)
+        kind: {start: before(own, *start, keys[start[1:]]) for start in dict.fromkeys(trial.start for trial in each)}
+        for kind, each in trials.items()
     }
-    fleet, found = Fleet(own, changes, firsts, fitted), kinds(names)
-    programs = {kind: Program(own, len(fleet.second_spots(members))) for kind, members in found.items()}
-    with _stage("compiling", seconds, console) as line, ThreadPoolExecutor(2) as pool:
-        line.say(f"{len(programs)} programs")
-        list(pool.map(lambda kind: programs[kind](fleet.begun(found[kind]), active=False), programs))
-    tags, parts, beginnings, worked = [], [], {}, time.process_time()
-    for kind, members in found.items():
-        with _stage(f"flying {kind}", seconds, console) as line:
-            line.say(f"{len(fleet.first_spots(members))} first halves")
-            moments, early = programs[kind](fleet.begun(members))
-            at = {spot: i for i, spot in enumerate(fleet.first_spots(members))}
-            beginnings |= {spot: lane(early, i) for spot, i in at.items()}
-            spots = fleet.second_spots(members)
-            line.say(f"{len(spots)} second halves")
-            ends = [lane(moments, at[SHARED.get(name, name), path, seed]) for name, _, path, seed in spots]
-            parts.append(programs[kind]([fleet.second(*pair) for pair in zip(spots, ends, strict=True)])[1])
-            tags += [dict(zip(("agent", "change", "reference", "seed"), spot, strict=True)) for spot in spots]
-    together = Flown(*(np.concatenate(leaves) for leaves in zip(*map(widened, parts), strict=True)))
-    return Run(tags, together, beginnings, seconds, time.process_time() - worked)
+    kinds = {kind: list(each.values()) for kind, each in firsts.items()}
+    most = {kind: len(each) for kind, each in trials.items()}
+    compiled = partial(programs.compiled, partial(simulate, own), kinds, most, (own.references,))
+    made = stages.timed("compiling", compiled, f"{len(kinds)} programs")
+    began, worked, early, late = time.perf_counter(), time.process_time(), {}, []
+    for kind, each in trials.items():
+        fly = partial(_fly_kind, own, made[kind], each, firsts[kind], fitted)
+        records, after_change = stages.timed(f"flying {kind}", fly, f"{len(each)} flights")
+        early |= records
+        late.append(after_change)
+    spent = time.perf_counter() - began, time.process_time() - worked
+    together = Record(*(np.concatenate(leaves) for leaves in zip(*late, strict=True)))
+    return Run([trial for each in trials.values() for trial in each], together, early, *spent)
 
 
-@contextmanager
-def _stage(name: str, seconds: dict[str, float], console: Console) -> Iterator[Line]:
-    """A line of progress, and how long it took."""
-    began = time.perf_counter()
-    with Line(name, console) as line:
-        yield line
-    seconds[name] = time.perf_counter() - began
-
-
-def widened(flown: Flown) -> Flown:
-    """With NaN for θ where nothing was estimated, so that all flights can be stacked."""
-    size = PARTS + len(agents.DISTURBANCE)
-    none = np.full((*flown.nis.shape, size), np.nan, np.float32)
-    return flown if flown.theta.shape[-1] else flown._replace(theta=none, std=none)
-
-
-def changed(own: Setting, name: str, change: str, seed: int, first: Half, fitted: Mapping[str, Any]) -> Any:
-    """The estimator of the second half: that of the first, unless the agent was told something."""
-    if name == "oracle":
-        field = agents.as_numpy(agents.with_theta(agents.true_theta(CHANGES[change])))
-        return agents.told(field, own.period, float(first.clock), share=float(wind in CHANGES[change].forces))
-    if name == "least_squares":
-        return agents.told(lane(fitted[change], seed), own.period, float(first.clock))
-    return first.estimator
+def _fly_kind(
+    own: Setup,
+    program: LaneMap,
+    trials: list[Trial],
+    firsts: Mapping[tuple[str, str, int], Segment],
+    fitted: Mapping[str, Any],
+) -> tuple[dict[tuple[str, str, int], Record], Record]:
+    """Records of the trials of one kind of estimator before the change, by their start, and after it, stacked."""
+    moments, records = programs.fly(program, list(firsts.values()), (own.references,))
+    numbers = {start: i for i, start in enumerate(firsts)}
+    seconds = [after(own, trial, firsts[trial.start], lane(moments, numbers[trial.start]), fitted) for trial in trials]
+    late = programs.fly(program, seconds, (own.references,))[1]
+    return {start: lane(records, i) for start, i in numbers.items()}, late

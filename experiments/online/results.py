@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from experiments.closed_loop.results import REFERENCES
+from experiments.flying.scenario import REFERENCES
 from experiments.online.agents import AGENTS, CHANGE_NAMES, CHANGES, PARTS, true_theta
-from experiments.online.flights import Run, Setting
+from experiments.online.flights import Run, Setup
 from experiments.reporting.claims import Claim, Part, Undecided, all_of
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, cross_table
@@ -32,17 +32,17 @@ class Evidence:
     flights: int
 
 
-def results_of(run: Run, setting: Setting) -> Results:
+def results_of(run: Run, setup: Setup) -> Results:
     """A row for each flight. RMSE in m: of the first second after the change, and from SETTLED on."""
-    rate = round(1 / setting.period)
+    rate = round(1 / setup.period)
     rows = []
-    for i, tags in enumerate(run.tags):
-        error, low = run.flown.error[i], run.flown.altitude[i].min()
+    for i, trial in enumerate(run.trials):
+        error, low = run.after.error[i], run.after.altitude[i].min()
         crashed = not (np.isfinite(error).all() and error.max() <= CRASH and low >= 0)
-        row: dict[str, Any] = {**tags, "crashed": crashed, "largest": float(np.max(error))}
+        row: dict[str, Any] = {**trial._asdict(), "crashed": crashed, "largest": float(np.max(error))}
         row |= {name: rms(part) for name, part in (("first_second", error[:rate]), ("settled", error[rate:]))}
-        if tags["agent"] == "online":
-            row |= _intervals(run, i, tags["change"], rate)
+        if trial.agent == "online":
+            row |= _intervals(run, i, trial.change, rate)
         rows.append(row)
     return Results(rows, TAGS)
 
@@ -54,9 +54,9 @@ def rms(values: Any) -> float:
 def _intervals(run: Run, i: int, change: str, rate: int) -> Row:
     """The share of the time from LEARNED on that each interval contains the true value; when it alarmed."""
     late = slice(round(LEARNED * rate), None)
-    theta, std = run.flown.theta[i][late, :PARTS], run.flown.std[i][late, :PARTS]
+    theta, std = run.after.theta[i][late, :PARTS], run.after.std[i][late, :PARTS]
     inside = np.abs(theta - true_theta(CHANGES[change])) <= Z * std
-    alarms = np.flatnonzero(np.diff(run.flown.changes[i], prepend=run.flown.changes[i][:1]))
+    alarms = np.flatnonzero(np.diff(run.after.changes[i], prepend=run.after.changes[i][:1]))
     shares = inside.mean(axis=0) if len(theta) else np.full(PARTS, np.nan)
     first = float(alarms[0]) / rate if len(alarms) else None
     return {"inside": dict(zip(NAMES, shares.tolist(), strict=True)), "first_alarm": first, "alarms": len(alarms)}

@@ -1,14 +1,12 @@
 """Time of one step of the filter, on one core."""
 
 import time
-from concurrent.futures import ProcessPoolExecutor
-from multiprocessing import get_context
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments.closed_loop.timing import use_one_core
+from experiments.flying.timing import on_one_core
 from experiments.online import agents
 from hybrid_jax.control import Hardware
 from hybrid_jax.vehicle import IRIS
@@ -18,8 +16,7 @@ STEPS = 1000  # that are timed
 
 def step_time(hardware: Hardware, period: float) -> float:
     """Processor time of a step of the filter on one core [ms]."""
-    with ProcessPoolExecutor(1, get_context("spawn"), use_one_core) as process:
-        return process.submit(_step_time, hardware, period).result()
+    return on_one_core(_step_time, hardware, period)
 
 
 def _step_time(hardware: Hardware, period: float) -> float:

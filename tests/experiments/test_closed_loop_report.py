@@ -14,7 +14,6 @@ from experiments.closed_loop.flights import Flown, Scenario
 from experiments.closed_loop.path_figures import paths, strip
 from experiments.closed_loop.results import (
     ERROR,
-    REFERENCES,
     TAGS,
     Agent,
     ablation_tables,
@@ -23,6 +22,7 @@ from experiments.closed_loop.results import (
     gaps,
     tables,
 )
+from experiments.flying.scenario import REFERENCES
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT

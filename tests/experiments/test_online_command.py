@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from smoke import command, experiments, refused, unbegun
 
-from experiments.online.agents import CHANGES, L1, nominal, told, true_theta, with_theta
+from experiments.online.agents import CHANGES, L1, fixed_model, nominal, true_theta, with_theta
 from experiments.online.results import NAMES, TAGS, Evidence, claims, tables
 from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
@@ -31,7 +31,7 @@ def test_the_oracle_is_the_simulator_without_ground_effect(change):
 
 
 def test_an_oracle_of_the_wind_expects_its_force():
-    agent = told(nominal(), 0.01, clock=1.3, share=1.0)
+    agent = fixed_model(nominal(), 0.01, clock=1.3, share=1.0)
     state = agent.update(agent.begin(jnp.asarray(STATES[0])), jnp.asarray(STATES[0]), jnp.asarray(SPEEDS[0]))
     extra = agent.model(state)(STATES[0], SPEEDS[0]) - nominal()(STATES[0], SPEEDS[0])
     force = (-4 + np.sin(2 / 3 * np.pi * 1.31)) / IRIS.mass

@@ -1,0 +1,1 @@
+"""Closed-loop flights in the simulator, which several experiments fly."""

@@ -1,0 +1,51 @@
+"""The simulated vehicle as arrays, so that flights of different vehicles are lanes of one program."""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax.control.loop import Plant
+from hybrid_jax.sim.domain import Domain, Quadrotor
+from hybrid_jax.sim.forces import Parameters, Wrench, drag, ground_effect, parameters_of, weak_rotor, wind
+from hybrid_jax.vehicle import IRIS
+
+FORCES = (drag, ground_effect, wind, weak_rotor)
+
+
+class World(NamedTuple):
+    """The true system of a flight.
+
+    Attributes:
+        vehicle: the true one.
+        shares: of each of FORCES, 1 where it acts.
+        clock: of the wind when the flight begins [s].
+    """
+
+    vehicle: Parameters
+    shares: Float[Any, " f"]
+    clock: Float[Any, ""]
+
+
+def world_of(domain: Domain, clock: float = 0.0) -> World:
+    vehicle = jax.tree.map(np.asarray, domain.quadrotor().parameters)
+    shares = np.array([force in domain.forces for force in FORCES], np.float32)
+    return World(vehicle, shares, np.asarray(clock, np.float32))
+
+
+def plant_of(world: World, period: float) -> Plant:
+    """The state one period later, as `control.fly` and `Loop.tick` ask for it."""
+
+    def force(x, u, t, parameters) -> Wrench:
+        wrenches = [each(x, u, t, parameters) for each in FORCES]
+        return Wrench(*(jnp.tensordot(world.shares, jnp.stack(parts), 1) for parts in zip(*wrenches, strict=True)))
+
+    truth = Quadrotor(world.vehicle, (force,))
+    return lambda x, u, t: truth.step(x, u, t + world.clock, period)
+
+
+def wind_force(clock: Float[Any, ""]) -> Float[Any, "3"]:
+    """The force of the wind [N, world] at a time [s]."""
+    return wind(jnp.zeros(13), jnp.zeros(4), clock, parameters_of(IRIS)).force

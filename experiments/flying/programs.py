@@ -1,0 +1,40 @@
+"""Programs that fly many flights at once: one for each kind of flight, compiled before the first of them."""
+
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any
+
+import jax
+import numpy as np
+
+from hybrid_jax.runtime import cores
+from hybrid_jax.sweep.lanes import LaneMap, stack
+
+WIDTH = {"cpu": 4}  # flights in one vmap; on another backend an even share of all
+
+
+def compiled(
+    simulate: Callable, kinds: Mapping[Any, Sequence[Any]], most: Mapping[Any, int], shared: tuple
+) -> dict[Any, LaneMap]:
+    """A program for each kind of flight.
+
+    Args:
+        simulate: a pure function of a flight, a tree of arrays, and of what all flights share.
+        kinds: flights of each kind, equal in structure and shapes.
+        most: flights of each kind that will fly at once, for which the program has places.
+        shared: further arguments of `simulate`.
+    """
+    programs = {}
+    for kind in kinds:
+        width = min(WIDTH.get(jax.default_backend(), -(-most[kind] // jax.device_count())), most[kind])
+        programs[kind] = LaneMap(simulate, width, min_capacity=most[kind])
+    # Processes of one run must compile in the same order.
+    with ThreadPoolExecutor(cores() if jax.process_count() == 1 else 1) as pool:
+        # By flying none: XLA computes a single chunk nevertheless, so no program is run twice for this.
+        list(pool.map(lambda kind: fly(programs[kind], kinds[kind], shared, none=True), kinds))
+    return programs
+
+
+def fly(program: LaneMap, flights: Sequence[Any], shared: tuple, none: bool = False) -> Any:
+    """What `simulate` returns of each flight, stacked."""
+    return program(stack(flights), shared, np.ones(len(flights)), range(0 if none else len(flights)))

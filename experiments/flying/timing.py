@@ -1,0 +1,33 @@
+"""Times on one core, as a flight computer would have it."""
+
+import os
+import signal
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import TypeVar
+
+import jax
+
+from hybrid_jax.runtime import configure
+
+Result = TypeVar("Result")
+
+
+def on_one_core(function: Callable[..., Result], *arguments: object) -> Result:
+    """What the function returns in a process with one core: more do not make small matrix products faster.
+
+    A system that cannot bind a process to a core (macOS) leaves it all of them.
+    """
+    # Spawned, not forked: JAX already runs threads here and has fixed the devices.
+    with ProcessPoolExecutor(1, get_context("spawn"), _use_one_core) as process:
+        return process.submit(function, *arguments).result()
+
+
+def _use_one_core() -> None:
+    """Bind this process to one core and configure JAX, before its first array."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
+    if hasattr(os, "sched_setaffinity"):
+        os.sched_setaffinity(0, {min(os.sched_getaffinity(0))})
+    jax.config.update("jax_platforms", "cpu")
+    configure()
