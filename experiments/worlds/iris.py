@@ -71,7 +71,7 @@ def _fly(
 
         def interval(carry, now):
             integral, x, u, t = carry
-            integral, command = pilot.act(integral, x, now, nominal, IRIS.max_rotor_speed, scale)
+            integral, command = pilot.act(integral, x, now, nominal, IRIS, scale)
             u = kept * u + (1 - kept) * reached * command
             x = truth.step(x, u, t, DT)
             return (integral, x, u, t + DT), (x, u)

@@ -108,7 +108,7 @@ def _fly_chunk(
 
         def decide(carry, now):
             integral, x, t = carry
-            integral, u = pilot.act(integral, x, now, nominal, vehicle.max_rotor_speed, scale)
+            integral, u = pilot.act(integral, x, now, nominal, vehicle, scale)
             x = truth.step(x, u, t, DT)
             return (integral, x, t + DT), (x, u)
 

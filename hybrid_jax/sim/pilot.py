@@ -132,11 +132,12 @@ def _draw_dither(key: PRNGKeyArray, steps: int, scale: Scale) -> Float[Array, "t
 
 
 def act(
-    integral: Vector, x: State, plan: Plan, nominal: Parameters, max_speed: float, scale: Scale
+    integral: Vector, x: State, plan: Plan, nominal: Parameters, vehicle: Vehicle, scale: Scale
 ) -> tuple[Vector, Input]:
-    """One decision: rotor speeds [rad/s] in [0, max_speed] for the current entry of the plan.
+    """One decision: rotor speeds [rad/s] that the vehicle can reach, for the current entry of the plan.
 
-    `integral` is that of the position error [m/s², world], passed in and returned.
+    `nominal` are the parameters of `vehicle`, which the pilot is tuned for. `integral` is that of the position error
+    [m/s², world], passed in and returned.
     """
     # Raise the reference to a safe altitude if wind has blown the vehicle far away.
     far, place = jnp.linalg.norm(x[POSITION][:2]) > ASTRAY * scale.length, plan.position
@@ -152,7 +153,7 @@ def act(
     torque = nominal.inertia * spin_up + jnp.cross(rates, nominal.inertia * rates)
     along_thrust = jnp.dot(lift, body_z(x[QUATERNION])) + plan.dither[3]
     thrust = nominal.mass * jnp.clip(along_thrust, 0.3 * nominal.gravity, 2.0 * nominal.gravity)
-    return integral, _allocate(thrust, torque, nominal, max_speed)
+    return integral, _allocate(thrust, torque, vehicle)
 
 
 def _flare(wanted: Scalar, altitude: Scalar, climb: Scalar, scale: Scale):
@@ -182,18 +183,17 @@ def _angular_acceleration(x: State, lift: Vector, heading: Scalar, scale: Scale)
     return jnp.array(np.array(RATE_GAIN) / scale.time) * (rates - x[BODY_RATES])
 
 
-def _allocate(thrust: Scalar, torque: Vector, nominal: Parameters, max_speed: float) -> Input:
+def _allocate(thrust: Scalar, torque: Vector, vehicle: Vehicle) -> Input:
     """Rotor speeds [rad/s] that give a thrust [N] and a torque [N m, body], clipped to what a rotor can do."""
-    k, x, y = nominal.thrust_coefficient, nominal.rotor_positions[:, 0], nominal.rotor_positions[:, 1]
-    mixer = jnp.stack([k * jnp.ones(len(x)), k * y, -k * x, nominal.torque_coefficient * nominal.spin])
     wrench = jnp.concatenate([thrust[None], torque])
-    if len(x) <= 4:  # three rotors leave yaw alone
-        squared = jnp.linalg.solve(mixer[: len(x)], wrench[: len(x)])
+    mixer, rotors = jnp.asarray(vehicle.mixer, wrench.dtype), vehicle.rotors
+    if rotors <= 4:  # three rotors leave yaw alone
+        squared = jnp.linalg.solve(mixer[:rotors], wrench[:rotors])
     else:  # the smallest squares of many that give the wrench; rows scaled, as they differ by far
         size = jnp.linalg.norm(mixer, axis=1)
         mixer = mixer / size[:, None]
         squared = mixer.T @ jnp.linalg.solve(mixer @ mixer.T, wrench / size)
-    return jnp.sqrt(jnp.clip(squared, 0.0, max_speed**2))
+    return jnp.sqrt(jnp.clip(squared, 0.0, vehicle.max_rotor_speed**2))
 
 
 def starting_state(key: PRNGKeyArray, plan: Plan, scale: Scale) -> State:
