@@ -30,7 +30,7 @@ LISTS = ("--polynomial", "--motor-order", "--topics")
 WINDOW = 10  # intervals, as of load_windows
 DT, ONE_TO_ONE = 0.01, (0.0, 1.0)  # s; rotor speed = command
 # Checks that a log may fail and still tell of its vehicle: it needs no position, and is cut at gaps and on the ground.
-BORNE = ("quantities", "gaps", "repeated samples", "time on the ground")
+BORNE = ("quantities", "slowest signal", "gaps", "repeated samples", "time on the ground")
 
 
 @dataclass(frozen=True)
@@ -82,7 +82,8 @@ def inspect(options: Options) -> None:
         raise ValueError(f"{folder}: no such file or folder")
     paths, left = find_logs(folder) if folder.is_dir() else ([folder], {})
     if not paths:
-        raise ValueError(f"{folder}: holds no logs, only {', '.join(path.name for path in left) or 'nothing'}")
+        others = "; ".join(f"{path.name}: {why.replace('FILE', path.name)}" for path, why in left.items())
+        raise ValueError(f"{folder}: holds no logs, only {others or 'nothing'}")
     logs = [look(path, vehicle, options) for path in paths]
     console = Console()
     write_page(options.out / NAME, logs, left, json_value(_described(options)), console)
@@ -90,6 +91,8 @@ def inspect(options: Options) -> None:
         found = estimate(trusted(logs, console))
         write_atomic(options.write_vehicle, vehicle_text(found, folder.resolve().stem, options.mass, options.arm))
         console.print(f"{options.write_vehicle}: written; read its comments before it is used", highlight=False)
+    if all(log.raw is None for log in logs):
+        raise SystemExit(2)  # the lines above say why
 
 
 def look(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:

@@ -12,6 +12,7 @@ from jaxtyping import Float
 from scipy.signal import lfilter
 
 from hybrid_jax.flights.attitude import interpolate, mean_of_held
+from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.cleaning import TIME_CONSTANTS
 from hybrid_jax.flights.checks.mistakes import moving_mean
 from hybrid_jax.flights.checks.motor_response import FAST
@@ -39,6 +40,7 @@ class Estimate(NamedTuple):
     lag: float  # τ [s]
     curve: Float[np.ndarray, " 3"] | None  # c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command
     seconds: float  # in flight
+    moves: bool  # whether a log tells of the velocity, without which none tells of drag
 
     @property
     def placed(self) -> bool:
@@ -107,6 +109,7 @@ def estimate(recordings: Sequence[Recording]) -> Estimate:
         lag,
         heave[lag][0] if lag in heave else None,
         sum(len(piece.u) * piece.dt for piece in pieces),
+        any({"velocity", "body_velocity", "position"} & each.signals.keys() for each in usable),
     )
 
 
@@ -136,13 +139,15 @@ def _pieces(recording: Recording) -> list[_Piece]:
     known = np.logical_and.reduce(
         [(t < start) | (t > end) for each in (motors, rates) for start, end in each.gaps()] or [t > -1]
     )
-    flying = known & (u.mean(axis=1) > FLYING * np.quantile(u.mean(axis=1), 0.9))
+    told = "rotor_speed" if motors is recording.signals.get("rotor_speed") else "command"
+    # On the ground an accelerometer measures gravity whatever the motors do.
+    flying = known & within(t, airborne(recording, told))
     force, volts = (
         _column(recording.signals.get(name), axis, t)
         for name, axis in (("specific_force", "z"), ("voltage", "battery"))
     )
     omega, edges = interpolate(t, rates.t, rates.values), np.flatnonzero(np.diff(np.r_[0, flying, 0]))
-    commands = motors is not recording.signals.get("rotor_speed")
+    commands = told == "command"
     cut = [slice(a, b) for a, b in zip(edges[::2], edges[1::2], strict=True) if (b - a) * dt > 2 * SLOW]
     return [_Piece(dt, u[part], omega[part], force[part], volts[part], commands) for part in cut]
 
@@ -177,13 +182,17 @@ def _regress(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, "3
 
 
 def _curve(pieces: Sequence[_Piece], lag: float) -> tuple[Float[np.ndarray, " 3"], float] | None:
-    """Specific force along z over the motors, for one rotor of n, and its correlation; None if it hardly varies."""
+    """Specific force along z over the motors, for one rotor of n, and its correlation; None if it hardly varies.
+
+    Of speeds, which thrust follows by their squares, c2 alone.
+    """
     lagged = np.concatenate([_lagged(piece, lag) for piece in pieces])
     force = np.concatenate([piece.force for piece in pieces])
     known = np.isfinite(force)
     if known.sum() < 100 or force[known].std() < LEAST_SPREAD:
         return None
     powers = np.stack([(lagged[known] ** power).sum(axis=1) for power in range(3)], axis=1)
+    powers *= [pieces[0].commands, pieces[0].commands, True]
     curve = np.linalg.lstsq(powers, force[known], rcond=None)[0]
     if curve[1] + 2 * curve[2] * np.quantile(lagged[known], 0.01) <= 0:
         return None  # it would fall: the commands cover too little

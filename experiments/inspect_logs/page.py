@@ -49,25 +49,37 @@ class Inspected:
         """In a few words: refused, fails, or ready."""
         failed = [f"{check.name}: {check.suggestion}" for check in self.checks if check.verdict == FAILS]
         if self.raw is None:
-            return f"not read: {self.refusal.removeprefix(f'{self.path}: ')}"
+            return f"not read: {printable(self.refusal.removeprefix(f'{self.path}: '))}"
         if failed:
             return f"FAILS {failed[0]}" + (f" (and {len(failed) - 1} more)" if len(failed) > 1 else "")
         return f"no flight: {self.refusal.removeprefix(f'{self.path}: ')}" if self.refusal else "ready"
+
+    @property
+    def name(self) -> str:
+        """The file's name, fit to be printed."""
+        return printable(self.path.name)
+
+
+def printable(text: str) -> str:
+    """A text that may hold a file's name, which may hold anything: with escapes for what is no character."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
 
 
 def write_page(
     out: Path, logs: Sequence[Inspected], left: Mapping[Path, str], config: Mapping[str, Any], console: Console
 ) -> None:
     """Write report.md, report.json, rows.csv and the figures; print the tables."""
-    rows = Results([{"log": log.path.name, "result": log.result} for log in logs], ("log",))
+    rows = Results([{"log": log.name, "result": log.result} for log in logs], ("log",))
     read = [log for log in logs if log.raw is not None]
     tables = [overview(logs), *([signal_table(read), check_table(read), legend(read)] if read else [])]
     tables += [todo(logs)] if todo(logs).lines else []
-    notes = [f"{log.path.name}: {note}" for log in read if log.raw for note in log.raw.recording.notes]
-    notes += [f"{path.name}: left: {why}" for path, why in left.items()]
+    notes = [f"{log.name}: {note}" for log in read if log.raw for note in log.raw.recording.notes]
+    notes += [
+        f"{printable(path.name)}: left: {why.replace('FILE', printable(path.name))}" for path, why in left.items()
+    ]
     notes += [NOT_RUN] if config["vehicle"] is None and read else []
     pictures = {
-        f"signals_{index}": (draw(log), f"{log.path.name}: its signals; grey: gaps")
+        f"signals_{index}": (draw(log), f"{log.name}: its signals; grey: gaps")
         for index, log in enumerate(read[:PICTURED])
     }
     figures = save_figures(out, pictures)
@@ -77,7 +89,7 @@ def write_page(
     write_report(out, Report(*given))
     say = partial(console.print, highlight=False, soft_wrap=True, markup=False)
     for log in logs:
-        say(f"{log.path.name}: {described(log)}{log.result}")
+        say(f"{log.name}: {described(log)}{log.result}")
     for note in notes:
         say(f"  {note}")
     say(f"{ready} of {len(logs)} logs are ready for a model; signals, checks and what to do: {out / 'report.md'}")
@@ -99,7 +111,7 @@ def overview(logs: Sequence[Inspected]) -> Table:
         facts = found.facts if found else {}
         told = (facts.get(key, EMPTY) for key in ("format", "vehicle", "airframe", "program"))
         size = (f"{found.duration:.1f}", str(found.rotors)) if found else (EMPTY, EMPTY)
-        lines.append((log.path.name, *told, *size, log.result))
+        lines.append((log.name, *told, *size, log.result))
     return Table("Logs", ("log", "format", "vehicle", "airframe", "program", "s", "motors", "result"), lines)
 
 
@@ -111,7 +123,7 @@ def signal_table(logs: Sequence[Inspected]) -> Table:
             gaps = signal.gaps()
             longest = f", longest {max(end - start for start, end in gaps):.3g} s" if gaps else ""
             spread = f"{signal.values.min():.3g} … {signal.values.max():.3g} {unit(name)}" if len(signal) else EMPTY
-            lines.append((log.path.name, name, signal.source, str(len(signal)), rate, f"{len(gaps)}{longest}", spread))
+            lines.append((log.name, name, signal.source, str(len(signal)), rate, f"{len(gaps)}{longest}", spread))
     header = ("log", "quantity", "from", "samples", "Hz", "gaps", "values")
     return Table("Signals at their own rates, in the library's frames and units", header, lines)
 
@@ -125,7 +137,7 @@ def check_table(logs: Sequence[Inspected]) -> Table:
     lines = []
     for log in logs:
         own = {check.name: check for check in log.checks}
-        lines.append((log.path.name, *(_verdict(own[name]) if name in own else EMPTY for name in names)))
+        lines.append((log.name, *(_verdict(own[name]) if name in own else EMPTY for name in names)))
     return Table("Checks (? cannot tell)", ("log", *names), lines)
 
 
@@ -140,7 +152,7 @@ def legend(logs: Sequence[Inspected]) -> Table:
         name: f"{check.limit:.3g} {check.unit}" if check.unit and math.isfinite(check.limit) else EMPTY
         for name, check in checks.items()
     }
-    said = "two records of one motion agree: docs/real_flight.md"
+    said = "two records of one motion agree: docs/howto/own_flights.md"
     return Table(
         "What the checks ask",
         ("check", "passes if", "limit"),
@@ -151,8 +163,8 @@ def legend(logs: Sequence[Inspected]) -> Table:
 def todo(logs: Sequence[Inspected]) -> Table:
     lines = []
     for log in logs:
-        lines += [(log.path.name, c.name, c.suggestion) for c in log.checks if c.verdict in (FAILS, WARNS)]
-        lines += [(log.path.name, "flight", log.refusal.removeprefix(f"{log.path}: "))] if log.refusal else []
+        lines += [(log.name, c.name, c.suggestion) for c in log.checks if c.verdict in (FAILS, WARNS)]
+        lines += [(log.name, "flight", log.refusal.removeprefix(f"{log.path}: "))] if log.refusal else []
     return Table("What to do", ("log", "check", "what it found, and what mends it"), lines)
 
 
@@ -169,7 +181,7 @@ def draw(log: Inspected) -> Figure:
         panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{unit(name)}]", fontsize=7)
         panel.legend(loc="upper right", fontsize=6, ncols=len(signal.axes))
     axes[-1, 0].set_xlabel("time [s]")
-    figure.suptitle(log.path.name, fontsize=10)
+    figure.suptitle(log.name, fontsize=10, parse_math=False)
     return figure
 
 

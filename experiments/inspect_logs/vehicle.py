@@ -1,10 +1,13 @@
 """A vehicle file to start from: every number that logs tell, and for the others what to measure."""
 
+import json
+
 import numpy as np
 
 from experiments.inspect_logs.estimates import GRAVITY, Estimate
 
 ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
+LEARN, OF_VELOCITY = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping"), ("drag", "aerodynamic_moment")
 WEIGH = "PLACEHOLDER: weigh it; thrust and inertia grow with it"
 TOP = 1000.0  # rad/s at full command, where speeds are not known: thrust alone matters
 
@@ -21,7 +24,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     lines = [
         "# Written from logs by python -m experiments.inspect_logs. Numbers with a # are explained; those marked",
         "# PLACEHOLDER are not told by any log: measure them.",
-        'learn = ["Ix", "Iy", "Iz", "k_rotors", "drag", "aerodynamic_moment", "rate_damping"]',
+        f"learn = {json.dumps([*LEARN, *(OF_VELOCITY if found.moves else ())])}",
         "",
         "[vehicle]",
         f'name = "{name}"',

@@ -1,5 +1,6 @@
 """From a recording, whose signals have times of their own, to the samples of a flight on one grid."""
 
+import re
 from collections.abc import Sequence
 
 import numpy as np
@@ -10,17 +11,42 @@ from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, mean_
 from hybrid_jax.flights.formats.csv import MAX_ROWS
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import GAP, ROTOR_UNITS, Recording, Signal
+from hybrid_jax.vehicle import MOST_ROTORS
 
 DT = 0.01  # s, of logs whose signals have times of their own
 STATES = ("position", "velocity", "attitude", "rates")
-# What to log, by format.
+# What to log, by format, ready to paste.
+CRAZYFLIE = (
+    *(f"stateEstimate.{each}" for each in ("x", "y", "z", "vx", "vy", "vz", "qw", "qx", "qy", "qz")),
+    *(f"{group}.{axis}" for group in ("gyro", "acc") for axis in "xyz"),
+    *(f"motor.m{i}" for i in range(1, 5)),
+    "pm.vbatMV",
+)
 ADVICE = {
-    "PX4 ULog": "set SDLOG_PROFILE 25, and list vehicle_local_position in logger_topics.txt (docs/howto/logs.md)",
-    "Crazyflie µSD": "add stateEstimate.x … z, vx … vz, qw … qz, gyro.x … z, motor.m1 … m4 to the card's config.txt",
+    "Crazyflie µSD": f"put below on:fixedFrequency in config.txt of the card: {' '.join(CRAZYFLIE)}",
     "ROS bag": 'record odometry, IMU and motors, and name them: topics={"motors": "/TOPIC:FIELD:UNIT"}',
     "Betaflight blackbox": "blackbox cannot hold them: it serves to identify thrust, inertia and lag",
     "CSV": 'name the columns in a column map: columns="MAP.toml"',
 }
+# Topics of PX4 with the interval to log them at [ms]: since when [version], of those that came or went.
+PX4_TOPICS = {"vehicle_local_position": 10, "vehicle_attitude": 5, "sensor_combined": 5, "battery_status": 100}
+PX4_TOPICS |= {"vehicle_angular_velocity": 5, "actuator_motors": 5, "actuator_outputs": 5, "esc_status": 5}
+PX4_TOPICS |= {"vehicle_status": 100}
+SINCE = {"vehicle_angular_velocity": (1, 10), "actuator_motors": (1, 13), "esc_status": (1, 8)}
+
+
+def px4_topics(version: tuple[int, int] | None) -> str:
+    """A shell command, to be run on the SD card, that lists all that a model and its identification need.
+
+    The list takes the place of PX4's profile (logged_topics.cpp: a file of topics is read in place of the profile), so
+    it must be complete.
+
+    Args:
+        version: of PX4, as (1, 14); None if unknown: then topics of all versions are listed, and PX4 passes over those
+            that it does not know.
+    """
+    lines = [f"{name} {ms}" for name, ms in PX4_TOPICS.items() if version is None or SINCE.get(name, (0, 0)) <= version]
+    return "printf '" + "".join(rf"{line}\n" for line in lines) + "' > etc/logging/logger_topics.txt"
 
 
 def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] = ()) -> FlightLog:
@@ -46,6 +72,11 @@ def to_flight(recording: Recording, dt: float = DT, polynomial: Sequence[float] 
     for signal in used:
         if len(signal) < 2:
             raise ValueError(f"{recording.name}: {signal.source} has fewer than two samples; log it at a higher rate")
+    if apart := without_common_time(recording):
+        raise ValueError(f"{recording.name}: {apart}")
+    if motors.values.shape[1] > MOST_ROTORS:
+        order = "name those of the rotors: motor_order=(0, 1, 2, 3)"
+        raise ValueError(f"{recording.name}: {motors.source} holds {motors.values.shape[1]} motors; {order}")
     first, last = max(signal.t[0] for signal in used), min(signal.t[-1] for signal in used)
     if last - first < dt:
         raise ValueError(f"{recording.name}: the signals share less than {dt} s; log them at the same time")
@@ -74,7 +105,23 @@ def missing_states(recording: Recording) -> list[str]:
 def what_to_log(recording: Recording) -> str:
     """What to change in what is logged, or why a quantity that is logged was left out."""
     invalid = next((f"{note}; wait for the estimator" for note in recording.notes if "is not valid" in note), "")
+    if recording.facts.get("format") == "PX4 ULog":
+        found = re.match(r"PX4 (\d+)\.(\d+)\.", recording.facts.get("program", ""))
+        version = (int(found[1]), int(found[2])) if found else None
+        return invalid or f"on the SD card: {px4_topics(version)}"
     return invalid or ADVICE.get(recording.facts.get("format", ""), "log it and fly again")
+
+
+def without_common_time(recording: Recording) -> str:
+    """Which signals, if any, share no time, as with two clocks."""
+    signals = [signal for name, signal in recording.signals.items() if len(signal) and name != "voltage"]
+    if not signals:
+        return ""
+    late, early = (limit(signals, key=lambda signal: signal.t[end]) for limit, end in ((max, 0), (min, -1)))
+    if late.t[0] <= early.t[-1]:
+        return ""
+    times = " and ".join(f"{each.source} from {each.t[0]:.10g} to {each.t[-1]:.10g} s" for each in (early, late))
+    return f"no time in common: {times}, from the first: do they have two clocks? log both with one (a time sync)"
 
 
 def motors_of(recording: Recording, convertible: bool = True) -> Signal:

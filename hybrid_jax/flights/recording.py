@@ -107,6 +107,5 @@ class Recording:
 
     @property
     def duration(self) -> float:
-        """From the first to the last sample of any signal [s]."""
-        ends = [(signal.t[0], signal.t[-1]) for signal in self.signals.values() if len(signal)]
-        return max(end for _, end in ends) - min(start for start, _ in ends) if ends else 0.0
+        """From the first to the last sample of the signal that lasts longest [s]."""
+        return max((float(signal.t[-1] - signal.t[0]) for signal in self.signals.values() if len(signal)), default=0.0)

@@ -86,7 +86,14 @@ MISTAKES = {
     "NED and FRD": (as_ned, THRUST, 'world = "NED" and body = "FRD"'),
     "rpm": (lambda log: with_parts(log, u=log.u * 30 / np.pi), RATIO, "rpm"),
     "commands": (lambda log: with_parts(log, u=log.u / 1100), RATIO, "normalised"),
-    "thrust": (lambda log: with_parts(log, u=log.u * 1.3), RATIO, "thrust_coefficient by 0.59"),
+    "thrust": (lambda log: with_parts(log, u=log.u * 1.8), RATIO, "thrust_coefficient by 0.30"),
+    "rad/s as rpm": (lambda log: with_parts(log, u=log.u * np.pi / 30), RATIO, "rad/s, read as rpm"),
+    "late gyro": (lambda log: with_parts(log[20:], omega=log.x[:-20, 10:]), RATES, "0.2 s late"),
+    "world velocity": (
+        lambda log: with_parts(log, v=rotation_of(log.x[:, 3:7]).apply(log.x[:, 7:10])),
+        VELOCITY,
+        'topics={"velocity"',
+    ),
     "lag": (lambda log: with_parts(log[:-5], u=log.u[5:]), LAG, "ms later"),
     "lead": (lambda log: with_parts(log[5:], u=log.u[:-5]), LAG, "ms earlier"),
 }
@@ -96,7 +103,7 @@ MISTAKES = {
 def test_mistakes_are_found_and_corrections_suggested(flight, mistake):
     make, name, words = MISTAKES[mistake]
     check = table(make(noisy(flight, np.random.default_rng(1))))[name]
-    assert check.verdict == FAILS, check
+    assert check.verdict == FAILS or (check.verdict == WARNS and " s late" in words), check
     assert words in check.suggestion, check
 
 
@@ -155,6 +162,30 @@ def test_steady_wind_fails_no_check(flight):
     still = [0, 1, 1]  # along x the rotors move it, but it does not move
     check = table(with_parts(flight, flight.x[:, :3] * still, v=flight.x[:, 7:10] * still))[THRUST]
     assert (check.verdict, check.value > 0.3) == (OK, True)
+
+
+def test_gusts_and_loads_warn_and_say_that_the_vehicle_may_have_changed(flight):
+    """A force that no thrust explains, along each axis or downwards with speed, as a load or a wing makes it."""
+    rng, t = np.random.default_rng(0), flight.t
+    gusts = np.cumsum(rng.normal(0, 0.5, (len(t), 3)), axis=0)
+    gusts = 3 * (gusts - gusts.mean(axis=0)) / gusts.std(axis=0)
+    speed, whole = np.cumsum(gusts, axis=0) * 0.01, IRIS.mass
+    drift = np.cumsum(speed, axis=0) * 0.01
+    found = table(with_parts(flight, flight.x[:, :3] + drift, v=flight.x[:, 7:10] + speed))
+    assert {check.verdict for check in found.values()} <= {OK, WARNS}
+    assert "or the vehicle has changed (wind, load, damage): adapt" in found[THRUST].suggestion
+    for mass, verdict in ((1.8, WARNS), (1.1, OK), (4.0, FAILS)):
+        check = {each.name: each for each in check_log(flight, replace(IRIS, mass=whole / mass))}[RATIO]
+        assert (check.verdict, "vehicle has changed" in check.suggestion) == (verdict, verdict == WARNS)
+
+
+@pytest.mark.parametrize("part", [1e-3, 0.05])
+def test_another_reading_that_fits_a_hair_better_is_no_mistake(flight, part):
+    """dp/dt agrees with v, so it is not in the body; an estimate of 40 ms late is common and borne."""
+    log = with_parts(flight[4:], v=flight.x[4:, 7:10] * (1 - part) + part * flight.x[:-4, 7:10])
+    assert table(log)[VELOCITY].verdict == OK
+    pushed = np.array(flight.x[:, 7:10]) - 0.1 * np.abs(flight.x[:, 7:10]) * UPWARDS
+    assert "body frame" not in table(with_parts(flight, v=pushed))[THRUST].suggestion
 
 
 def test_time_on_the_ground_is_found_and_not_compared(flight):

@@ -16,7 +16,7 @@ from surface import outcome, refusal
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
-from hybrid_jax.flights.conversion import to_flight
+from hybrid_jax.flights.conversion import px4_topics, to_flight
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.load import reordered
 from hybrid_jax.state import QUATERNION
@@ -157,7 +157,7 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
     recording = read_ulog(written(ulog(old, formats)))
     np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
     np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
-    refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "SDLOG_PROFILE")
+    refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "logger_topics.txt")
 
 
 OUTPUTS = {"actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;"}
@@ -222,12 +222,23 @@ def test_slow_signals_fail_at_their_own_rates(flight, topics, written):
     assert not failures(check_recording(recording, IRIS, 0.25), "log")
 
 
+@pytest.mark.parametrize("version", [(1, 9), (1, 12), (1, 14)], ids=str)
+def test_advice_for_the_next_flight_is_complete_for_its_version(version):
+    """A list of topics takes the place of PX4's profile, so what it lacks is lost."""
+    said = px4_topics(version)
+    listed = {line.split()[0] for line in said.split("'")[1].split(r"\n") if line}
+    assert said.endswith("> etc/logging/logger_topics.txt")
+    assert listed >= {"vehicle_local_position", "vehicle_attitude", "sensor_combined", "battery_status", "esc_status"}
+    assert ("actuator_motors" in listed, "vehicle_angular_velocity" in listed) == (version > (1, 12), version > (1, 9))
+    assert "actuator_outputs" in listed
+
+
 @pytest.mark.parametrize("missing", STATES)
 def test_a_missing_topic_is_named(flight, topics, written, missing):
     motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
     quantity = dict(zip(STATES, ("position", "attitude", "rates"), strict=True))[missing]
-    refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "SDLOG_PROFILE")
+    refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
 
 
 def test_a_log_without_motors_is_refused(topics, written):

@@ -23,6 +23,7 @@ OK, WARNS, FAILS, UNKNOWN = "ok", "warns", "fails", "cannot tell"
 GROUND = "cut it out: in_flight=True"
 MORE_FLIGHT = "check on a flight with more motion"
 UNUSUAL = "no common mistake explains it: check sensors, time stamps and columns"
+CHANGED = "or the vehicle has changed (wind, load, damage): adapt"
 THRUST = "v̇ against thrust along body z"
 RATIO, ORDER = "specific force over thrust per mass", "motor order against roll and pitch"
 SPIN, GYRO = "spin against yaw", "lag of the gyro behind the motors"
@@ -41,6 +42,8 @@ THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
 YAW_LIMIT = 0.3  # correlation: rotor torque about z is small, and two wrong signs of four leave half of it
 OPPOSED = -0.1  # correlation
+IMPROVES = 0.7  # share of the difference of two records that may remain when a mistake is undone
+POSSIBLE = 2.5  # factor of thrust per mass, either way, that a load or damage may make
 NOISE = 0.2  # share of the least motion below which two records count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
 FATAL_LAG = 40.0  # ms
@@ -87,13 +90,17 @@ def check_log(log: FlightLog, vehicle: Vehicle | None = None) -> list[Check]:
     lost, stale = float(gaps(log).mean()), float(repeats(log).mean())
     clock = "the time is in ms or µs: declare its unit"
     split = "windows stop at each; resample=… with longest_gap=… bridges short ones"
+    moved = _compare(log, "dp/dt against v", mistakes.velocities(log), LEAST_MOTION["velocity"])
+    pushed = mistakes.accelerations(log)
+    if moved.verdict == OK:
+        pushed.pop(mistakes.BODY)  # dp/dt contradicts it
     return [
         _at_most("interval between samples", log.dt, "s", LONGEST_INTERVAL, clock),
         _at_most("gaps", lost, "share of intervals", 0.01, split),
         _at_most("repeated samples", stale, "share of samples", 0.01, split),
-        _compare(log, "dp/dt against v", mistakes.velocities(log), LEAST_MOTION["velocity"]),
+        moved,
         _compare(log, "q̇ against ω", mistakes.rates(log), LEAST_MOTION["rates"]),
-        _compare(log, THRUST, mistakes.accelerations(log), LEAST_MOTION["acceleration"]),
+        _compare(log, THRUST, pushed, LEAST_MOTION["acceleration"]),
         _at_most("time on the ground", float(on_ground(log).mean()), "share of samples", 0.01, GROUND),
         _columns(log),
         *([_thrust(log, vehicle), *_motors(log, vehicle)] if vehicle is not None else []),
@@ -119,19 +126,23 @@ def _thrust(log: FlightLog, vehicle: Vehicle) -> Check:
         still = "the vehicle stays on the ground: check a log in flight"
         return Check(RATIO, math.nan, "ratio", THRUST_RATIO_LIMIT, UNKNOWN, still)
     ratio = float(along.mean() / thrust.mean())
-    fits = 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT
-    return judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "" if fits else _thrust_advice(ratio, log, vehicle))
+    if 1 / THRUST_RATIO_LIMIT <= ratio <= THRUST_RATIO_LIMIT:
+        return judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, "")
+    check = judged(RATIO, ratio, "ratio", THRUST_RATIO_LIMIT, _thrust_advice(ratio, log, vehicle))
+    return replace(check, verdict=WARNS) if CHANGED in check.suggestion else check
 
 
 def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
     if ratio <= 0:
         return "body z points down: correct the frames first"
-    for unit, factor in (("rpm", np.pi / 30), ("rev/s", 2 * np.pi), ("deg/s", np.pi / 180)):
+    units = {"rpm": np.pi / 30, "rev/s": 2 * np.pi, "deg/s": np.pi / 180, "rad/s, read as rpm": 30 / np.pi}
+    for unit, factor in units.items():
         if 0.7 < ratio / factor**2 < 1.4:
             return f"rotor speeds are in {unit}: declare it"
     if log.u.max() < 0.02 * vehicle.hover_speed:
         return "rotor speeds are normalised commands: give the polynomial that maps them to rad/s"
-    return f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+    scaled = f"multiply thrust_coefficient by {ratio:.3g}, or divide mass by it, whichever is less sure"
+    return f"{scaled}; {CHANGED}" if 1 / POSSIBLE < ratio < POSSIBLE else scaled
 
 
 def _columns(log: FlightLog) -> Check:
@@ -144,7 +155,7 @@ def _columns(log: FlightLog) -> Check:
     alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
     problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
-    advice = f"{'; '.join(problems)}: name the measured columns"
+    advice = f"{'; '.join(problems)}: log what was measured, or name its columns"
     return _at_most("columns", float(len(problems)), "suspect", 0.0, advice)
 
 
@@ -195,11 +206,15 @@ def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
     a, b = pairs[NOTHING]
     if len(a) < FEWEST or max(_size(a), _size(b)) < least:
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
-    value = _relative_error(a, b)
-    advice = _nearer(pairs, limit, least) or (UNUSUAL if value > limit else "")
-    if name != THRUST:
+    value, advice = _relative_error(a, b), _nearer(pairs, limit, least)
+    doubtful = (not advice and name == THRUST) or ((" s late" in advice or " s early" in advice) and value <= limit)
+    advice = advice or (UNUSUAL if value > limit else "")
+    if name == THRUST and advice == UNUSUAL:
+        advice = f"{UNUSUAL}; {CHANGED}"
+    elif name != THRUST:
         advice = advice or _axes_apart(a, b, least) or _other_scale(a, b)
-    return judged(name, value, "relative error", limit, advice)
+    check = judged(name, value, "relative error", limit, advice)
+    return replace(check, verdict=WARNS) if advice and doubtful else check
 
 
 def _nearer(pairs: Pairs, limit: float, least: float) -> str:
@@ -207,7 +222,8 @@ def _nearer(pairs: Pairs, limit: float, least: float) -> str:
     left = {mistake: a - b for mistake, (a, b) in pairs.items()}
     own = left[NOTHING]
     # Any improvement counts if two differ by more than noise: an axis with little motion contributes little.
-    nearer = [name for name, other in left.items() if _size(own - other) > NOISE * least and _size(other) < _size(own)]
+    most = IMPROVES * _size(own)
+    nearer = [name for name, other in left.items() if _size(own - other) > NOISE * least and _size(other) < most]
     best = min(nearer, key=lambda name: _size(left[name]), default=NOTHING)
     return best if nearer and _relative_error(*pairs[best]) <= limit else ""
 

@@ -1,5 +1,7 @@
 """Mistakes of logs: pairs of records that should be equal, such as dp/dt and v, each with one mistake undone."""
 
+from collections.abc import Iterator
+
 import numpy as np
 from jaxtyping import Float
 
@@ -9,7 +11,9 @@ from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 
 NOTHING = "nothing to correct"  # the log as it is
-LATE = 0.1  # delay or advance of a velocity that is tried [s]
+LATE = (0.1, 0.2)  # delays and advances that are tried [s]
+WORLD = 'velocity is in the world, read as the body\'s: velocity = "world", or for a bag topics={"velocity": "TOPIC"}'
+BODY = 'velocity is in the body frame (FLU): set velocity = "body"'
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
 FLIPS = dict(zip("xyz", 1 - 2 * np.eye(3), strict=True))
@@ -22,11 +26,11 @@ def velocities(log: FlightLog) -> Pairs:
     """dp/dt and v [m/s]."""
     p, v, attitude = log.x[:, POSITION], log.x[:, VELOCITY], rotation_of(log.x[:, QUATERNION])
     slope, frd = np.diff(p, axis=0) / np.diff(log.t)[:, None], BODIES["FRD"]
-    now, late = np.arange(len(v)), round(LATE / log.dt)
     stated = {
         NOTHING: v,
-        'velocity is in the body frame (FLU): set velocity = "body"': attitude.apply(v),
+        BODY: attitude.apply(v),
         'velocity is in the body frame (FRD): set velocity = "body" and body = "FRD"': attitude.apply(v @ frd),
+        WORLD: attitude.inv().apply(v),
         "x and y of velocity or position are exchanged: name their columns the other way round": v[:, [1, 0, 2]],
         'velocity is NED, position is not: convert velocity from world = "NED"': v @ WORLDS["NED"].T,
         "velocity has y and z the other way round than position: flip the signs of vy and vz": v * [1, -1, -1],
@@ -34,12 +38,19 @@ def velocities(log: FlightLog) -> Pairs:
         "velocity is in cm/s: set its unit": v * 1e-2,
         "position is in mm: set its unit": v * 1e3,
         "position is in cm: set its unit": v * 1e2,
-        f"velocity is about {LATE:g} s late: shift it": v[np.minimum(now + late, now[-1])],
-        f"velocity is about {LATE:g} s early: shift it": v[np.maximum(now - late, 0)],
-    }
+    } | {f"velocity is about {words}": v[rows] for words, rows in _shifted(log)}
     for axis, signs in FLIPS.items():
         stated[f"v{axis} and p{axis} have opposite signs: flip one"] = v * signs
     return {mistake: (slope, middle(values)) for mistake, values in stated.items()}
+
+
+def _shifted(log: FlightLog) -> Iterator[tuple[str, np.ndarray]]:
+    """What is said of a quantity that is late or early, and the rows that undo it."""
+    now = np.arange(len(log))
+    for seconds in LATE:
+        late = round(seconds / log.dt)
+        yield f"{seconds:g} s late: shift its times by that", np.minimum(now + late, now[-1])
+        yield f"{seconds:g} s early: shift its times by that", np.maximum(now - late, 0)
 
 
 def rates(log: FlightLog) -> Pairs:
@@ -53,6 +64,9 @@ def rates(log: FlightLog) -> Pairs:
         "body rates are in the world frame: rotate them into the body": (turned, back.apply(omega)),
         "body rates and attitude differ in body frame: convert the one that is FRD": (turned, omega @ BODIES["FRD"]),
         "body rates have the opposite sign": (turned, -omega),
+    }
+    found |= {
+        f"body rates are about {words}": (turned, middle(log.x[rows, BODY_RATES])) for words, rows in _shifted(log)
     }
     for mistake, attitude in _attitudes(q).items():
         found[mistake] = rates_between(log.t, attitude), omega
@@ -75,7 +89,7 @@ def accelerations(log: FlightLog) -> Pairs:
         'position and velocity alone are NED: set world = "NED" for them': (q, v @ WORLDS["NED"].T),
         "height is counted downwards: flip the signs of pz and vz": (q, v * [1, 1, -1]),
         'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
-        'velocity is in the body frame: set velocity = "body"': (q, attitude.apply(v)),
+        BODY: (q, attitude.apply(v)),
     }
     # Other mistakes of attitudes rotate thrust about z only, which wind or a load may do as well.
     stated |= {mistake: (other, v) for mistake, other in list(_attitudes(q).items())[:2]}

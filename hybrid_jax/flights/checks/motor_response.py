@@ -12,7 +12,7 @@ from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES
 from hybrid_jax.vehicle import Vehicle
 
-LONGEST_LAG = 0.1  # s, either way
+LONGEST_LAG = 0.25  # s, either way
 # Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
 # and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s

@@ -9,13 +9,16 @@ from typing import Any
 import numpy as np
 
 from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, Check, judged
-from hybrid_jax.flights.conversion import ADVICE, missing_states, motors_of, what_to_log
+from hybrid_jax.flights.conversion import missing_states, motors_of, what_to_log, without_common_time
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording, Signal
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.vehicle import MOST_ROTORS, Vehicle
 
 SLOWER = 1.5  # times the interval asked for
 REST_SHARE = 0.05  # of the largest command or speed below which a motor does not carry
 REST_SPEED = 20.0  # rad/s, where the largest is not known
+SLOW_ROTOR = 100.0  # rad/s; the rotors of every multirotor turn faster than 955 rpm in flight
+STILL = 5.0  # rad/s, below which a rotor stands
+MOVED = 0.5  # m of height that only flight explains
 BEYOND = 0.02  # share by which a motor may exceed the largest
 JUMP = 0.5  # share of the whole time that one gap may last
 USED = ("position", "velocity", "body_velocity", "attitude", "rates")
@@ -74,9 +77,20 @@ def _rotors(recording: Recording, vehicle: Vehicle | None) -> Check:
     if not found:
         return Check("number of motors", 0.0, "motors", expected, UNKNOWN, "no motors")
     who = "the vehicle file has" if vehicle is not None else "the airframe has"
-    mend = f"name those of the rotors (motor_order={tuple(range(expected))})" if found > expected else "log all motors"
+    mend = "log all motors"
+    if found > expected or found > MOST_ROTORS:
+        moving = [i for signal in _all_motors(recording) for i in range(found) if np.ptp(signal.values[:, i]) > 0]
+        named = (
+            tuple(dict.fromkeys(moving)) if vehicle is None and not stated else tuple(dict.fromkeys(moving))[:expected]
+        )
+        mend = f"name those of the rotors, which change: motor_order={named}"
     advice = f"{found} motors are logged, {who} {expected}: {mend}, or correct the vehicle file"
-    return judged("number of motors", found, "motors", expected, "" if found == expected else advice)
+    fits = found == expected and found <= MOST_ROTORS
+    return judged("number of motors", found, "motors", expected, "" if fits else advice)
+
+
+def _all_motors(recording: Recording) -> Iterator[Signal]:
+    return (recording.signals[name] for name in ROTOR_UNITS if name in recording.signals)
 
 
 def _motors(recording: Recording) -> Signal | None:
@@ -92,7 +106,8 @@ def _rates(recording: Recording, dt: float) -> Check:
     listed = ", ".join(f"{name} {_hertz(each)}" for name, each in slow.items())
     coarser = f"dt={float(f'{max(slow.values(), default=0.0):.2g}'):g}"
     kind = recording.facts.get("format", "")
-    advice = f"slower than {_hertz(dt)}: {listed}; {ADVICE.get(kind, 'log faster')}; or take {coarser}"
+    faster = "log faster" if kind == "CSV" else what_to_log(recording)
+    advice = f"slower than {_hertz(dt)}: {listed}; {faster}; or take {coarser}"
     return judged("slowest signal", worst, "s", SLOWER * dt, advice if slow else "")
 
 
@@ -104,6 +119,8 @@ def _clock(recording: Recording) -> Check:
     longest = (0.0, 0.0, "")
     for signal in recording.signals.values():
         longest = max([longest, *((end - start, start, signal.source) for start, end in signal.gaps())])
+    if apart := without_common_time(recording):
+        return judged("longest gap", recording.duration, "s", JUMP * recording.duration, apart)
     length, start, source = longest
     advice = f"{source} stops at {start:.4g} s for {length:.4g} s, most of the log: split the file there"
     most = JUMP * recording.duration
@@ -141,6 +158,17 @@ def _flown(recording: Recording, vehicle: Vehicle | None) -> Check:
     speeds = motors is recording.signals.get("rotor_speed")
     most = vehicle.max_rotor_speed if vehicle is not None else REST_SPEED / REST_SHARE
     limit = REST_SHARE * (most if speeds else 1.0)
-    value = float(motors.values.mean(axis=1).max())
-    advice = "the motors rest throughout, so nothing flew: leave the file out"
-    return judged(name, value, "rad/s" if speeds else "of the largest", limit, advice if value < limit else "")
+    # Of the fastest three: some channels may be none of a motor.
+    value = float(np.sort(motors.values, axis=1)[:, -3:].mean(axis=1).max())
+    position = recording.signals.get("position")
+    climbed = float(np.ptp(position.values[:, -1])) if position is not None and position.axes[-1] == "z" else 0.0
+    advice = ""
+    if speeds and STILL < value < SLOW_ROTOR:
+        told = f"rotor speeds up to {value:.3g} rad/s ({value * 30 / np.pi:.4g} rpm) are too slow for flight"
+        advice = f"{told}: are they rad/s or rev/s, read as rpm? correct their unit"
+    elif value < limit and climbed > MOVED:
+        told = f"the motors of {motors.source} rest, and yet the height changes by {climbed:.2g} m"
+        advice = f"{told}: the vehicle's own are in another topic, instance or column: name or log those"
+    elif value < limit:
+        advice = "the motors rest throughout, so nothing flew: leave the file out"
+    return judged(name, value, "rad/s" if speeds else "of the largest", limit, advice)
