@@ -11,10 +11,13 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.plots import STYLE, save_figure
 from experiments.reporting.tables import Table
+from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, rotation_of
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.fitting import Identified, prediction_errors
 from hybrid_jax.identification.recordings import Layout
+
+DRAGGED = 0.6  # correlation of forces with the velocity from which on they are drag
 
 
 def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Recording], layout: Layout, names):
@@ -47,9 +50,42 @@ def tables(found: Identified, logs: Sequence[Recording], left_out: Sequence[Reco
         f"share of the body rates within a window, less their trend, that commands explain: {shares}; inertia and "
         "torque have intervals that hold both regressions, of torque on acceleration and the other way round"
     )
+    if "drag" not in {_plain(row) for row in rows} and (dragged := unlearned_drag(logs)):
+        notes.append(dragged)
     if not found.converged:
         notes.append("the fit stopped before it converged: start nearer, or learn less")
     return rows, shown, notes
+
+
+def unlearned_drag(logs: Sequence[Recording]) -> str:
+    """What is to be said where forces across the thrust follow the velocity; empty where they do not."""
+    both = [pair for log in logs if (pair := _across(log)) is not None]
+    if not both:
+        return ""
+    force, velocity = (np.concatenate(each) for each in zip(*both, strict=True))
+    slope = (force * velocity).sum() / max((velocity**2).sum(), 1e-12)
+    correlation = (force * velocity).sum() / max(np.sqrt((force**2).sum() * (velocity**2).sum()), 1e-12)
+    if correlation > -DRAGGED:
+        return ""
+    told = f"specific force across the thrust is {slope:.2g} v (correlation {correlation:.2f})"
+    return f"{told}: drag, which is not learned, so lag and inertia take it up: learn drag as well"
+
+
+def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Specific force and velocity along x and y of the body, if both were measured."""
+    signals = log.signals
+    force, q = signals.get("specific_force"), signals.get("attitude")
+    if force is None or force.axes != ("x", "y", "z") or not {"velocity", "body_velocity"} & signals.keys():
+        return None
+    if "body_velocity" in signals:
+        own = signals["body_velocity"]
+        return force.values[:, :2], interpolate(force.t, own.t, own.values)[:, :2]
+    if q is None:
+        return None
+    inside = (force.t >= q.t[0]) & (force.t <= q.t[-1])
+    t, own = force.t[inside], signals["velocity"]
+    turned = rotation_of(interpolate_attitude(t, q.t, q.values)).inv().apply(interpolate(t, own.t, own.values))
+    return force.values[inside, :2], turned[:, :2]
 
 
 def _plain(row) -> str:

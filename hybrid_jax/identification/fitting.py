@@ -45,6 +45,7 @@ ROUNDS = 3  # of weights
 CLUSTER = 2.0  # s of windows that are taken as one observation,
 FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many windows
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
+OF_VELOCITY = {"drag", "aerodynamic_moment", "velocity_lag", "velocity_gain"}
 FORCE_STEPS = 5  # times as many steps have windows of forces, which no instability limits
 AXES_OF = {"Ix": 0, "Iy": 1, "Iz": 2, "torque_coefficient": 2}
 TOLERANCE = 1e-5  # share of the cost: a step that lowers it by less is slow
@@ -106,7 +107,8 @@ def identify(
         level: confidence of the intervals, between 0 and 1.
 
     Returns:
-        A parameter that the windows do not tell has an infinite interval and stays as it was.
+        A parameter that the windows do not tell has an infinite interval and stays as it was, as do those of
+        `OF_VELOCITY` where no recording holds a velocity or position.
 
     Raises:
         ValueError: of a recording that lacks something, or too few windows: name and what was expected.
@@ -118,7 +120,7 @@ def identify(
     if isinstance(physics, Actuated) and physics.reads_voltage:
         _require_voltage(recordings)
     windows, inputs, columns = cut(recordings, layout, told, measured)
-    moves = _free(field, free)
+    moves, measurable = _free(field, free), _measurable(field, recordings)
     if len(windows.start) <= moves.sum():
         raise ValueError(
             f"{recordings[0].name}: {len(windows.start)} windows for {moves.sum()} parameters; record more"
@@ -130,7 +132,7 @@ def identify(
         problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
         changes, status = jnp.zeros_like(spread), Status.RUNNING
         for _ in range(rounds):
-            theta, changes, status = _fit(field, theta, changes, problem, layout, max_steps, moves)
+            theta, changes, status = _fit(field, theta, changes, problem, layout, max_steps, moves & measurable)
             errors = {name: np.asarray(size) for name, size in rms(field, theta, changes, problem, layout).items()}
             variance = normal_equations(field, theta, changes, problem, layout)[3]
             size = jnp.sqrt(jnp.mean((changes**2 + variance)[:, TANGENT:], axis=0))
@@ -141,7 +143,7 @@ def identify(
                 problem = _weighted(field, theta, changes, problem, layout)
         equations = normal_equations(field, theta, changes, problem, layout)[0]
         cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(windows.start) // FEWEST_CLUSTERS))
-        covariance = _covariance(equations, cluster, moves, known)
+        covariance = _covariance(equations, cluster, moves, known, measurable)
         degrees = max(1, -(-len(windows.start) // cluster) - 1)
         found = unravel(theta)
         intervals = uncertainty.intervals(found, covariance, level, degrees)
@@ -304,13 +306,22 @@ def _free(field, names: Sequence[str] | None) -> np.ndarray:
     return np.concatenate(parts).astype(bool)
 
 
-def _covariance(equations: NormalEquations, cluster: int, moves, known) -> Array:
+def _measurable(field, recordings: Sequence[Recording]) -> np.ndarray:
+    """Which numbers of θ are not of a velocity that no recording measures: the windows would tell them by chance."""
+    measured = {"velocity", "body_velocity", "position"}
+    known = all(measured & each.signals.keys() for each in recordings)
+    physics = physics_of(field)
+    sizes = [leaf.size for leaf in jax.tree.leaves(eqx.filter(physics, trainable(physics)))]
+    return np.repeat([known or name not in OF_VELOCITY for name in _names(field)], sizes)
+
+
+def _covariance(equations: NormalEquations, cluster: int, moves, known, measurable) -> Array:
     """The sandwich of `uncertainty`, with windows clustered; infinite for what has no effect.
 
     To it comes what follows from the uncertainty of known parameters: S C Sᵀ with S = −H⁻¹ ∂g/∂known (delta method).
     """
     gram = np.asarray(equations.gram.sum(axis=0))
-    seen = (np.diagonal(gram) > NO_EFFECT) & moves
+    seen = (np.diagonal(gram) > NO_EFFECT) & moves & measurable
     found = np.zeros_like(gram)
     both = np.ix_(seen, seen)
     found[both] = np.asarray(uncertainty.sandwich(masked(equations, seen), int(seen.sum()), cluster))[both]

@@ -107,7 +107,12 @@ def test_numbers_that_wrapped_are_found(flight, written):
 
 def test_motors_at_rest_and_beyond_their_limits_fail(flight, written):
     resting = crazyflie(flight, **{name: np.zeros(len(flight.t), int) for name in MOTORS})
-    assert "nothing flew" in failures(check_recording(read_recording(written(resting))), "log")[0]
+    assert "another topic, instance" in failures(check_recording(read_recording(written(resting))), "log")[0]
+    still = {name: np.zeros(len(flight.t), int) for name in MOTORS} | {"stateEstimate.z": 0 * flight.t}
+    still = read_recording(written(crazyflie(flight, **still)))
+    assert "nothing flew" in failures(check_recording(still), "log")[0]
+    slow = read_recording(written(crazyflie(flight, **{f"rpm.m{i + 1}": u for i, u in enumerate(flight.u.T)})))
+    assert "read as rpm" in failures(check_recording(slow), "log")[0]
     speeds = {f"rpm.m{i + 1}": u * 30 / np.pi for i, u in enumerate(flight.u.T)}
     speeds["rpm.m2"] = np.where(np.arange(len(flight.t)) == 300, 1e6, speeds["rpm.m2"])
     (line,) = failures(check_recording(read_recording(written(crazyflie(flight, **speeds))), IRIS), "log")

@@ -21,6 +21,7 @@ from hybrid_jax.state import BODY_RATES, QUATERNION, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
 BLOCK = 1 << 22  # characters read at once
+LISTS = "a list in a cell: write each of its numbers in a column of its own"
 MAX_ROW_LENGTH = 1 << 16
 FURTHER = input_names(MOST_ROTORS)[FEWEST_ROTORS:]
 MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
@@ -127,7 +128,8 @@ def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) ->
     for at, line in enumerate(lines):
         if line.count(delimiter) != commas:
             found = f"{line.count(delimiter) + 1} fields" if line.strip() else "a blank line"
-            raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; repair or cut the row out")
+            mend = LISTS if "[" in line else "repair or cut the row out"
+            raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; {mend}")
     with contextlib.suppress(ValueError):
         table = np.loadtxt(lines, delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
         if table.shape == (len(lines), len(picked)) and np.isfinite(table).all():
@@ -146,6 +148,9 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
             if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
                 advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'
                 return f"row {row + at}, field {names[column]}: {cell[:40]!r} has a decimal comma; {advice}"
+            if re.match(r"\d{4}-\d\d-\d\d", cell) or cell.startswith("["):
+                kind = LISTS if cell.startswith("[") else "a date: write the time in seconds"
+                return f"row {row + at}, field {names[column]}: {cell[:40]!r} is {kind}"
             found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
             return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"
     return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
-from hybrid_jax.flights.log import unlike_one, wrong_norms
+from hybrid_jax.flights.log import FEW_DIGITS, SHARED, unlike_one, wrapped, wrong_norms
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
 GZIP = b"\x1f\x8b"
@@ -22,8 +22,6 @@ LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sampl
 STRAY = 0.01  # share of samples whose time stamps may be wrong
 APART = 0.5  # share of a log's time by which a few samples at an end must lie off to be such
 LOST = 0.5  # share of samples that may be no number, or no rotation, and are left out
-# Counters that may begin anew: what they are called, and the seconds that they count to.
-WRAPS = {f"{bits} bits of {unit}": 2**bits * tick for bits in (16, 32) for unit, tick in (("µs", 1e-6), ("ms", 1e-3))}
 FEWEST_OF_LINES = 100  # samples; of fewer, lines may be chance
 STRAIGHT = 1e-6  # of the steepest slope: by how much that of a line may change at a sample, by rounding
 BENT = 0.5  # share of samples with a bend from which on a signal was not made of lines
@@ -113,6 +111,9 @@ def record(
     said, signals, ordered = list(notes), {}, {}
     for name, part in parts.items():
         kept, lines = _in_order(f"{path}: {part.source}", part.ticks, tick)
+        same = np.flatnonzero(np.diff(part.ticks) == 0)
+        if (part.values[same + 1] != part.values[same]).any(axis=1).sum() > SHARED * len(part.ticks):
+            raise ValueError(f"{path}: {part.source}: many samples share a time: {FEW_DIGITS}")
         ordered[name] = part._replace(ticks=part.ticks[kept], values=part.values[kept])
         said += [f"{part.source}: {line}: left out" for line in lines]
     start = min(part.ticks[0] for part in ordered.values())
@@ -185,12 +186,6 @@ def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, l
     late, repeated = int((back > 0).sum()), int((~rising & (back == 0)).sum())
     lines += [f"{late} samples out of order by up to {back[row]:.2g} s"] if late else []
     return kept[rising], lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
-
-
-def wrapped(fall: float) -> str:
-    """Which counter, if any, falls by so many seconds when it begins anew."""
-    found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
-    return f"a counter of {found[0]} began anew" if found else ""
 
 
 def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:

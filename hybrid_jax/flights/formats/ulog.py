@@ -85,7 +85,7 @@ def _instances(data) -> tuple[dict[str, Any], list[str]]:
             tables[each.name], chosen[each.name] = each.data, (each.multi_id, alive)
     several = [(each.name, each.multi_id, chosen[each.name]) for each in data if chosen[each.name][0] != each.multi_id]
     return tables, [
-        f"{name}: instance {number} is left out" + (f": {kept} changes" if kept and alive else "")
+        f"{name}: instance {number} is left out" + (f": instance {kept} changes" if kept and alive else "")
         for name, number, (kept, alive) in several
     ]
 

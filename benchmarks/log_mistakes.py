@@ -1,0 +1,167 @@
+"""Which planted mistakes the checks of logs find, and how often they are wrong: python -m benchmarks.log_mistakes
+
+Prints the table of docs/howto/logs.md. Each mistake is made in every simulated flight, with the noise of sensors; it is
+found if a check fails or warns, or reading refuses the log, and says the words that name it.
+"""
+
+import sys
+from collections.abc import Callable
+
+import jax
+import numpy as np
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
+from hybrid_jax.flights.checks.consistency import FAILS, WARNS, check_log
+from hybrid_jax.flights.checks.suitability import check_recording
+from hybrid_jax.flights.load import recording_of
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
+from hybrid_jax.sim.flight import DT, fly, gone_wrong
+from hybrid_jax.vehicle import IRIS
+
+FLIGHTS, SECONDS = 20, 20.0
+NOISE = np.repeat([1e-3, 1e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s
+Parts = dict[str, np.ndarray]
+
+
+def parts_of(log: FlightLog) -> Parts:
+    return {"t": log.t, "p": log.x[:, :3], "q": log.x[:, 3:7], "v": log.x[:, 7:10], "w": log.x[:, 10:], "u": log.u}
+
+
+def later(name: str, rows: int) -> Callable[[Parts], Parts]:
+    """A quantity that comes late, or others that do for a negative number of rows."""
+    own, others = (slice(None, -rows), slice(rows, None)) if rows > 0 else (slice(-rows, None), slice(None, rows))
+    return lambda log: {key: value[own if key == name else others] for key, value in log.items()}
+
+
+def held(names: str, rows: int) -> Callable[[Parts], Parts]:
+    kept = lambda n: np.arange(n) // rows * rows  # noqa: E731
+    return lambda log: log | {name: log[name][kept(len(log["t"]))] for name in names}
+
+
+def drawn(log: Parts) -> Parts:
+    t = log["t"]
+    return log | {name: np.stack([np.interp(t, t[::4], c) for c in log[name][::4].T], axis=1) for name in "pv"}
+
+
+def turned(log: Parts):
+    return rotation_of(log["q"])
+
+
+def as_ned(log: Parts) -> Parts:
+    q = quaternion_of(turned(log).from_matrix(WORLDS["NED"] @ turned(log).as_matrix() @ BODIES["FRD"]))
+    return {"t": log["t"], "p": log["p"] @ WORLDS["NED"], "q": q, "v": log["v"] @ WORLDS["NED"], "u": log["u"]} | {
+        "w": log["w"] @ BODIES["FRD"]
+    }
+
+
+def columns(name: str, change) -> Callable[[Parts], Parts]:
+    return lambda log: log | {name: change(log[name])}
+
+
+UP, SIDE = [1, 1, -1], [-1, 1, 1]
+# Kind → mistake → what it does to a log, and the words that name it.
+MISTAKES: dict[str, dict[str, tuple[Callable[[Parts], Parts], str]]] = {
+    "sign": {
+        "vz": (columns("v", lambda v: v * UP), "vz and pz have opposite signs"),
+        "vx": (columns("v", lambda v: v * SIDE), "vx and px have opposite signs"),
+        "gyro z": (columns("w", lambda w: w * UP), "wz has the wrong sign"),
+        "gyro": (columns("w", lambda w: -w), "opposite sign"),
+        "qy": (columns("q", lambda q: q * [1, 1, -1, 1]), "qy has the wrong sign"),
+        "height down": (lambda log: log | {name: log[name] * UP for name in "pv"}, "height is counted downwards"),
+    },
+    "axis, order": {
+        "x and y of position": (columns("p", lambda p: p[:, [1, 0, 2]]), "exchanged"),
+        "motors 2 0 3 1": (columns("u", lambda u: u[:, [2, 0, 3, 1]]), "motor_order=(1, 3, 0, 2)"),
+        "two motors": (columns("u", lambda u: u[:, [1, 0, 2, 3]]), "motor_order=(1, 0, 2, 3)"),
+        "xyzw read as wxyz": (columns("q", lambda q: np.roll(q, -1, axis=1)), "(x, y, z, w), read as"),
+        "wxyz read as xyzw": (columns("q", lambda q: np.roll(q, 1, axis=1)), "declare wxyz"),
+        "world to body": (columns("q", lambda q: q * [1, -1, -1, -1]), "conjugate"),
+    },
+    "frame": {
+        "NED and FRD": (as_ned, 'world = "NED" and body = "FRD"'),
+        "velocity in the body": (lambda log: log | {"v": turned(log).inv().apply(log["v"])}, "body frame (FLU)"),
+        "velocity in the world": (lambda log: log | {"v": turned(log).apply(log["v"])}, "in the world, read as"),
+        "velocity NED": (columns("v", lambda v: v @ WORLDS["NED"]), "velocity is NED"),
+        "gyro FRD": (columns("w", lambda w: w @ BODIES["FRD"]), "FRD"),
+        "gyro in the world": (lambda log: log | {"w": turned(log).apply(log["w"])}, "world frame"),
+    },
+    "unit": {
+        "position mm": (columns("p", lambda p: 1e3 * p), "position is in mm"),
+        "velocity cm/s": (columns("v", lambda v: 1e2 * v), "velocity is in cm/s"),
+        "gyro deg/s": (columns("w", np.rad2deg), "degrees per second"),
+        "gyro declared deg/s": (columns("w", np.deg2rad), "declare rad/s"),
+        "rotors rpm": (columns("u", lambda u: u * 30 / np.pi), "rpm"),
+        "rotors rad/s as rpm": (columns("u", lambda u: u * np.pi / 30), "read as rpm"),
+        "commands as speeds": (columns("u", lambda u: u / 1100), "command"),
+        "time ms": (columns("t", lambda t: 1e3 * t), "in ms"),
+    },
+    "time": {
+        "velocity 0.1 s late": (later("v", 10), "0.1 s late"),
+        "gyro 0.2 s late": (later("w", 20), "0.2 s late"),
+        "motors 50 ms early": (later("u", -5), "ms later"),
+        "clock twice as fast": (columns("t", lambda t: t / 2), "times the second"),
+        "clock set back": (columns("t", lambda t: np.where(t > t[-1] / 2, t - t[-1] / 4, t)), "goes back"),
+        "six digits": (columns("t", lambda t: np.round(t + 12345.0)), "too few digits"),
+        "16 bits of ms": (columns("t", lambda t: (t + 60) % 65.536), "16 bits of ms"),
+    },
+    "rate": {
+        "33 Hz, repeated": (held("pqv", 3), "33.3 Hz"),
+        "rotors 20 Hz, repeated": (held("u", 5), "motors 20 Hz"),
+        "25 Hz, lines": (drawn, "25 Hz"),
+        "one gap of most of it": (columns("t", lambda t: np.where(t > t[-1] / 2, t + 100, t)), "most of the log"),
+    },
+    "motors": {
+        "one twice": (columns("u", lambda u: u[:, [0, 0, 2, 3]]), "equal in every sample"),
+        "one not logged": (columns("u", lambda u: u * [1, 0, 1, 1]), "u1 never changes"),
+        "another instance": (columns("u", lambda u: 0 * u), "another topic, instance"),
+        "beyond the largest": (columns("u", lambda u: u + 800 * (u > np.quantile(u, 0.99))), "max_rotor_speed"),
+    },
+}  # fmt: skip
+
+
+def sound_logs(domain: Domain, seed: int) -> list[FlightLog]:
+    found, rng = fly(domain, FLIGHTS, SECONDS, jax.random.key(seed)), np.random.default_rng(seed)
+    logs = []
+    for i in np.flatnonzero(~gone_wrong(found.states)):
+        x, u = np.array(found.states[i], float), np.array(found.inputs[i], float)
+        x += NOISE * rng.normal(size=x.shape)
+        x[:, 3:7] /= np.linalg.norm(x[:, 3:7], axis=1, keepdims=True)
+        u = np.maximum(np.concatenate([u, u[-1:]]) + rng.normal(size=(len(x), 4)), 0.0)
+        logs.append(FlightLog(DT * np.arange(len(x)), x, u))
+    return logs
+
+
+def said(log: Parts) -> list[tuple[str, str]]:
+    """Verdict and suggestion of every check that does not pass; or why the log is refused."""
+    try:
+        whole = FlightLog(log["t"], np.concatenate([log[name] for name in "pqvw"], axis=1), log["u"])
+        found = [*check_recording(recording_of(whole), IRIS, DT), *check_log(whole, IRIS)]
+    except ValueError as error:
+        return [(FAILS, str(error))]
+    return [(check.verdict, f"{check.name}: {check.suggestion}") for check in found if check.verdict in (FAILS, WARNS)]
+
+
+def main() -> int:
+    sound = {
+        domain.name: sound_logs(domain, seed) for seed, domain in enumerate((SOURCE, PARAMETER_SHIFT, EXTERNAL_FORCE))
+    }
+    for name, logs in sound.items():
+        alarms = [line for log in logs for verdict, line in said(parts_of(log)) if verdict == FAILS]
+        warned = sum(any(verdict == WARNS for verdict, _ in said(parts_of(log))) for log in logs)
+        print(f"{name}: {len(logs)} sound logs, {len(alarms)} checks fail, {warned} logs with a warning", *alarms[:3])
+    print("\n| kind | mistake | found | says |\n|---|---|---|---|")
+    least, logs = 1.0, sound[SOURCE.name]
+    for kind, mistakes in MISTAKES.items():
+        for mistake, (make, words) in mistakes.items():
+            lines = [[line for _, line in said(make(parts_of(log)))] for log in logs]
+            share = float(np.mean([any(words in line for line in each) for each in lines]))
+            least = min(least, share)
+            print(f"| {kind} | {mistake} | {100 * share:.0f} % | {words} |", flush=True)
+            if share < 0.95:
+                print("     ", lines[0][:3], file=sys.stderr)
+    return 0 if least >= 0.95 else 1
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
