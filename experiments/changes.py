@@ -4,9 +4,11 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, get_args
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from matplotlib.figure import Figure
 from rich.console import Console
 
@@ -140,16 +142,16 @@ def adapted(domain: Domain, fields: AbstractVectorField, config: ChangesConfig, 
 
     def of_draw(draw: int) -> Found:
         own = pool[drawn[draw * config.seeds : (draw + 1) * config.seeds]]
-        names, found = jax.device_get(_candidates(fields, own, flights, test, settings(config)))
-        inside = [_share_inside(found["ends"][seed], np.delete(found["flown"][seed], draw, 0)) for seed in seeds]
+        found = jax.device_get(_candidates(fields, own, flights, test, settings(config)))
+        inside = [_share_inside(found.ends[seed], np.delete(found.flown[seed], draw, 0)) for seed in seeds]
 
         def row(seed: int, i: int) -> Row:
-            taken = bool(found["taken"][seed] == i)
-            tags = {"domain": domain.name, "candidate": names[i], "draw": draw, "seed": seed, "taken": taken}
-            numbers = {name: found[name][seed, i] for name in ("test_mse", "left_out")}
+            taken = bool(found.taken[seed] == i)
+            tags = {"domain": domain.name, "candidate": found.names[i], "draw": draw, "seed": seed, "taken": taken}
+            numbers = {"test_mse": found.test_mse[seed, i], "left_out": found.left_out[seed, i]}
             return tags | numbers | {INSIDE: inside[seed] if taken else None}
 
-        return [row(seed, i) for seed in seeds for i in range(len(names))], {}
+        return [row(seed, i) for seed in seeds for i in range(len(found.names))], {}
 
     jobs = {f"flight {draw}": partial(of_draw, draw) for draw in range(config.draws)}
     found = stages.kept(f"adapt {domain.name}", jobs, identity_of(config.described(), fields, target))
@@ -176,29 +178,49 @@ def compared(fields: AbstractVectorField, config: ChangesConfig, stages: Stages,
     return rows
 
 
+class Tested(eqx.Module):
+    """The candidates of each seed, and which was taken.
+
+    Attributes:
+        names: of the candidates.
+        left_out: their errors on left-out blocks (s, c).
+        test_mse: their test errors (s, c).
+        taken: the index of the candidate that was taken (s,).
+        ends: of that one the mean squared errors at the ends of windows, and of those that touch, of the blocks that
+            were left out, as in `BlockErrors` (s, b, 2, d).
+        flown: the same of each of the flights (s, f, 2, d).
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    left_out: Array
+    test_mse: Array
+    taken: Array
+    ends: Array
+    flown: Array
+
+
 @jit_with(FAST_COMPILE)
 def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test: Trajectories, shared: Settings):
-    """The candidates' names and, by seed, their left-out and test errors, and which was taken.
+    """Each seed's candidates on its windows."""
+    places = blocks_of(windows.x0.shape[1], BLOCKS)
 
-    Also the mean squared errors of that one at the ends of windows, and of those that touch, as in `BlockErrors`: of
-    the blocks that were left out, and of each of the flights.
-    """
-    names, places = [], blocks_of(windows.x0.shape[1], BLOCKS)
-
-    def one(run):
+    def one(run) -> Tested:
         field, windows = run
         choice = Auto().solve(field, windows, windows, shared).choice
-        names[:] = choice.names
         larger = extended(field, STATE_SIZE)
 
         def error(index):
             return rollout_mse(candidate(larger, choice, index), test, EVERY, shared.solver)
 
-        errors = jax.lax.map(error, jnp.arange(len(choice.names)))
         adapted = candidate(larger, choice, choice.taken)
-        found = {"left_out": geometric_mean(choice.errors.mse), "taken": choice.taken, "test_mse": errors}
-        flown = jax.lax.map(partial(of_flight, adapted), flights)
-        return found | {"ends": choice.errors.ends[choice.taken], "flown": flown}
+        return Tested(
+            choice.names,
+            left_out=geometric_mean(choice.errors.mse),
+            test_mse=jax.lax.map(error, jnp.arange(len(choice.names))),
+            taken=choice.taken,
+            ends=choice.errors.ends[choice.taken],
+            flown=jax.lax.map(partial(of_flight, adapted), flights),
+        )
 
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
@@ -206,8 +228,7 @@ def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test:
             jax.lax.map(lambda block: predict_block(field, block[0], block[1], shared.solver).ends, blocks), axis=0
         )
 
-    found = jax.lax.map(one, (fields, windows))
-    return tuple(names), found
+    return jax.lax.map(one, (fields, windows))
 
 
 def _share_inside(ends: np.ndarray, flown: np.ndarray) -> float | None:
