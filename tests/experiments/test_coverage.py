@@ -11,12 +11,12 @@ from experiments.reporting.claims import evaluate
 from experiments.reporting.results import Results
 
 
-def rows(inside, flights=100):
+def rows(inside, flights=100, half_width=2.0):
     """Of each flight whether the interval of Ix contains the truth; k was not fitted."""
     found = []
     for draw in range(flights):
         tags = {"domain": "weak_rotor", "noise": "1", "draw": draw}
-        numbers = {"inside": draw < inside, "error": 0.5, "half_width": 2.0, "alone": 0.5}
+        numbers = {"inside": draw < inside, "error": 1.6, "half_width": half_width, "alone": 0.5}
         found += [tags | {"parameter": "Ix"} | numbers, tags | {"parameter": "k"} | dict.fromkeys(numbers)]
     return Results(found, ("domain", "noise", "draw", "parameter"))
 
@@ -25,7 +25,16 @@ def rows(inside, flights=100):
 def test_the_claim_fails_where_significantly_fewer_intervals_hold(inside, holds):
     (verdict,) = evaluate(CLAIMS, rows(inside))
     assert verdict.holds is holds
-    assert verdict.measured == f"weak_rotor 1 Ix {inside / 100:.2f} of 100"
+    assert verdict.measured == f"weak_rotor 1 Ix {inside / 100:.2f} of 100, 1.2 times as wide as needed"
+
+
+@pytest.mark.parametrize(
+    ("change", "holds"), [({"inside": 100}, False), ({"half_width": 4.0}, False), ({"inside": 30, "flights": 30}, True)]
+)
+def test_the_claim_fails_from_above_where_intervals_are_too_wide(change, holds):
+    """All of 30 hold by chance where 95 % should."""
+    (verdict,) = evaluate(CLAIMS, rows(**{"inside": 97} | change))
+    assert verdict.holds is holds
 
 
 @pytest.mark.parametrize(("inside", "means"), [(97, "So they can be taken"), (80, "something acts")])
@@ -38,7 +47,7 @@ def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
 
 def test_a_parameter_that_was_not_fitted_does_not_count():
     of_ix, of_k = pooled_table(rows(97)).lines
-    assert of_ix[3:] == ("100", "97", "50", "+0.50", "2.00")
+    assert of_ix[3:] == ("100", "97", "50", "+1.60", "2.00")
     assert of_k[3:] == ("0", "–", "–", "–", "–")
 
 
