@@ -1,33 +1,36 @@
 """Cases of adaptation: a world, a change and a flight to adapt to; from these to a row for each source and flight."""
 
+import itertools
+import time
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple, get_args
 
 import jax
 from jaxtyping import PRNGKeyArray
 
 import hybrid_jax as hj
 from experiments.paper.config import OneFlight
-from experiments.paper.study import EVERY, pretrained
+from experiments.paper.study import pretrained
 from experiments.reporting.names import HYBRID
 from experiments.reporting.results import Row
 from experiments.runner.cache import identity_of
 from experiments.runner.options import distinct
 from experiments.runner.stages import Found, Stages, rows_of
 from experiments.worlds.iris import Iris
+from experiments.worlds.measures import EXPECTED, error_of, expected_inside, parameters_of
+from experiments.worlds.methods import AUTO, METHODS, Task
 from experiments.worlds.rotorpy import ROTORPY
 from experiments.worlds.world import CHANGES, MADE_FOR, NOTHING, World, logged
 from hybrid_jax.io.datasets import Dataset
-from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.sweep.lanes import lane
 
 WORLDS: dict[str, World] = {world.name: world for world in (Iris(), *ROTORPY)}
 STEPS, LONG = 10, 100  # intervals of a window to learn from, and to test on
 LEARNING, TESTING = 20.0, 10.0  # s, of a flight
-SOURCE, TARGET, TEST, NOISE = range(4)  # purposes of a key
+SOURCE, TARGET, TEST, NOISE, TRAINING = range(5)  # purposes of a key
+MANY = 5  # flights to train on in the paper's protocol: 1000 windows
 WorldName = Literal["iris", "hummingbird", "crazyflie"]
 FlightName = Literal["moving", "hover", "near_ground", "short", "noisy", "outliers"]
 if TYPE_CHECKING:
@@ -76,6 +79,8 @@ class WorldsConfig(OneFlight):
     three times as noisy. outliers: 0.3 s of wild samples."""
     rotor_speeds: Literal["averaged", "sampled"] = "averaged"
     """How a log has them: as means over each interval, or sampled at its start."""
+    rivals: tuple[ChangeName, ...] = ("nothing", "parameter_shift", "external_force", "reaction_torque")
+    """Changes after which other methods are compared with `hj.adapt`."""
     test_flights: int = 6
     """Usual flights of ten seconds after each change, without noise."""
 
@@ -119,36 +124,62 @@ def flown_after(world: World, change: str, flight: str, draw: int, config: World
     return logged(flown, key, STEPS, noise=noise * config.noise, averaged=averaged, burst=burst)
 
 
-def tests_after(world: World, change: str, config: WorldsConfig) -> hj.Trajectories:
-    """Usual flights after a change, without noise."""
+class Tests(NamedTuple):
+    """Usual flights after a change: all without noise, and each as it would be logged."""
+
+    exact: hj.Trajectories
+    logged: list[hj.Trajectories]
+
+
+def tests_after(world: World, change: str, config: WorldsConfig) -> Tests:
+    """The flights that tell how good a model is."""
     flown = world.fly(change, USUAL, config.test_flights, TESTING, key_of(world, config, TEST))
-    return logged(flown, key_of(world, config, TEST), LONG, noise=0.0, averaged=config.rotor_speeds == "averaged")
+    key, averaged = key_of(world, config, TEST), config.rotor_speeds == "averaged"
+    noisy = logged(flown, key, LONG, noise=config.noise, averaged=averaged)
+    each = len(noisy) // config.test_flights
+    others = [noisy[i : i + each] for i in range(0, len(noisy), each)]
+    return Tests(logged(flown, key, LONG, noise=0.0, averaged=averaged), others)
 
 
-@jit_with(FAST_COMPILE)
-def error_of(field: hj.AbstractVectorField, test: hj.Trajectories):
-    """L^T_MSE, at every 0.1 s of a second."""
-    return rollout_mse(field, test, EVERY)
+def many_after(world: World, change: str, config: WorldsConfig) -> tuple[hj.Trajectories, hj.Trajectories]:
+    """Windows of many flights to train on, and others to stop by, without noise."""
+    flown = world.fly(change, USUAL, MANY + 1, LEARNING, key_of(world, config, TRAINING))
+    averaged = config.rotor_speeds == "averaged"
+    windows = logged(flown, key_of(world, config, NOISE), STEPS, noise=0.0, averaged=averaged)
+    first = len(windows) * MANY // (MANY + 1)
+    return windows[:first], windows[first:]
 
 
 def adapted(world: World, config: WorldsConfig, stages: Stages) -> list[Row]:
-    """The rows of a world: for each case, draw and source what `hj.adapt` does to its error on usual flights."""
-    source = source_flights(world, config)
-    fields = pretrained(HYBRID, world.vehicle, config, stages, source).fields
+    """The rows of a world: for each case, draw, source and method what becomes of the error on usual flights."""
+    flown = source_flights(world, config)
+    fields = pretrained(HYBRID, world.vehicle, config, stages, flown).fields
 
     def of_case(change: str, flight: str) -> Found:
         test = tests_after(world, change, config)
-        rows = []
-        for draw in range(config.draws):
-            windows = flown_after(world, change, flight, draw, config)
-            for seed in range(config.seeds):
-                field = lane(fields, seed)
-                result = hj.adapt(field, windows, learned_from=source.splits["train"])
-                before, after = (float(error_of(each, test)) for each in (field, result.field))
-                tags = {"world": world.name, "change": change, "flight": flight, "draw": draw, "seed": seed}
-                known = {"made_for": change in MADE_FOR, "chosen": result.chosen, "source_mse": before}
-                rows.append(tags | known | {"test_mse": after, "ratio": after / before})
-        return rows, {}
+        compare = flight == USUAL and change in config.rivals
+        many = many_after(world, change, config) if compare else None
+        rows: list[dict[str, Any]] = []
+        for draw, seed in itertools.product(range(config.draws), range(config.seeds)):
+            windows, noise = flown_after(world, change, flight, draw, config), FLIGHTS[flight].noise * config.noise
+            task = Task(world, lane(fields, seed), flown.splits["train"], windows, noise, many)
+            tags: dict[str, Any] = {"world": world.name, "change": change, "flight": flight, "draw": draw, "seed": seed}
+            rows += [tags | row_of(name, task, change, test) for name in (METHODS if compare else (AUTO,))]
+        # Errors on flights of another kind are not those to expect.
+        return [row if flight == USUAL else row | dict.fromkeys(EXPECTED) for row in rows], {}
 
     jobs = {f"{change} {flight}": partial(of_case, change, flight) for change, flight in config.cases()}
-    return rows_of(stages.kept(f"adapt {world.name}", jobs, identity_of(config.described(), fields, source)))
+    return rows_of(stages.kept(f"adapt {world.name}", jobs, identity_of(config.described(), fields, flown)))
+
+
+def row_of(method: str, task: Task, change: str, test: Tests) -> dict[str, Any]:
+    """What a method makes of a task, and how well that does on the tests."""
+    begun = time.process_time()
+    model = METHODS[method](task)
+    seconds = time.process_time() - begun
+    before, after = (float(error_of(field, test.exact)) for field in (task.source, model.field))
+    row: dict[str, Any] = {"method": method, "made_for": change in MADE_FOR, "seconds": seconds}
+    row |= {"chosen": model.result.chosen if model.result else None}
+    row |= {"source_mse": before, "test_mse": after, "ratio": after / before}
+    inside = expected_inside(model.field, model.result.expected if model.result else {}, test.logged)
+    return row | parameters_of(task.world, change, model.parameters) | inside

@@ -15,10 +15,15 @@ from hybrid_jax.sim.flight import CLOCK
 from hybrid_jax.sim.forces import Parameters, Scalar, parameters_of
 from hybrid_jax.vehicle import IRIS, Vehicle
 
-DOMAINS = {domain.name: domain for domain in changes.CHANGES}
 REACTION = Domain("reaction_torque", replace(IRIS, torque_coefficient=1.6 * IRIS.torque_coefficient), nominal=IRIS)
+DOMAINS = {domain.name: domain for domain in (*changes.CHANGES, REACTION)}
 MOTORS = {"motor_lag": (0.03, 1.0), "battery": (0.0, 0.9)}  # lag [s], share of the commanded speed that is reached
 AT_ONCE = 1e-9  # s
+
+
+def domain_of(change: str) -> Domain:
+    """The true system after one of `CHANGES`; motors change beside it."""
+    return DOMAINS.get(change, SOURCE)
 
 
 @dataclass(frozen=True)
@@ -33,8 +38,11 @@ class Iris:
     name: str = "iris"
     vehicle: Vehicle = IRIS
 
+    def changed(self, change: str) -> Vehicle:
+        return domain_of(change).vehicle
+
     def fly(self, change: str, kind: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
-        domain = DOMAINS.get(change, REACTION if change == REACTION.name else SOURCE)
+        domain = domain_of(change)
         lag, reached = MOTORS.get(change, (0.0, 1.0))
 
         def fly(flight: Kind, steps: int, keys: PRNGKeyArray):

@@ -165,9 +165,10 @@ class RotorPy:
 
     @property
     def vehicle(self) -> Vehicle:
-        c = self.nominal
-        places = tuple(map(tuple, c.rotors[:, :2].tolist()))
-        return Vehicle(c.mass, c.inertia, c.thrust, c.torque, places, c.spin, c.fastest, gravity=G, name=self.name)
+        return _vehicle(self.name, self.nominal)
+
+    def changed(self, change: str) -> Vehicle:
+        return _vehicle(self.name, self.truth(change))
 
     def truth(self, change: str) -> Constants:
         """The constants after one of `CHANGES`."""
@@ -196,6 +197,11 @@ class RotorPy:
     def fly(self, change: str, kind: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
         given = (Constants(*map(np.asarray, each)) for each in (self.truth(change), self.nominal))  # type: ignore
         return flown(partial(_fly, *given), kind, flights, seconds, key)
+
+
+def _vehicle(name: str, c: Constants) -> Vehicle:
+    places = tuple(map(tuple, c.rotors[:, :2].tolist()))
+    return Vehicle(c.mass, c.inertia, c.thrust, c.torque, places, c.spin, c.fastest, gravity=G, name=name)
 
 
 ROTORPY = (RotorPy("hummingbird", HUMMINGBIRD), RotorPy("crazyflie", CRAZYFLIE))

@@ -88,6 +88,10 @@ class World(Protocol):
         """Its constants before a change, as a user knows them."""
         ...
 
+    def changed(self, change: str) -> Vehicle:
+        """Its constants after one of `CHANGES`."""
+        ...
+
     def fly(self, change: str, kind: str, flights: int, seconds: float, key: PRNGKeyArray) -> Flown:
         """Flights of one of `KINDS` after one of `CHANGES`; the pilot knows the vehicle before it."""
         ...

@@ -1,0 +1,66 @@
+"""What a row says of an adapted model: its error, its parameters and their intervals, the errors that it expected."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+import hybrid_jax as hj
+from experiments.paper.study import EVERY
+from experiments.worlds.world import World
+from hybrid_jax.adaptation.adapting import Parameter
+from hybrid_jax.adaptation.expectation import Expected
+from hybrid_jax.dynamics.rigid_body import LEARNED, RIGID_BODY_SPACE, nominal
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.runtime import FAST_COMPILE, jit_with
+
+HORIZONS = {"0.1 s": 10, "1 s": 100}  # intervals
+EXPECTED = tuple(f"expected {name}" for name in HORIZONS)  # columns
+
+
+@jit_with(FAST_COMPILE)
+def error_of(field: hj.AbstractVectorField, test: hj.Trajectories):
+    """L^T_MSE, at every 0.1 s of a second."""
+    return rollout_mse(field, test, EVERY)
+
+
+def parameters_of(world: World, change: str, found: Mapping[str, Parameter]) -> dict[str, Any]:
+    """Of each of θ_p its error, half-width and whether its 95 % interval holds the truth; None where there is none.
+
+    A weak rotor has no k of its own, and the model keeps the mass, so that with another one its θ_p are others, too.
+    """
+    vehicle, truth = world.changed(change), nominal(world.changed(change))
+    other_mass = vehicle.mass != world.vehicle.mass
+    row: dict[str, Any] = {}
+    for name in LEARNED:
+        known = name in found and not other_mass and (name, change) != ("k", "weak_rotor")
+        one = found[name] if known else Parameter(np.nan)
+        bounded = known and one.has_interval and np.isfinite(one.high)
+        row |= {
+            f"{name}_error": one.value / truth[name] - 1 if known else None,
+            f"{name}_half_width": (one.high - one.low) / (2 * truth[name]) if bounded else None,
+            f"{name}_inside": bool(one.low <= truth[name] <= one.high) if bounded else None,
+        }
+    return row
+
+
+@jit_with(FAST_COMPILE)
+def _ends(field: hj.AbstractVectorField, windows: hj.Trajectories):
+    predicted = rollout_batch(field, windows.x0, windows.u, windows.dt)
+    return tuple(predicted[:, steps - 1] - windows.x[:, steps - 1] for steps in HORIZONS.values())
+
+
+def expected_inside(
+    field: hj.AbstractVectorField, expected: Expected, flights: list[hj.Trajectories]
+) -> dict[str, Any]:
+    """By horizon the share of flights and quantities whose RMSE is in the 80 % interval; None without intervals."""
+    inside: dict[str, list[bool]] = {name: [] for name in HORIZONS}
+    for windows in flights:
+        for horizon, away in zip(HORIZONS, _ends(field, windows), strict=True):
+            for part, one in RIGID_BODY_SPACE.parts:
+                if one.name in expected.get(horizon, {}):
+                    rmse = one.scale * np.sqrt(np.mean(np.sum(np.square(away[:, part]), axis=1)))
+                    _, low, high = expected[horizon][one.name]
+                    inside[horizon].append(bool(low <= rmse <= high))
+    return dict(zip(EXPECTED, (float(np.mean(each)) if each else None for each in inside.values()), strict=True))

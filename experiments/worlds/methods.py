@@ -1,0 +1,111 @@
+"""What people use to adapt a model of a vehicle to ten seconds of flight, beside `hj.adapt`."""
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hybrid_jax as hj
+from experiments.paper.conditions import Noise
+from experiments.worlds.world import DT, World
+from hybrid_jax.adaptation.adapting import Adaptation, Parameter
+from hybrid_jax.adaptation.methods import FineTune
+from hybrid_jax.estimation.uncertainty import named_parameters
+
+WHITE_BOX = "Ix", "Iy", "k", "drag"  # what physics without a network learns
+CHANGING = 1.0  # m/s² and rad/s²: the filter's prior of a disturbance
+
+
+class Task(NamedTuple):
+    """What a method may use.
+
+    Attributes:
+        world: whose vehicle, before the change, is known.
+        source: the hybrid that was trained before the change.
+        learned: what it learned from.
+        windows: of the flight to adapt to.
+        noise: of that flight; 1 is typical.
+        many: windows of many flights without noise, to train on and to stop by, as in the paper; None if not needed.
+    """
+
+    world: World
+    source: hj.AbstractVectorField
+    learned: hj.Trajectories
+    windows: hj.Trajectories
+    noise: float
+    many: tuple[hj.Trajectories, hj.Trajectories] | None
+
+
+class Model(NamedTuple):
+    """What a method gives: a field, its parameters, and what `hj.adapt` says beyond that."""
+
+    field: hj.AbstractVectorField
+    parameters: Mapping[str, Parameter]
+    result: Adaptation | None = None
+
+
+def auto(task: Task) -> Model:
+    """`hj.adapt`, with what the source learned from."""
+    return _of(hj.adapt(task.source, task.windows, learned_from=task.learned))
+
+
+def source(task: Task) -> Model:
+    """Not adapted."""
+    return Model(task.source, {name: Parameter(float(value)) for name, value in named_parameters(task.source).items()})
+
+
+def fine_tuned(method: FineTune, task: Task) -> Model:
+    """By Adam on the one flight; its last fifth tells when to stop."""
+    return _of(hj.adapt(task.source, task.windows, method=method))
+
+
+def as_in_the_paper(task: Task) -> Model:
+    """By Adam on windows of many flights, with others to stop by, all without noise."""
+    assert task.many is not None
+    train, validation = task.many
+    return _of(hj.adapt(task.source, train, method=FineTune(), validation=validation))
+
+
+def white_box(task: Task) -> Model:
+    """Least squares on physics without a network, from nominal values: no source is needed."""
+    return _of(hj.adapt(hj.rigid_body(task.world.vehicle, WHITE_BOX), task.windows, method="least_squares"))
+
+
+def kalman_filter(task: Task) -> Model:
+    """An extended Kalman filter of the same parameters, sample by sample."""
+    size = asdict(Noise())
+    noise = np.repeat([task.noise * each for each in size.values()], [3, 4, 3, 3]).tolist()
+    physics = hj.rigid_body(task.world.vehicle, WHITE_BOX)
+    online = hj.OnlineAdaptation(physics, DT, tuple(noise), disturbance=CHANGING)
+    x, u = (jnp.asarray(part).reshape(-1, part.shape[-1]) for part in (task.windows.x, task.windows.u))
+    state = _filtered(online, jnp.asarray(task.windows.x0[0]), x, u)
+    found = {
+        name: Parameter(float(v), float(low), float(high)) for name, (v, low, high) in online.intervals(state).items()
+    }
+    return Model(online.model(state), found)
+
+
+@eqx.filter_jit
+def _filtered(online: hj.OnlineAdaptation, start, x, u):
+    return jax.lax.scan(lambda state, new: (online.update(state, *new), None), online.begin(start), (x, u))[0]
+
+
+def _of(result: Adaptation) -> Model:
+    return Model(result.field, result.parameters, result)
+
+
+AUTO, SOURCE = "auto", "source"
+METHODS: dict[str, Callable[[Task], Model]] = {
+    AUTO: auto,
+    SOURCE: source,
+    "fine_tune_paper": as_in_the_paper,
+    "fine_tune": partial(fine_tuned, FineTune()),
+    "l2_sp": partial(fine_tuned, FineTune(l2_sp=1e-2)),
+    "white_box": white_box,
+    "kalman_filter": kalman_filter,
+}
