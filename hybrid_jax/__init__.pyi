@@ -21,13 +21,15 @@ from .dynamics import (
     Grid,
     Hybrid,
     RigidBody,
+    StateSpaceModel,
     actuated,
     check_grid,
     diffusion,
     rigid_body,
     with_disturbance,
+    with_hidden,
 )
-from .estimation import covariance_of, fit_least_squares, intervals
+from .estimation import covariance_of, fit_least_squares, fit_records, intervals, predict, simulate
 from .flights import load_log, load_windows
 from .integrate import RK4, SOLVERS, rollout, rollout_batch
 from .io import Model, check_savable, load, portable, save
@@ -35,6 +37,7 @@ from .networks import grid_network, residual_network
 from .networks.standardise import with_scaling
 from .online import Hypothesis, OnlineAdaptation
 from .planning import Excitation, FlightBounds, InputBounds, excitation
+from .records import Record
 from .training import Settings, Stage, fit, fit_gauss_newton, fit_in_stages, rates_by_group
 from .trajectories import Trajectories
 from .vehicle import IRIS, Vehicle, load_vehicle
@@ -52,3 +55,4 @@ __all__ += ["Settings", "Stage", "fit", "fit_in_stages", "rates_by_group"]
 __all__ += ["METHODS", "Adaptation", "FineTune", "LeastSquares", "Method", "Ridge", "Solution", "Source", "adapt"]
 __all__ += ["Excitation", "FlightBounds", "Hypothesis", "InputBounds", "OnlineAdaptation", "excitation"]
 __all__ += ["covariance_of", "fit_least_squares", "intervals", "load_log", "load_windows", "pool"]
+__all__ += ["Record", "StateSpaceModel", "fit_records", "predict", "simulate", "with_hidden"]

@@ -13,8 +13,19 @@ import hybrid_jax
 ROOT = Path(__file__).parents[1]
 # Modules and packages of the library, from the bottom: each may import what stands before it.
 ORDER = (
-    *("state", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "trajectories"),
-    *("status", "extrapolation", "dynamics", "integrate", "networks", "kernels", "rollouts", "metrics", "io"),
+    *("state", "rotation", "matrices", "chunks", "runtime", "checks", "vehicle", "state_space", "records"),
+    *(
+        "trajectories",
+        "status",
+        "extrapolation",
+        "dynamics",
+        "integrate",
+        "networks",
+        "kernels",
+        "rollouts",
+        "metrics",
+        "io",
+    ),
     *("estimation", "training", "adaptation", "online", "sweep", "sim", "flights", "control", "export"),
     *("planning", "identification"),
 )

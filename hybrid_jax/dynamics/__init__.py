@@ -3,7 +3,8 @@
 `base` defines the field and its operations, `batching` the training mode of a user's own field, `rigid_body` with
 `equations` and `terms` the equations of motion, `actuators` what is between command and rotor, `disturbance` a
 constant disturbance, `estimator` the protocol of what learns in flight, `baselines` reference models, and
-`vehicle_file` reads all of them from a TOML file. `grids` has quantities on a periodic grid in space, and diffusion.
+`vehicle_file` reads all of them from a TOML file. `outputs` says what is measured of a state, `hidden` has parts that
+no sensor shows. `grids` has quantities on a periodic grid in space, and diffusion.
 """
 
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
@@ -12,6 +13,8 @@ from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion
+from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, WithHidden, with_hidden
+from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body, with_vehicle
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.dynamics.vehicle_file import VehicleModel, load_vehicle_model
@@ -22,3 +25,13 @@ __all__ += ["AbstractEstimator", "ConstantDisturbance", "disturbed", "with_distu
 __all__ += ["Diffusion", "Grid", "check_grid", "diffusion"]
 __all__ += ["RigidBody", "Terms", "VehicleModel"]
 __all__ += ["load_vehicle_model", "perturbed", "rigid_body", "with_vehicle"]
+__all__ += [
+    "Delay",
+    "Lag",
+    "LinearDynamics",
+    "Oscillator",
+    "RandomWalk",
+    "StateSpaceModel",
+    "WithHidden",
+    "with_hidden",
+]

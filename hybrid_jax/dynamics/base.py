@@ -360,7 +360,7 @@ def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
     return jax.tree.map(lambda node: unfreeze(node.field) if frozen(node) else node, field, is_leaf=frozen)
 
 
-def trainable(field: AbstractVectorField) -> AbstractVectorField:
+def trainable(field: Any) -> Any:
     """A tree with True at each leaf that the optimiser may move, for `equinox.partition`.
 
     Args:
@@ -373,7 +373,7 @@ def trainable(field: AbstractVectorField) -> AbstractVectorField:
     return jax.tree.map(lambda node: not fixed(node) and eqx.is_inexact_array(node), field, is_leaf=fixed)
 
 
-def ravel_learned(field: AbstractVectorField) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], Any]]:
+def ravel_learned(field: Any) -> tuple[Float[Array, " p"], Callable[[Float[Array, " p"]], Any]]:
     """The learned numbers of a field as a vector, in the order of its leaves, and the field as a function of them."""
     learned, rest = eqx.partition(field, trainable(field))
     theta, unravel = ravel_pytree(learned)

@@ -1,0 +1,215 @@
+"""Parts of a system that no sensor shows: lags, delays, disturbances that move, loads that swing.
+
+Each adds states of its own behind those of a field, and acts on the field's inputs or on ẋ. Their initial states are
+unknown like any other, see `StateSpaceModel`.
+"""
+
+from abc import abstractmethod
+
+import equinox as eqx
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import AbstractVectorField
+
+Indices = tuple[int, ...]
+
+
+class AbstractHidden(eqx.Module):
+    """A part with states z of its own. Every array inside is learned."""
+
+    @property
+    @abstractmethod
+    def size(self) -> int:
+        """The number of its states k."""
+
+    @abstractmethod
+    def derivative(self, z: Float[Array, " k"], x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " k"]:
+        """ż.
+
+        Args:
+            z: its states (k,).
+            x: the states of the field (d,).
+            u: the inputs, after the parts before this one (m,).
+        """
+
+    def inputs(self, z: Float[Array, " k"], u: Float[Array, " m"]) -> Float[Array, " m"]:
+        """The inputs that act on the field; by default they pass unchanged.
+
+        Args:
+            z: its states (k,).
+            u: the inputs, after the parts before this one (m,).
+        """
+        return u
+
+    def added(self, z: Float[Array, " k"], d: int) -> Float[Array, " d"]:
+        """What is added to ẋ of the field; by default nothing.
+
+        Args:
+            z: its states (k,).
+            d: the number of states of the field.
+        """
+        return jnp.zeros(d)
+
+
+class Lag(AbstractHidden):
+    """Inputs that follow with a first-order lag: ż = (u − z) / τ, and z acts.
+
+    Attributes:
+        log_time_constant: ln τ of each of these inputs (k,), τ in seconds.
+        places: which inputs.
+    """
+
+    log_time_constant: Float[Array, " k"]
+    places: Indices = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return len(self.places)
+
+    def derivative(self, z, x, u):
+        return (u[jnp.array(self.places)] - z) / jnp.exp(self.log_time_constant)
+
+    def inputs(self, z, u):
+        return u.at[jnp.array(self.places)].set(z)
+
+
+class Delay(AbstractHidden):
+    """Inputs that act later, by a chain of equal lags whose time constants add up to the delay.
+
+    The delay of a chain is spread by delay / √order about its mean (MacDonald, Time Lags in Biological Models, 1978).
+
+    Attributes:
+        log_delay: ln of the delay, the delay in seconds.
+        places: which inputs.
+        order: lags in the chain.
+    """
+
+    log_delay: Float[Array, ""]
+    places: Indices = eqx.field(static=True)
+    order: int = eqx.field(static=True, default=4)
+
+    @property
+    def size(self) -> int:
+        return len(self.places) * self.order
+
+    def derivative(self, z, x, u):
+        chain = z.reshape(self.order, -1)
+        before = jnp.concatenate([u[jnp.array(self.places)][None], chain[:-1]])
+        return ((before - chain) * self.order / jnp.exp(self.log_delay)).ravel()
+
+    def inputs(self, z, u):
+        return u.at[jnp.array(self.places)].set(z.reshape(self.order, -1)[-1])
+
+
+class RandomWalk(AbstractHidden):
+    """A disturbance of ẋ that stays as it is but for process noise: constant without, a random walk with it.
+
+    Attributes:
+        places: which states of the field it acts on.
+    """
+
+    places: Indices = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return len(self.places)
+
+    def derivative(self, z, x, u):
+        return jnp.zeros_like(z)
+
+    def added(self, z, d):
+        return jnp.zeros(d).at[jnp.array(self.places)].set(z)
+
+
+class Oscillator(AbstractHidden):
+    """A damped oscillator that pushes, such as a load on a cable.
+
+    Its states are a and ȧ, with ä = −ω² a − 2 ζ ω ȧ + w · (x, u); g a is added to ẋ.
+
+    Attributes:
+        log_frequency: ln ω, ω in rad/s.
+        log_damping: ln ζ.
+        drive: w, what moves it, of each state and input (d + m,).
+        gain: g of each state it acts on (k,).
+        places: which states of the field it acts on.
+    """
+
+    log_frequency: Float[Array, ""]
+    log_damping: Float[Array, ""]
+    drive: Float[Array, " n"]
+    gain: Float[Array, " k"]
+    places: Indices = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return 2
+
+    def derivative(self, z, x, u):
+        frequency, pushed = jnp.exp(self.log_frequency), self.drive @ jnp.concatenate([x, u])
+        return jnp.stack([z[1], pushed - frequency**2 * z[0] - 2 * jnp.exp(self.log_damping) * frequency * z[1]])
+
+    def added(self, z, d):
+        return jnp.zeros(d).at[jnp.array(self.places)].set(self.gain * z[0])
+
+
+class LinearDynamics(AbstractHidden):
+    """Hidden linear dynamics: ż = A z + B (x, u), and C z is added to ẋ.
+
+    Attributes:
+        a: A (k, k).
+        b: B, of each state and input (k, d + m).
+        c: C, of each state it acts on (s, k).
+        places: which states of the field it acts on (s).
+    """
+
+    a: Float[Array, "k k"]
+    b: Float[Array, "k n"]
+    c: Float[Array, "s k"]
+    places: Indices = eqx.field(static=True)
+
+    @property
+    def size(self) -> int:
+        return len(self.a)
+
+    def derivative(self, z, x, u):
+        return self.a @ z + self.b @ jnp.concatenate([x, u])
+
+    def added(self, z, d):
+        return jnp.zeros(d).at[jnp.array(self.places)].set(self.c @ z)
+
+
+class WithHidden(AbstractVectorField):
+    """A field with hidden parts: its state is that of the field, then the states of each part in turn.
+
+    Attributes:
+        field: the field that the parts act on.
+        parts: the hidden parts; the first is told the inputs, each next one what the one before lets through.
+    """
+
+    field: AbstractVectorField
+    parts: tuple[AbstractHidden, ...]
+
+    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
+        hidden = sum(part.size for part in self.parts)
+        d, own, slopes = len(x) - hidden, x[: len(x) - hidden], []
+        at, added = d, jnp.zeros(d)
+        for part in self.parts:
+            z = x[at : at + part.size]
+            slopes.append(part.derivative(z, own, u))
+            u, added, at = part.inputs(z, u), added + part.added(z, d), at + part.size
+        return jnp.concatenate([self.field(own, u) + added, *slopes])
+
+
+def with_hidden(field: AbstractVectorField, *parts: AbstractHidden) -> WithHidden:
+    """A field to which hidden parts are added, any number of each kind.
+
+    Args:
+        field: the field that the parts act on.
+        parts: such as `Lag`, `Delay`, `RandomWalk`, `Oscillator` and `LinearDynamics`.
+
+    Raises:
+        ValueError: no part, or something else.
+    """
+    return WithHidden(field, tuple(checks.list_of("parts", parts, AbstractHidden)))

@@ -1,0 +1,265 @@
+"""Fit a model to records of which not every state was measured, and predict from what was just seen.
+
+Unknown are the learned numbers of the model and the state at the start of each record; with process noise, or for a
+first approach, also the states at the starts of segments (`shooting`). Levenberg–Marquardt takes the steps, on normal
+equations summed over segments, so memory grows with the number of unknowns, not with the length of a record.
+"""
+
+import dataclasses
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float
+
+from hybrid_jax import checks
+from hybrid_jax.dynamics.base import Frozen, ravel_learned, trainable
+from hybrid_jax.dynamics.disturbance import physics_of
+from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.estimation import record_search, shooting, uncertainty
+from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
+from hybrid_jax.estimation.normal_equations import inverse
+from hybrid_jax.estimation.record_search import TINY
+from hybrid_jax.estimation.shooting import Problem
+from hybrid_jax.estimation.uncertainty import Interval
+from hybrid_jax.integrate import RK4
+from hybrid_jax.records import Between, Record, Signal, on_grid
+from hybrid_jax.status import Status
+
+CONTINUOUS = 1e-6  # the same of a state without process noise beside one that has some
+
+
+class RecordFit(eqx.Module):
+    """The result of `fit_records`.
+
+    Attributes:
+        model: with the fitted numbers; the start state is that of the first record.
+        starts: the state at the start of each record (r, d).
+        starts_error: its standard error (r, d).
+        ends: the state at the end of each record (r, d).
+        times: the first and last time of each record that was compared [s] (r, 2).
+        intervals: confidence interval of each physical parameter, number by number. It is infinite for one that the
+            records do not determine.
+        errors: RMS of each output's errors in the fit (k).
+        set_aside: how many samples of each output counted less, as their errors were too large.
+        covariance: of the learned numbers (p, p), in the order of `ravel_learned`.
+        steps: of Levenberg–Marquardt, all rounds together.
+        status: how the last round ended.
+    """
+
+    model: StateSpaceModel
+    starts: Float[np.ndarray, "r d"]
+    starts_error: Float[np.ndarray, "r d"]
+    ends: Float[np.ndarray, "r d"]
+    times: Float[np.ndarray, "r 2"]
+    intervals: dict[str, Interval]
+    errors: dict[str, Float[np.ndarray, " k"]]
+    set_aside: dict[str, int]
+    covariance: Float[np.ndarray, "p p"]
+    steps: int
+    status: Status
+
+    @property
+    def undetermined(self) -> tuple[str, ...]:
+        """The physical parameters that the records do not determine."""
+        return tuple(name for name, each in self.intervals.items() if not np.isfinite(float(each.high - each.low)))
+
+
+def fit_records(
+    model: StateSpaceModel,
+    records: Sequence[Record],
+    *,
+    dt: float,
+    between: Between = "held",
+    segment: float | None = None,
+    prior: Mapping[str, float] | None = None,
+    noise: Mapping[str, float] | None = None,
+    robust: float = np.inf,
+    rounds: int = 2,
+    max_steps: int = 50,
+    solver: Solver = None,
+    substeps: int = 1,
+    level: float = 0.95,
+) -> RecordFit:
+    """Fit the learned numbers of a model to what was measured, whatever was measured, and the initial states.
+
+    Args:
+        model: the start of the search.
+        records: one or more; each output is compared wherever a record has samples of it.
+        dt: length of the intervals in which the inputs are constant [s].
+        between: how inputs act between their samples: "held", "linear" or "averaged", see `records.on_grid`.
+        segment: length of the pieces of multiple shooting [s], from which a simulation is approached; by default the
+            simulation begins at once. Necessary for unstable systems, far starts, and process noise.
+        prior: how far learned numbers may be expected from where they are, by the beginning of their path, for example
+            {"field.residual": 0.3}; the others are free.
+        noise: the size of the errors that are expected of each output in the first round, by default the deviation of
+            its samples. Against it `prior` is weighed.
+        robust: from the second round on, an error of more than so many times the usual one counts linearly. By default
+            all count as squares; 3 is usual for data with outliers.
+        rounds: fits, each with outputs weighted by the errors of the one before.
+        max_steps: of Levenberg–Marquardt in each round.
+        solver: of diffrax, by default `RK4`.
+        substeps: steps of the solver in each interval.
+        level: confidence of the intervals, between 0 and 1.
+
+    Raises:
+        ValueError: a record without a signal of the model, too many unknowns, or no finite error at the start.
+    """
+    records = checks.list_of("records", records, Record)
+    if not records:
+        raise ValueError("records: at least one is needed")
+    checks.positive("dt", dt, "a positive number of seconds")
+    if not robust > 0:
+        raise ValueError(f"robust must be a positive number, got {checks.short_repr(robust)}")
+    for name, number in (("rounds", rounds), ("max_steps", max_steps), ("substeps", substeps)):
+        checks.count(name, number)
+    if any(model.process) and segment is None:
+        raise ValueError("segment must be given with process noise: it acts between segments")
+    gridded = [on_grid(each, model.inputs, tuple(model.outputs), dt, between) for each in records]
+    with jax.enable_x64(True):
+        model = _in_double(model)
+        y = {name: np.concatenate([each.y[name] for each in gridded]) for name in gridded[0].y}
+        deviation = {name: np.maximum(each.std(axis=0), TINY) for name, each in y.items()}
+        known = {name: np.full_like(deviation[name], size) for name, size in (noise or {}).items()}
+        scale = {name: jnp.asarray(each) for name, each in (deviation | known).items()}
+        problem = Problem(model, scale, np.inf, dt, RK4() if solver is None else solver, substeps)
+        steps = record_search.steps_of(segment, gridded, dt)
+        theta = np.asarray(ravel_learned(model)[0])
+        near = record_search.deviations_of(model, prior or {})
+        search = record_search.Search(problem, gridded, near, theta, shooting.cut(gridded, steps))
+        z, total = record_search.approached(search, segment), 0
+        if any(model.process):
+            noise = np.array(model.process) * np.sqrt(steps * dt)
+            search = search._replace(off=np.maximum(noise, CONTINUOUS * record_search.sizes_of(search, z)))
+        else:
+            z = np.concatenate([z[: len(theta)], search.nodes(z)[:, 0].ravel()])
+        for i in range(rounds):
+            end = record_search.descend(search.system, z, max_steps=max_steps)
+            z, total = end.z, total + end.steps
+            errors = search.errors(z)
+            if i < rounds - 1:
+                sizes = {name: jnp.asarray(_size(each, robust)) for name, each in errors.items()}
+                search = search._replace(problem=Problem(model, sizes, robust, dt, problem.solver, substeps))
+        return _result(search, end._replace(steps=total), errors, robust, level)
+
+
+def simulate(
+    model: StateSpaceModel,
+    record: Record,
+    start: Float[np.ndarray, " d"] | None = None,
+    *,
+    dt: float,
+    begin: float | None = None,
+    between: Between = "held",
+    solver: Solver = None,
+    substeps: int = 1,
+) -> tuple[dict[str, Float[np.ndarray, "n k"]], Float[np.ndarray, "t d"]]:
+    """The outputs at the times of a record's samples, and the states at the edges of all intervals.
+
+    Args:
+        model: what is simulated.
+        record: the inputs, and the times of the outputs' samples; the values of outputs are not read.
+        start: the state at the first time (d,), by default that of the model.
+        dt: length of the intervals in which inputs are constant [s].
+        begin: the first time [s], by default that of the first sample of an output.
+        between: how inputs act between samples.
+        solver: of diffrax, by default `RK4`.
+        substeps: steps of the solver in each interval.
+
+    Raises:
+        ValueError: a record without a signal of the model.
+    """
+    gridded = [on_grid(record, model.inputs, tuple(model.outputs), dt, between, begin)]
+    with jax.enable_x64(True):
+        model = _in_double(model)
+        problem = Problem(model, {}, np.inf, dt, RK4() if solver is None else solver, substeps)
+        segments = shooting.cut(gridded, len(gridded[0].u))
+        x0 = jnp.asarray(model.start if start is None else start, float)[None]
+        y, states = shooting.simulated(problem, model, x0, segments)
+        found = {name: np.asarray(each)[0, 0][segments.there[name][0, 0]] for name, each in y.items()}
+        return found, np.asarray(states[0, 0])
+
+
+def predict(
+    model: StateSpaceModel, past: Record, future: Record, *, dt: float, between: Between = "held", **options: Any
+) -> dict[str, Float[np.ndarray, "n k"]]:
+    """The outputs at the times of a record's samples, from the state in which the record before it ends.
+
+    The states in the past, and what acted on them, are estimated from its samples with the model as it is, by the
+    estimator of `fit_records`.
+
+    Args:
+        model: with numbers that are known; its start is what is expected at the first time of the past.
+        past: the last samples. The more is hidden, the longer it has to be.
+        future: the inputs from the end of the past on, and the times of the outputs' samples to predict; the values of
+            outputs are not read.
+        dt: length of the intervals in which inputs are constant [s].
+        between: how inputs act between samples.
+        options: others of `fit_records`, such as noise, robust, segment, solver and substeps.
+
+    Raises:
+        ValueError: a record without a signal of the model.
+    """
+    still = eqx.tree_at(lambda model: model.field, model, Frozen(model.field))
+    known = fit_records(still, [past], dt=dt, between=between, rounds=1, **options)
+    kept = {name: value for name, value in options.items() if name in ("solver", "substeps")}
+    joined = dict(future.signals)
+    for name in set(model.inputs) & past.signals.keys() & joined.keys():
+        before, after = past.signals[name], joined[name]
+        earlier = before.t < after.t[0]
+        t, values = np.append(before.t[earlier], after.t), np.concatenate([before.values[earlier], after.values])
+        joined[name] = Signal(t, values, after.axes, after.source)
+    options = {"begin": known.times[0, 1], "dt": dt, "between": between} | kept
+    return simulate(model, Record(future.name, joined), known.ends[0], **options)[0]
+
+
+def _in_double(model: StateSpaceModel) -> StateSpaceModel:
+    return jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, model)
+
+
+def _size(errors: Float[np.ndarray, "n k"], robust: float) -> Float[np.ndarray, " k"]:
+    """The usual size of errors: their RMS, or 1.48 times the median of their sizes, which outliers do not change."""
+    found = np.sqrt(np.mean(errors**2, axis=0)) if np.isinf(robust) else 1.4826 * np.median(np.abs(errors), axis=0)
+    return np.maximum(found, TINY)
+
+
+def _result(search: record_search.Search, end: record_search.End, errors, robust: float, level: float) -> RecordFit:
+    model, p, d = search.model(end.z), len(search.theta), search.problem.model.size
+    covariance = _covariance(search, end)
+    nodes = search.nodes(end.z)
+    starts = np.concatenate([record_search.place(p, nodes, i, 0) for i in range(len(nodes))])
+    deviation = np.sqrt(np.diagonal(covariance)[starts]).reshape(-1, d)
+    found, physics = {}, physics_of(model.field)
+    if jax.tree.leaves(eqx.filter(physics, trainable(physics))):
+        picked = np.asarray(jax.jacfwd(lambda theta: ravel_parameters(search.model(theta).field)[0])(end.z[:p]))
+        rows = picked.argmax(axis=1)
+        found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
+    limits = {name: robust * _size(each, robust) for name, each in errors.items()}
+    aside = {name: int((np.abs(each) > limits[name]).any(axis=1).sum()) for name, each in errors.items()}
+    rms = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in errors.items()}
+    model = dataclasses.replace(model, start=nodes[0, 0])
+    ends = np.asarray(search.predicted(end.z)[1])[:, -1, -1]
+    times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in search.gridded])
+    start = nodes[:, 0]
+    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance[:p, :p], end.steps, end.status)
+
+
+def _covariance(search: record_search.Search, end: record_search.End) -> Float[np.ndarray, "z z"]:
+    """Of all unknowns; infinite for those along which no output changes.
+
+    In a simulation the errors of a model last, so the scores of each piece are one observation (a sandwich; White
+    1980). With process noise errors are independent, and the inverse of the normal equations is the covariance.
+    """
+    back = inverse(jnp.asarray(end.gram))
+    found, told = np.asarray(back.matrix), np.asarray(back.told)
+    if search.off is None:
+        local, nodes, p = search.local(end.z), search.nodes(end.z), len(search.theta)
+        meat = end.gram.copy()  # what was expected counts as it is
+        for i in range(len(search.gridded)):
+            rows = np.ix_(*2 * (np.r_[:p, record_search.place(p, nodes, i, 0)],))
+            meat[rows] += local.score[i].T @ local.score[i] - local.gram[i].sum(axis=0)
+        found = found @ meat @ found
+    return found + np.diag(np.where(told, 0.0, np.inf))

@@ -1,0 +1,202 @@
+"""The errors of a model along records of which not every state is measured, and their normal equations.
+
+A record is cut into segments. In a *simulation* each segment begins where the one before ended: beside the parameters
+only the state at the start of the record is unknown, and sensitivities are carried from segment to segment. In
+*multiple shooting* (Bock 1983) each segment has an unknown initial state, and what is missing between the end of one
+and the start of the next counts as process noise: that converges from worse starts, and it is the model of a state on
+which something acts at random (full-information estimation; Rao, Rawlings and Mayne 2003).
+"""
+
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from hybrid_jax.dynamics.base import ravel_learned
+from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.integrate import Solver, integrate
+from hybrid_jax.records import Gridded
+
+FLAT = 1e-12  # of a gradient's norm
+
+
+class Segments(NamedTuple):
+    """r records of s segments of t intervals, filled up where a record is shorter.
+
+    Attributes:
+        u: mean of the inputs over each interval.
+        valid: which intervals are within the record.
+        y: the samples of each output, 0 where there is none.
+        there: which samples there are.
+        index: the interval of the segment in which each sample lies.
+        share: how far into it, from 0 to 1.
+    """
+
+    u: Float[Array | np.ndarray, "*r s t m"]
+    valid: Bool[Array | np.ndarray, "*r s t"]
+    y: dict[str, Float[Array | np.ndarray, "*r s n k"]]
+    there: dict[str, Bool[Array | np.ndarray, "*r s n"]]
+    index: dict[str, Int[Array | np.ndarray, "*r s n"]]
+    share: dict[str, Float[Array | np.ndarray, "*r s n"]]
+
+
+def cut(records: list[Gridded], steps: int) -> Segments:
+    """All records in segments of `steps` intervals."""
+    most = max(-(-len(each.u) // steps) for each in records)
+    parts = [_cut(each, steps, most) for each in records]
+    widest = {name: max(part.there[name].shape[-1] for part in parts) for name in records[0].y}
+
+    def filled(path, *leaves):
+        name = path[-1].key if len(path) > 1 else None
+        n = 0 if name is None else widest[name]
+        return np.stack([_fill(leaf, n, 1) if n else leaf for leaf in leaves])
+
+    return jax.tree_util.tree_map_with_path(filled, *parts)
+
+
+def _fill(array: np.ndarray, n: int, axis: int) -> np.ndarray:
+    missing = [(0, n - size if i == axis else 0) for i, size in enumerate(array.shape)]
+    return np.pad(array, missing)
+
+
+def _cut(record: Gridded, steps: int, most: int) -> Segments:
+    u = record.u[np.minimum(np.arange(most * steps), len(record.u) - 1)].reshape(most, steps, -1)
+    valid = (np.arange(most * steps) < len(record.u)).reshape(most, steps)
+    found = {}
+    for name, at in record.index.items():
+        segment = at // steps
+        counts = np.bincount(segment, minlength=most)
+        place = np.arange(len(at)) - np.repeat(np.cumsum(counts) - counts, counts)  # samples are in order of time
+        shape = most, max(counts.max(), 1)
+        parts = (record.y[name], np.ones(len(at), bool), at % steps, record.share[name])
+        found[name] = []
+        for part in parts:
+            array = np.zeros((*shape, *part.shape[1:]), part.dtype)
+            array[segment, place] = part
+            found[name].append(array)
+    return Segments(u, valid, *({name: each[i] for name, each in found.items()} for i in range(4)))
+
+
+class Problem(eqx.Module):
+    """What is compared, and how errors count.
+
+    Attributes:
+        model: its learned numbers are the start of the search.
+        scale: the size of an error that counts as 1, of each output (k).
+        robust: an error of more than so many times its scale counts linearly, not as a square (Huber 1964).
+        dt: length of an interval [s].
+        solver: takes the field over an interval.
+        substeps: steps of the solver in each interval.
+    """
+
+    model: StateSpaceModel
+    scale: dict[str, Float[Array, " k"]]
+    robust: float = eqx.field(static=True)
+    dt: float = eqx.field(static=True)
+    solver: Solver = eqx.field(static=True)
+    substeps: int = eqx.field(static=True)
+
+
+def states_of(problem: Problem, model: StateSpaceModel, x0: Float[Array, " d"], segment: Segments):
+    """The states at the edges of a segment's intervals (t + 1, d); they stay where the record has ended."""
+    x = integrate(model.field, x0, jnp.asarray(segment.u), problem.dt, problem.solver, problem.substeps)
+    states = jnp.concatenate([x0[None], x])
+    last = jnp.sum(segment.valid)
+    return jnp.where((jnp.arange(len(states)) <= last)[:, None], states, states[last])
+
+
+def outputs_of(model: StateSpaceModel, states, segment: Segments, dt: float) -> dict[str, Float[Array, "n k"]]:
+    """The outputs at the times of their samples, from states between which a cubic goes through."""
+    u = jnp.asarray(segment.u)
+    slopes = jax.vmap(model.field)(states[:-1], u) * dt
+    ends = jax.vmap(model.field)(states[1:], u) * dt  # the input jumps at an edge
+
+    def one(name, i, share):
+        a, b, c, d = states[i], states[i + 1], slopes[i], ends[i]
+        s = share
+        x = a * (1 + 2 * s) * (1 - s) ** 2 + b * s**2 * (3 - 2 * s) + c * s * (1 - s) ** 2 + d * s**2 * (s - 1)
+        return jnp.atleast_1d(jnp.asarray(model.outputs[name](x, u[i])))
+
+    found = {}
+    for name in segment.index:
+        at = jnp.asarray(segment.index[name]), jnp.asarray(segment.share[name])
+        found[name] = jax.vmap(partial(one, name))(*at)
+    return found
+
+
+def errors_of(problem: Problem, model: StateSpaceModel, x0, segment: Segments):
+    """(ŷ − y) / scale of a segment, zero where nothing was measured, all in one vector; and the state at its end."""
+    states = states_of(problem, model, x0, segment)
+    predicted = outputs_of(model, states, segment, problem.dt)
+    rows = [
+        jnp.where(segment.there[name][:, None], (y - segment.y[name]) / problem.scale[name], 0.0).ravel()
+        for name, y in predicted.items()
+    ]
+    return jnp.concatenate(rows), states[-1]
+
+
+class Local(NamedTuple):
+    """The normal equations of segments in (θ, state at the start), and how the end depends on both."""
+
+    gram: Float[Array, "*s q q"]
+    score: Float[Array, "*s q"]
+    cost: Float[Array, "*s"]
+    slope: Float[Array, "*s d q"]
+    end: Float[Array, "*s d"]
+
+
+def local(problem: Problem, theta, x0, segment: Segments) -> Local:
+    """The normal equations of one segment."""
+    p, unravel = len(theta), ravel_learned(problem.model)[1]
+
+    def errors(z):
+        found = errors_of(problem, unravel(z[:p]), z[p:], segment)
+        return found, found
+
+    (jacobian, slope), (r, end) = jax.jacfwd(errors, has_aux=True)(jnp.concatenate([theta, x0]))
+    size = jnp.maximum(jnp.abs(r), FLAT)
+    weight = jnp.minimum(1.0, problem.robust / size)
+    cost = jnp.where(size <= problem.robust, r**2, 2 * problem.robust * size - problem.robust**2)
+    weighted = jacobian * weight[:, None]
+    return Local(weighted.T @ jacobian, weighted.T @ r, jnp.sum(cost), slope, end)
+
+
+@eqx.filter_jit
+def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], segments: Segments) -> Local:
+    """The normal equations of every segment, each from its own initial state."""
+    each = jax.vmap(jax.vmap(partial(local, problem, theta)))
+    return each(nodes, segments)
+
+
+@eqx.filter_jit
+def simulation(problem: Problem, theta, starts: Float[Array, "r d"], segments: Segments) -> Local:
+    """The normal equations of every segment in (θ, state at the start of the record), one after the other."""
+    p, d = len(theta), starts.shape[-1]
+
+    def record(x0, own):
+        def step(carry, segment):
+            x, slope = carry
+            found = local(problem, theta, x, segment)
+            through = jnp.concatenate([jnp.eye(p, p + d), slope])
+            slope = found.slope @ through
+            gram, score = through.T @ found.gram @ through, through.T @ found.score
+            return (found.end, slope), Local(gram, score, found.cost, slope, found.end)
+
+        return jax.lax.scan(step, (x0, jnp.eye(d, p + d, p)), own)[1]
+
+    return jax.vmap(record)(starts, segments)
+
+
+@eqx.filter_jit
+def simulated(problem: Problem, model: StateSpaceModel, starts, segments: Segments):
+    """The predicted outputs of every segment, and the state at its start, in one simulation of each record."""
+
+    def step(x, segment):
+        states = states_of(problem, model, x, segment)
+        return states[-1], (outputs_of(model, states, segment, problem.dt), states)
+
+    return jax.vmap(lambda x0, own: jax.lax.scan(step, x0, own)[1])(starts, segments)

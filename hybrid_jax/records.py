@@ -1,0 +1,213 @@
+"""What was measured in an experiment: signals by name, each with samples at times of its own."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Float, Int
+
+from hybrid_jax import checks
+
+GAP = 5.0  # intervals longer than this many times the median are gaps
+
+Between = Literal["held", "linear", "averaged"]
+
+
+@dataclass(frozen=True)
+class Signal:
+    """n samples of one quantity.
+
+    Attributes:
+        t: time of each sample [s], strictly increasing, from the start of the record.
+        values: one column for each of `axes`, in SI units.
+        axes: which axes were measured; by default "0", "1", …
+        source: topic, group or columns that it came from, for messages.
+
+    Raises:
+        ValueError: inconsistent shapes, values that are not finite, or times that do not increase: source and time.
+    """
+
+    t: Float[np.ndarray, " n"] = field(repr=False)
+    values: Float[np.ndarray, "n k"] = field(repr=False)
+    axes: tuple[str, ...] = ()
+    source: str = "signal"
+
+    def __post_init__(self):
+        t, values = np.array(self.t, float), np.array(self.values, float)
+        values = values[:, None] if values.ndim == 1 else values
+        axes = self.axes or tuple(map(str, range(values.shape[-1])))
+        if t.ndim != 1 or values.shape != (len(t), len(axes)):
+            shapes = f"got {t.shape} and {values.shape}"
+            raise ValueError(f"{self.source}: t and values must be (n,) and (n, {len(axes)}), {shapes}")
+        for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
+            raise ValueError(f"{self.source}: time {t[row]:.6g} s does not come after {t[row - 1]:.6g} s")
+        for row, column in np.argwhere(~np.isfinite(values))[:1].tolist():
+            axis = axes[column]
+            raise ValueError(f"{self.source}: {axis} is {values[row, column]} at {t[row]:.6g} s, must be finite")
+        for name, value in (("t", t), ("values", values), ("axes", axes)):
+            object.__setattr__(self, name, value)
+
+    def __len__(self) -> int:
+        return len(self.t)
+
+    @property
+    def interval(self) -> float:
+        """The median time between samples [s]; infinite for fewer than two."""
+        return float(np.median(np.diff(self.t))) if len(self) > 1 else np.inf
+
+    def gaps(self) -> list[tuple[float, float]]:
+        """Start and end [s] of each time without samples."""
+        missing = np.flatnonzero(np.diff(self.t) > GAP * self.interval)
+        return [(float(self.t[i]), float(self.t[i + 1])) for i in missing]
+
+
+@dataclass(frozen=True)
+class Record:
+    """The signals of one experiment.
+
+    Attributes:
+        name: of the experiment in messages, usually its file.
+        signals: by name; what was not measured is absent.
+        notes: what a reader left out or had to assume, a sentence each.
+        facts: what a log says of its system and program, such as {"airframe": "4001"}, for reports and checks.
+    """
+
+    name: str
+    signals: Mapping[str, Signal]
+    notes: tuple[str, ...] = ()
+    facts: Mapping[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of(cls, name: str = "record", **signals: tuple) -> "Record":
+        """A record of arrays.
+
+        For example `Record.of("run 1", torque=(t, torque), angle=(t_angle, angle))`.
+
+        Args:
+            name: of the experiment in messages.
+            signals: times [s] (n,) and values (n,) or (n, k) of each signal. Samples with a NaN are left out.
+
+        Raises:
+            ValueError: as of a `Signal`.
+        """
+        found = {}
+        for label, (t, values) in signals.items():
+            t, values = np.asarray(t, float), np.asarray(values, float)
+            kept = np.isfinite(values.reshape(len(values), -1)).all(axis=1) if len(t) == len(values) else slice(None)
+            found[label] = Signal(t[kept], values[kept], source=f"{name}: {label}")
+        return cls(name, found)
+
+    @property
+    def duration(self) -> float:
+        """From the first to the last sample of the signal that lasts longest [s]."""
+        return max((float(signal.t[-1] - signal.t[0]) for signal in self.signals.values() if len(signal)), default=0.0)
+
+    def part(self, begin: float, end: float) -> "Record":
+        """The samples between two times, which stay as they are.
+
+        Args:
+            begin: the first time [s].
+            end: the last time [s].
+        """
+        cut = {}
+        for name, signal in self.signals.items():
+            inside = (signal.t >= begin) & (signal.t <= end)
+            cut[name] = Signal(signal.t[inside], signal.values[inside], signal.axes, signal.source)
+        return type(self)(self.name, cut, self.notes, self.facts)
+
+
+class Gridded(NamedTuple):
+    """A record on the solver's grid, with outputs at their own times.
+
+    Attributes:
+        start: time of the grid's first point [s].
+        u: the mean of the inputs over each interval.
+        y: the samples of each output.
+        index: the interval in which each sample lies.
+        share: how far into it, from 0 to 1.
+    """
+
+    start: float
+    u: Float[np.ndarray, "t m"]
+    y: dict[str, Float[np.ndarray, "n k"]]
+    index: dict[str, Int[np.ndarray, " n"]]
+    share: dict[str, Float[np.ndarray, " n"]]
+
+
+def on_grid(
+    record: Record,
+    inputs: tuple[str, ...],
+    outputs: tuple[str, ...],
+    dt: float,
+    between: Between = "held",
+    begin: float | None = None,
+) -> Gridded:
+    """A record on intervals of length dt, from the first to the last sample of its outputs where its inputs are known.
+
+    Args:
+        record: what was measured.
+        inputs: names of the signals that act, which make up u in this order.
+        outputs: names of the signals that are compared.
+        dt: length of an interval [s].
+        between: how the inputs act between samples: each "held" until the next, on a "linear" path to the next, or
+            "averaged" over the time since the one before.
+        begin: the first time [s], by default that of the first sample.
+
+    Raises:
+        ValueError: a signal that is not there, or signals that have no time in common: name and what was expected.
+    """
+    for name in (*inputs, *outputs):
+        if name not in record.signals or len(record.signals[name]) == 0:
+            raise ValueError(f"{record.name}: has no {name}; it has {', '.join(record.signals) or 'nothing'}")
+    if between not in get_args(Between):
+        raise ValueError(f"between must be one of {', '.join(get_args(Between))}, got {checks.short_repr(between)}")
+    first, end = _span(record, inputs, outputs, between)
+    if begin is not None and begin < min((record.signals[name].t[0] for name in inputs), default=begin) - dt:
+        raise ValueError(f"{record.name}: {', '.join(inputs)} must be known from {begin:.6g} s on")
+    begin = first if begin is None else begin
+    steps = int(np.ceil((end - begin) / dt - 1e-6))  # the last one may end after the last sample
+    if steps < 1:
+        raise ValueError(f"{record.name}: {', '.join((*inputs, *outputs))} share less than dt={dt:.3g} s")
+    edges = begin + dt * np.arange(steps + 1)
+    areas = [_area(record.signals[name], edges, between) for name in inputs]
+    u = np.diff(np.concatenate(areas, axis=1), axis=0) / dt if inputs else np.zeros((steps, 0))
+    y, index, share = {}, {}, {}
+    for name in outputs:
+        signal = record.signals[name]
+        at = (signal.t - begin) / dt
+        inside = (at >= -1e-6) & (at <= steps + 1e-6)
+        if not inside.any():
+            raise ValueError(f"{record.name}: no sample of {name} lies between {begin:.6g} and {end:.6g} s")
+        at = np.clip(at[inside], 0, steps)
+        index[name] = np.minimum(np.floor(at + 1e-9).astype(int), steps - 1)
+        y[name], share[name] = signal.values[inside], np.clip(at - index[name], 0.0, 1.0)
+    return Gridded(begin, u, y, index, share)
+
+
+def _span(record: Record, inputs, outputs, between: Between) -> tuple[float, float]:
+    """From the first to the last time at which all inputs act."""
+    acting = [record.signals[name] for name in inputs]
+    lasting = [signal.interval if between == "held" and len(signal) > 1 else 0.0 for signal in acting]
+    begin = max((signal.t[0] - (signal.interval if between == "averaged" else 0) for signal in acting), default=-np.inf)
+    end = min((signal.t[-1] + more for signal, more in zip(acting, lasting, strict=True)), default=np.inf)
+    measured = [record.signals[name] for name in outputs]
+    first, last = min(signal.t[0] for signal in measured), max(signal.t[-1] for signal in measured)
+    return (max(begin, first), min(end, last)) if outputs else (begin, end)
+
+
+def _area(signal: Signal, t: Float[np.ndarray, " n"], between: Between) -> Float[np.ndarray, "n k"]:
+    """The integral of a signal up to each time."""
+    edges, values = signal.t, signal.values
+    step = np.diff(edges)[:, None]
+    parts = {"held": values[:-1], "averaged": values[1:], "linear": (values[1:] + values[:-1]) / 2}[between] * step
+    area = np.concatenate([0 * values[:1], np.cumsum(parts, axis=0)])
+    i = np.clip(np.searchsorted(edges, t, side="right") - 1, 0, max(len(edges) - 2, 0))
+    past = (t - edges[i])[:, None]
+    if len(edges) == 1:
+        return values[0] * past
+    slope = (values[i + 1] - values[i]) / step[i] if between == "linear" else 0.0
+    level = values[i + 1] if between == "averaged" else values[i]
+    beyond = np.where(t >= edges[-1], t - edges[-1], 0.0)[:, None]  # the last sample goes on
+    past = past - beyond
+    return area[i] + level * past + slope * past**2 / 2 + values[-1] * beyond

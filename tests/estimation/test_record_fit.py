@@ -1,0 +1,205 @@
+"""Records of which not every state was measured: what made them is recovered, and what they do not tell is said."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.hidden import Delay, Lag, LinearDynamics, Oscillator, RandomWalk, with_hidden
+from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.estimation.record_fit import fit_records, predict, simulate
+from hybrid_jax.records import Record, on_grid
+
+NOISE, UNKNOWN = 0.01, (np.inf, np.inf)
+
+
+class Pendulum(hj.AbstractVectorField):
+    """x = [angle, rate], u = [acceleration]."""
+
+    log_length: jax.Array
+    damping: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - 9.81 / jnp.exp(self.log_length) * jnp.sin(x[0]) - self.damping * x[1]])
+
+
+def pendulum(length=0.8, damping=0.3):
+    return Pendulum(jnp.log(jnp.array(length)), jnp.array(damping))
+
+
+def angle(x, u):
+    return x[0]
+
+
+def record(field, start, length=8.0, samples=80, seed=0, drop=(), noise=NOISE):
+    """Inputs every 0.1 s, and a noisy angle at irregular times."""
+    random = np.random.default_rng(seed)
+    t = np.arange(0.0, length, 0.1)
+    inputs = Record.of("inputs", torque=(t, 2 * random.normal(size=len(t))))
+    times = np.sort(random.uniform(0, length, samples))
+    times = times[~((times > drop[0]) & (times < drop[1]))] if drop else times
+    both = inputs.signals["torque"], np.concatenate([[0.0], times])
+    wanted = Record.of("r", torque=(both[0].t, both[0].values), angle=(both[1], 0 * both[1]))
+    model = StateSpaceModel(field, ("torque",), {"angle": angle}, start, np.zeros(len(start)))
+    y = simulate(model, wanted, dt=0.01)[0]["angle"][:, 0] + noise * random.normal(size=len(both[1]))
+    return Record.of(f"run {seed}", torque=(both[0].t, both[0].values), angle=(both[1], y))
+
+
+def model_of(field, d=2, **options):
+    return StateSpaceModel(field, ("torque",), {"angle": angle}, np.zeros(d), np.full(d, np.inf), **options)
+
+
+@pytest.fixture(scope="module")
+def records():
+    return [record(pendulum(), (0.5, 0.0), seed=1), record(pendulum(), (-0.4, 1.0), 6.0, 60, seed=2, drop=(2.0, 3.5))]
+
+
+@pytest.fixture(scope="module")
+def fitted(records):
+    return fit_records(model_of(pendulum(1.0, 0.1)), records, dt=0.02)
+
+
+def test_parameters_and_starts_are_recovered_within_their_errors(fitted):
+    truth = {"log_length": np.log(0.8), "damping": 0.3}
+    for name, interval in fitted.intervals.items():
+        error = float(interval.high - interval.low) / 3.92
+        assert abs(float(interval.value) - truth[name]) < 4 * error < 0.1
+    found = np.abs(fitted.starts - [[0.5, 0.0], [-0.4, 1.0]]) / fitted.starts_error
+    assert (found < 4).all()
+    assert fitted.errors["angle"] == pytest.approx(NOISE, rel=0.2)
+    assert fitted.status.name == "OK"
+
+
+def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(records, fitted):
+    shot = fit_records(model_of(pendulum(2.0, 1.0)), records, dt=0.02, segment=0.5)
+    for name, interval in shot.intervals.items():
+        assert float(interval.value) == pytest.approx(float(fitted.intervals[name].value), abs=1e-4)
+
+
+def test_what_follows_is_predicted_from_what_was_seen(fitted):
+    whole = record(pendulum(), (0.3, -0.5), 6.0, 60, seed=3)
+    past, future = whole.part(0, 4.0), whole.part(3.9, 9.0)
+    late = future.signals["angle"].t > 4.05
+    signal = future.signals["angle"]
+    signals = future.signals | {"angle": type(signal)(signal.t[late], signal.values[late])}
+    y = predict(fitted.model, past, Record("future", signals), dt=0.02)["angle"]
+    assert np.sqrt(np.mean((y - signals["angle"].values) ** 2)) < 2 * NOISE
+
+
+def test_a_burst_of_outliers_is_set_aside(records):
+    signal = records[0].signals["angle"]
+    spoiled = signal.values.copy()
+    spoiled[20:24] += 3.0
+    torque = records[0].signals["torque"]
+    bad = [Record.of("bad", torque=(torque.t, torque.values), angle=(signal.t, spoiled)), records[1]]
+    start = model_of(pendulum(1.0, 0.1))
+    plain, robust = (fit_records(start, bad, dt=0.02, robust=each, rounds=3) for each in (np.inf, 3.0))
+    errors = [abs(float(fit.intervals["log_length"].value) - np.log(0.8)) for fit in (plain, robust)]
+    assert errors[1] < errors[0] / 5
+    assert 4 <= robust.set_aside["angle"] <= 10
+    assert plain.set_aside["angle"] == 0
+
+
+class Twofold(hj.AbstractVectorField):
+    """Two factors of which only the product acts."""
+
+    a: jax.Array
+    b: jax.Array
+    damping: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1], u[0] - self.a * self.b * x[0] - self.damping * x[1]])
+
+
+def test_what_no_output_tells_is_named_and_has_no_interval(records):
+    fit = fit_records(model_of(Twofold(jnp.array(3.0), jnp.array(4.0), jnp.array(0.3))), records[:1], dt=0.02)
+    assert set(fit.undetermined) == {"a", "b"}
+    assert np.isfinite(float(fit.intervals["damping"].high))
+
+
+@pytest.mark.parametrize(
+    ("part", "extra", "at", "truth"),
+    [
+        (Lag(jnp.log(jnp.array([0.2])), (0,)), 1, lambda part: part.log_time_constant, np.log(0.2)),
+        (Delay(jnp.log(jnp.array(0.2)), (0,), 3), 3, lambda part: part.log_delay, np.log(0.2)),
+        (
+            Oscillator(jnp.log(jnp.array(5.0)), jnp.array(-2.0), jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0]), (1,)),
+            2,
+            lambda part: part.log_frequency,
+            np.log(5.0),
+        ),
+    ],
+    ids=["lag", "delay", "oscillator"],
+)
+def test_a_hidden_part_is_found(part, extra, at, truth):
+    true = with_hidden(pendulum(), part)
+    data = [record(true, (0.5, 0.0, *(0.0,) * extra), seed=4, samples=200, noise=1e-3)]
+    start = eqx.tree_at(lambda field: at(field.parts[0]), true, at(part) + 0.2)
+    frozen = eqx.tree_at(lambda field: field.field, start, hj.Frozen(pendulum()))
+    model = StateSpaceModel(frozen, ("torque",), {"angle": angle}, np.zeros(2 + extra), (np.inf,) * 2 + (1.0,) * extra)
+    fit = fit_records(model, data, dt=0.02, noise={"angle": 1e-2})
+    assert np.asarray(at(fit.model.field.parts[0])) == pytest.approx(truth, abs=0.05)
+
+
+def test_linear_dynamics_are_an_oscillator():
+    w, z = 5.0, np.exp(-2.0)
+    a = jnp.array([[0.0, 1.0], [-(w**2), -2 * z * w]])
+    linear = LinearDynamics(a, jnp.array([[0.0, 0.0, 0.0], [0.0, 0.0, 3.0]]), jnp.array([[4.0, 0.0]]), (1,))
+    drive, gain = jnp.array([0.0, 0.0, 3.0]), jnp.array([4.0])
+    oscillator = Oscillator(jnp.log(jnp.array(w)), jnp.log(jnp.array(z)), drive, gain, (1,))
+    x, u = jnp.array([0.3, -0.2, 0.1, 0.4]), jnp.array([0.7])
+    one, other = (with_hidden(pendulum(), part)(x, u) for part in (linear, oscillator))
+    np.testing.assert_allclose(one, other, rtol=1e-5)
+
+
+def test_a_disturbance_that_walks_is_followed():
+    """A push that jumps in the middle: the part without process noise cannot follow, that with it does."""
+    true = pendulum()
+    t = np.arange(0.0, 8.0, 0.02)
+    push = np.where(t < 4, 1.0, -1.0)
+    made = Record.of("made", torque=(t, push), angle=(t, 0 * t))
+    known = StateSpaceModel(true, ("torque",), {"angle": angle}, (0.0, 0.0), (0.0, 0.0))
+    y = simulate(known, made, dt=0.02)[0]["angle"][:, 0] + NOISE * np.random.default_rng(0).normal(size=len(t))
+    data = [Record.of("data", torque=(t, 0 * t), angle=(t, y))]
+    fixed = with_hidden(hj.Frozen(true), RandomWalk((1,)))
+    ends = []
+    for noise in (0.0, 1.0):
+        model = StateSpaceModel(fixed, ("torque",), {"angle": angle}, np.zeros(3), (0.1, 0.1, 2.0), (0, 0, noise))
+        ends.append(fit_records(model, data, dt=0.02, segment=0.2, noise={"angle": NOISE}, rounds=1).ends[0, 2])
+    assert abs(ends[1] + 1) < 0.3 < abs(ends[0] + 1)
+
+
+@pytest.mark.parametrize("between", ["held", "averaged", "linear"])
+def test_the_mean_of_an_input_over_intervals_keeps_its_integral(between):
+    t = np.array([0.0, 0.3, 0.5, 1.1, 2.0])
+    u = np.array([1.0, -2.0, 0.5, 3.0, 1.0])
+    steps = np.diff(t)
+    parts = {"held": u[:-1], "averaged": u[1:], "linear": (u[1:] + u[:-1]) / 2}[between] * steps
+    found = on_grid(Record.of("r", u=(t, u), y=(t, u)), ("u",), ("y",), 0.1, between)
+    assert found.u.sum() * 0.1 == pytest.approx(parts.sum())
+    assert found.u[0, 0] == pytest.approx({"held": 1.0, "averaged": -2.0, "linear": 0.5}[between])
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"records": [Record.of("r", torque=([0, 1], [0, 1]))]}, "r: has no angle; it has torque"),
+        ({"records": []}, "records: at least one is needed"),
+        ({"prior": {"field.mass": 1.0}}, "prior: the model has no field.mass"),
+        ({"between": "cubic"}, "between must be one of held, linear, averaged, got 'cubic'"),
+        ({"robust": -1.0}, "robust must be a positive number"),
+        ({"dt": 0.0}, "dt must be a positive number of seconds"),
+    ],
+)
+def test_what_is_wrong_is_said_in_a_line(records, wrong, said):
+    options = {"records": records, "dt": 0.02} | wrong
+    with pytest.raises(ValueError, match=said):
+        fit_records(model_of(pendulum()), **options)
+
+
+def test_signals_that_share_no_time_are_refused():
+    apart = Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))
+    with pytest.raises(ValueError, match="r: torque, angle share less than dt"):
+        fit_records(model_of(pendulum()), [apart], dt=0.02)
