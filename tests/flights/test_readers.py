@@ -2,7 +2,9 @@
 
 import gzip
 import os
+import resource
 import struct
+import time
 import zlib
 
 import numpy as np
@@ -455,7 +457,36 @@ def wholes(flight, tmp_path_factory):
     return made.__getitem__
 
 
-@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def mutated(content, rng):
+    """A few bytes changed, cut out or doubled, and perhaps the end lost."""
+    content = bytearray(content)
+    for _ in range(rng.integers(1, 6)):
+        at, size = int(rng.integers(len(content))), int(rng.integers(1, 40))
+        kind = rng.integers(3)
+        content[at : at + (size if kind == 0 else 0)] = b"" if kind == 0 else content[at : at + size]
+        if kind == 2:
+            content[at] ^= int(rng.integers(1, 256))
+    return bytes(content[: int(rng.integers(1, len(content)))] if rng.random() < 0.2 else content)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WHOLES)
+def test_a_thousand_mutations_end_in_a_log_or_a_line(written, wholes, name):
+    """Without another exception, a hang over ten seconds, or a gigabyte more of memory."""
+    rng, most = np.random.default_rng(0), 0.0
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    for _ in range(1000):
+        path, began = written(mutated(wholes(name), rng), name), time.monotonic()
+        recording = outcome(read_recording, path, topics={"motors": "/rotors:data:rpm"})
+        if recording is not None:
+            check_recording(recording, IRIS, 0.01)
+            outcome(to_flight, recording, naming=str(path))
+        most = max(most, time.monotonic() - began)
+    assert most < 10
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.data())
 def test_damaged_files_are_read_or_refused_in_one_line(written, wholes, data):
     name = data.draw(st.sampled_from(WHOLES))
