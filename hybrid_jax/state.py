@@ -16,6 +16,9 @@ INPUT_NAMES = ("u0", "u1", "u2", "u3")  # of a quadrotor; see `input_names`
 STATE_SIZE = len(STATE_NAMES)
 INPUT_SIZE = len(INPUT_NAMES)
 
+# Typical standard deviations of each entry of these four: motion capture [m, of quaternions, m/s], a gyroscope [rad/s].
+SENSOR_NOISE = (0.001, 0.002, 0.02, 0.02)
+
 State = Float[Array, "13"]
 Input = Float[Array, " rotors"]  # rad/s
 

@@ -23,7 +23,7 @@ from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.flight import permutation
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, VELOCITY
 from hybrid_jax.sweep.lanes import count, lane, stack
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import FitState, RunConfig, make_run_config
@@ -197,13 +197,13 @@ def _key(seed, purpose: int) -> PRNGKeyArray:
 class Noise:
     """Standard deviation of the white measurement noise on each entry of a group of the state."""
 
-    position: NotNegative = 0.001
+    position: NotNegative = SENSOR_NOISE[0]
     """[m], motion capture."""
-    quaternion: NotNegative = 0.002
+    quaternion: NotNegative = SENSOR_NOISE[1]
     """Of each component, motion capture: about 0.2 degrees."""
-    velocity: NotNegative = 0.02
+    velocity: NotNegative = SENSOR_NOISE[2]
     """[m/s], differentiated motion capture."""
-    body_rates: NotNegative = 0.02
+    body_rates: NotNegative = SENSOR_NOISE[3]
     """[rad/s], gyroscope."""
 
 

@@ -8,6 +8,7 @@ from experiments.reporting.names import CONSTANT_DISTURBANCE, HYBRID, NO_PHYSICS
 from experiments.runner.options import Activation, Count, CountFromZero, NotNegative, Positive, Run, distinct, factors
 from hybrid_jax.dynamics.rigid_body import LEARNED
 from hybrid_jax.integrate import SOLVERS
+from hybrid_jax.networks.mlp import NORMS
 from hybrid_jax.sim.changes import CHANGES
 from hybrid_jax.training.loss import REGULARISERS
 
@@ -24,11 +25,13 @@ if TYPE_CHECKING:
     RegulariserName = str
     SolverName = str
     Change = str
+    Norm = str
 else:  # the command line offers what the registries hold
     Model = Literal[MODELS]
     RegulariserName = Literal[("none", *REGULARISERS)]
     SolverName = Literal[tuple(SOLVERS)]
     Change = Literal[CHANGED]
+    Norm = Literal[tuple(NORMS)]
 ResidualInputs = Literal["all", "no_xy", "no_xy_yaw", "near_ground", "body"]
 ResidualOutputs = Literal["all", "accelerations", "wrench", "rotors"]
 
@@ -121,7 +124,7 @@ class Config(Run):
     """Hidden units of f_d."""
     inputs: Literal["hover", "raw"] = "hover"
     """Rotor speeds as f_d sees them: hover: (u − hover) / (hover / 10); raw: u in rad/s."""
-    norm: Literal["batch", "layer", "none"] = "batch"
+    norm: Norm = "batch"
     """Normalisation of f_d's hidden layer."""
     activation: Activation = "relu"
     """Activation of f_d's hidden layer. All but ReLU suit solvers of optimal control problems."""

@@ -3,7 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -12,7 +12,7 @@ import numpy as np
 
 from experiments.paper.conditions import settings, subsets
 from experiments.paper.config import Config
-from experiments.paper.lanes import Fit, Lanes, lanes_of, physics_in, source_of, theta_of
+from experiments.paper.lanes import MODELS, Fit, Lanes, lanes_of, physics_in, source_of, theta_of
 from experiments.paper.study import SOLVED, solved
 from experiments.paper.study import adapted as trained
 from experiments.reporting import names
@@ -30,10 +30,10 @@ from hybrid_jax.trajectories import Trajectories, split
 
 PAST = 10  # intervals of a test window before the ones to predict
 WITHOUT_INTERVALS = (names.THETA_D_ONLY, names.CONSTANT_DISTURBANCE, names.LAST_LAYER, names.LINEAR_RESIDUAL)
-Method = Literal[
-    "hybrid", "no_physics", "physics_only", "expert_augmentation", "theta_p_only", "theta_d_only", "last_layer",
-    "least_squares", "constant_disturbance", "linear_residual",
-]  # fmt: skip
+if TYPE_CHECKING:
+    Method = str
+else:
+    Method = Literal[MODELS]
 
 
 @dataclass(frozen=True)

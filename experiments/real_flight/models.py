@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import equinox as eqx
 import jax
@@ -20,7 +20,6 @@ from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import Vehicle
 
 Model = Literal["hybrid", "no_physics", "physics_only"]
-RecipeName = Literal["staged", "turning", "short", "torque_off", "frozen_rates"]
 
 REFERENCE = 1000  # N for which a recipe states the epochs of an adaptation
 NETWORK, ORDER = range(2)  # uses of a seed: weights of the network, order of the minibatches
@@ -105,6 +104,11 @@ RECIPES: Mapping[str, Recipe] = {
         learn=("k", "drag", "velocity_gain"),
     ),
 }
+
+if TYPE_CHECKING:
+    RecipeName = str
+else:
+    RecipeName = Literal[tuple(RECIPES)]
 
 
 def rates_of(step: Step, model: str, field: AbstractVectorField) -> dict[str, float]:

@@ -5,18 +5,22 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, field, is_dataclass
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal, get_args, get_type_hints
+from typing import TYPE_CHECKING, Annotated, Any, Literal, get_args, get_type_hints
 
 import platformdirs
 
 from hybrid_jax import checks
+from hybrid_jax.networks.activations import ACTIVATIONS
 
 # Numbers with a rule, which `check_numbers` applies wherever an option's type mentions them.
 Count = Annotated[int, checks.count]
 CountFromZero = Annotated[int, partial(checks.count, least=0)]
 Positive = Annotated[float, checks.positive]
 NotNegative = Annotated[float, checks.not_negative]
-Activation = Literal["relu", "softplus", "tanh", "silu"]
+if TYPE_CHECKING:
+    Activation = str
+else:  # the command line offers what the registry holds
+    Activation = Literal[tuple(ACTIVATIONS)]
 
 # Options that do not affect the results.
 UNFIXED = ("out", "cache", "fresh", "paper", "saving", "distributed", "coordinator", "processes", "process_id")

@@ -36,7 +36,7 @@ from hybrid_jax.planning.input_designs import (
     Trajectory,
 )
 from hybrid_jax.runtime import FAST_COMPILE
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_SIZE, VELOCITY
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import windows_of
 
 SPARE = 0.98  # share of each limit that is used at most, as limits are looked at between samples only
@@ -45,8 +45,6 @@ PENALTY = 30.0, 3000.0  # on the mean squared excess over a limit, at the first 
 TOLD_APART = 1e-5  # least eigenvalue of the scaled information, ten times its rounding in float32
 RATE = 0.05  # of Adam, in units of the coefficients
 Starts = Float[Array, "s outputs harmonics 2"]
-# Of motion capture and a gyroscope: m, quaternion, m/s, rad/s.
-NOISE = ((POSITION, 0.001), (QUATERNION, 0.002), (VELOCITY, 0.02), (BODY_RATES, 0.02))
 
 
 @dataclass(frozen=True)
@@ -234,7 +232,7 @@ def _noise(noise: Sequence[float] | None, states: int) -> Float[np.ndarray, " d"
         if states != STATE_SIZE:
             raise ValueError(f"noise must be given: the standard deviation of each of {states} states")
         sizes = np.zeros(STATE_SIZE, np.float32)
-        for part, size in NOISE:
+        for part, size in zip((POSITION, QUATERNION, VELOCITY, BODY_RATES), SENSOR_NOISE, strict=True):
             sizes[part] = size
         return sizes
     sizes = np.asarray(checks.finite("noise", checks.real_array("noise", noise)), np.float32)
