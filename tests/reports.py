@@ -58,7 +58,7 @@ def verdicts(rows, experiment="param_shift", truth=TRUTH):
 
 
 def make_report(rows, experiment="param_shift", truth=TRUTH, figures=MappingProxyType({}), **options):
-    return paper_report(experiment, PRESETS["quick"], {"training": 12.5}, rows, truth, figures, **options)
+    return paper_report(experiment, PRESETS["paper"], {"training": 12.5}, rows, truth, figures, **options)
 
 
 NUMBERS = st.none() | st.floats(min_value=0) | st.sampled_from([float("nan"), float("inf")])

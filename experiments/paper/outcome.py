@@ -100,7 +100,7 @@ def paper_report(
     extra: Mapping[str, Any] | None = None,
 ) -> Report:
     """The report of an experiment of the paper; `truth`: the true θ_p, by domain where there are several."""
-    verdicts = claims(rows, experiment, truth)
+    verdicts = claims(rows, experiment, truth, quick=config.preset == "quick")
     headline = ranking if experiment == COMPARISON else by_size
     altitude = altitudes(rows) if experiment != COMPARISON else []
     rate = [RATE_NOTE] if experiment == "param_shift" else []

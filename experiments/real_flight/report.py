@@ -57,7 +57,6 @@ def write_report(name: str, experiment: Experiment, outputs: Outputs, console: C
         ],
         "selections": [selected.described() for selected in outputs.selections],
         "outside": {flight: each for flight, (_, each) in shares.items()},
-        "replicates": outputs.replicates.rows,
         "logs": {label: logs.records for label, logs in experiment.logs.items()},
     }
     figures = save_figures(out, make_figures(experiment, outputs), experiment.config.paper)

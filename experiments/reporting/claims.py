@@ -70,11 +70,12 @@ def decided(table: Table) -> Table:
 
 
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
-    """One sentence: how many hypotheses hold, and which fail or are undecided."""
-    if not verdicts:
+    """One sentence: how many hypotheses hold, and which fail or are undecided, of those that the results can judge."""
+    judged = [each for each in verdicts if not each.lacks_data]
+    if not judged:
         return []
-    names = {holds: [each.id for each in verdicts if each.holds is holds] for holds in OUTCOMES}
-    words = [f"{len(names[True])} of {len(verdicts)} hypotheses hold"]
+    names = {holds: [each.id for each in judged if each.holds is holds] for holds in OUTCOMES}
+    words = [f"{len(names[True])} of {len(judged)} hypotheses hold"]
     words += [f"{', '.join(names[False])} fail{'s' * (len(names[False]) == 1)}"] * bool(names[False])
     words += [f"{', '.join(names[None])} {'is' if len(names[None]) == 1 else 'are'} undecided"] * bool(names[None])
     return [f"{'; '.join(words)}."]
