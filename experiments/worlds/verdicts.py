@@ -58,12 +58,12 @@ def coverage_table(rows: Results) -> Table:
         for name in LEARNED:
             known = own.where(lambda row, name=name: row[f"{name}_error"] is not None)
             inside = _inside(known, name)
-            share = f"{100 * np.mean(inside):.0f} of {len(inside)}" if inside else EMPTY
+            share = f"{np.mean(inside):.0%} of {len(inside)}" if inside else EMPTY
             half = [row[f"{name}_half_width"] for row in known if row[f"{name}_half_width"] is not None]
             width = f"{100 * np.median(half):.2g}" if half else EMPTY
             away = f"{100 * np.median(np.abs(known.numbers(f'{name}_error'))):.2g}" if len(known) else EMPTY
             lines.append((world, method, name, share, away, width))
-    header = ("world", "method", "θ_p", "intervals that hold [%]", "error [%], median", "half-width [%], median")
+    header = ("world", "method", "θ_p", "intervals that hold", "error [%], median", "half-width [%], median")
     return Table("Do 95 % intervals of θ_p after ten seconds of usual flight hold the truth?", header, lines)
 
 
