@@ -293,9 +293,12 @@ SMOKE = replace(
     PAPER, preset="smoke", seeds=1, sizes=(20,), source_train=40, validation=20, test=20, batch_size=20, max_epochs=3,
     hidden=32,
 )  # fmt: skip
-# Both ends of the sizes, and less source flight, learnt at a rate that converges in it: about a minute on two cores.
+# Both ends of the sizes, and less source flight, learnt at rates that converge in it: under a minute on two cores.
 BOTH_ENDS = replace(
-    QUICK, sizes=(100, 1000), source_train=2000,
-    validation=100, max_epochs=600, rates=Rates(pretraining=1e-3, no_physics_target_only=1e-3),
+    QUICK, sizes=(100, 1000), source_train=3000, validation=100, max_epochs=600,
+    rates=Rates(pretraining=1e-3, no_physics_target_only=1e-3, no_physics=(1e-4, 3e-4, 3e-4, 3e-4, 5e-4)),
+    patience=Patience(
+        hybrid_pretraining=Stopping(70, 15), no_physics_pretraining=Stopping(100, 15), no_physics=Stopping(150, 20)
+    ),
 )  # fmt: skip
 PRESETS = {"paper": PAPER, "quick": BOTH_ENDS, "smoke": SMOKE}
