@@ -1,6 +1,7 @@
 """Imports point down only, between the packages of the library and from the programs to the library."""
 
 import ast
+import re
 from functools import cache
 from graphlib import TopologicalSorter
 from pathlib import Path
@@ -80,6 +81,13 @@ def test_a_service_knows_no_learning_and_no_other_service(name):
 @pytest.mark.parametrize("name", sorted(modules("benchmarks")))
 def test_benchmarks_need_the_library_alone(name):
     assert all(needed.startswith(("hybrid_jax.", "benchmarks.")) for needed in modules("benchmarks")[name])
+
+
+def test_the_library_needs_no_package_of_the_programs():
+    """Those are an extra. MuJoCo is installed with the library, and imported by `sim` alone."""
+    for path in (ROOT / "hybrid_jax").rglob("*.py"):
+        needed = set(re.findall(r"^ *(?:import|from) (filelock|matplotlib|tyro|mujoco)\b", path.read_text(), re.M))
+        assert needed <= ({"mujoco"} if path.parent.name == "sim" else set()), path
 
 
 def test_there_is_no_cycle():

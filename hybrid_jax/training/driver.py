@@ -234,9 +234,12 @@ def _reporting(progress: Report | bool | None, most: int) -> Iterator[Report]:
     elif callable(progress):
         yield progress
     else:
-        # Not above: it would add to the time that `import hybrid_jax` takes.
-        from rich.console import Console
-        from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+        try:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+        except ImportError as error:
+            hint = "pip install 'hybrid_jax[experiments]', or pass a function of (epoch, state)"
+            raise ImportError(f"progress: the bar needs rich: {hint}") from error
 
         columns = "epoch", MofNCompleteColumn(), BarColumn(), "{task.description}"
         clocks = TimeElapsedColumn(), "at most", TimeRemainingColumn()
