@@ -17,6 +17,7 @@ import tyro
 from filelock import FileLock, Timeout
 from rich.console import Console
 
+from experiments.runner.cache import source_digest
 from experiments.runner.flags import in_flags
 from experiments.runner.options import Run
 from experiments.runner.run_record import ChecksFailed, OtherRun, recorded
@@ -53,7 +54,11 @@ def run(
         gc.freeze()  # tracing makes millions of objects, and to look for garbage among them takes an eighth of its time
         gc.set_threshold(50_000, 20, 20)
         if config.distributed:
-            hosts.initialize(config.coordinator, config.processes, config.process_id)
+            alike = config.described() | {name: source_digest(name) for name in ("hybrid_jax", "experiments")}
+            try:
+                hosts.initialize(config.coordinator, config.processes, config.process_id, alike)
+            except ValueError as error:
+                raise ValueError(f"--distributed: {error}") from error
         # Compiles the kernels beside what comes first, if there are none yet: GCC takes some seconds.
         threading.Thread(target=kernels.status, daemon=True).start()
         signal.signal(signal.SIGTERM, _interrupt)

@@ -9,44 +9,58 @@ import contextlib
 import io
 import json
 from collections.abc import Callable, Iterator, Mapping
-from functools import cache
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.sharding import Mesh, NamedSharding, PartitionSpec, Sharding
+from jax.experimental import multihost_utils
+from jax.sharding import Sharding
 from jaxtyping import PyTree
 
 Arrays = Mapping[str, np.ndarray]
-AXIS = "processes"
 
 
 class PeerLost(ConnectionError):
     """Another process of this run has ended before its work was done."""
 
 
-def initialize(coordinator: str | None = None, processes: int | None = None, process: int | None = None) -> None:
+def initialize(
+    coordinator: str | None = None,
+    processes: int | None = None,
+    process: int | None = None,
+    alike: Mapping[str, Any] | None = None,
+) -> None:
     """Join a multi-process run, whose process 0 is at `coordinator`, host:port. Call it before the first array is made.
 
-    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU).
+    Missing arguments are detected by `jax.distributed.initialize` (Slurm, Open MPI, Kubernetes, Cloud TPU). `alike` are
+    JSON values by name in which all processes must agree, such as options and a digest of the source.
 
     Raises:
-        ValueError: an argument is missing or inconsistent, or the processes differ in their number of devices.
+        ValueError: an argument is missing or inconsistent, or the processes differ in what must be alike.
     """
     jax.config.update("jax_enable_preemption_service", False)  # the host loop handles signals
     try:
         jax.distributed.initialize(coordinator, processes, process)
     except ValueError as error:
-        raise ValueError(f"--distributed: {error}") from error
+        raise ValueError(f"coordinator, processes, process: {error}") from error
     except RuntimeError as error:
         raise PeerLost(f"the processes did not find each other: {error}") from error
-    devices = gather(np.array([jax.local_device_count()]))
-    if len(set(devices.tolist())) > 1:
-        raise ValueError(f"all processes must have the same number of devices, got {devices.tolist()}")
+    # XLA's connections are made here; afterwards the service that arranges them is not needed.
+    _require_alike({"devices": jax.local_device_count()} | dict(alike or {}))
     if jax.default_backend() == "cpu":
         # Open connections report a lost peer. The coordination service would abort this process before it can save.
         jax.distributed.shutdown()
+
+
+def _require_alike(values: Mapping[str, Any]) -> None:
+    own = json.loads(json.dumps(values, default=str))
+    first, _ = from_first(lambda: (own, {}))
+    names = sorted(name for name in own.keys() | first.keys() if own.get(name) != first.get(name))
+    others = np.flatnonzero(gather(np.array([len(names)]))).tolist()
+    if names:
+        raise ValueError(f"processes of one run must be started alike, this one differs from 0 in {', '.join(names)}")
+    if others:
+        raise ValueError(f"processes of one run must be started alike, {others} differ from this one")
 
 
 def is_main_process() -> bool:
@@ -78,7 +92,8 @@ def gather(tree: PyTree) -> PyTree:
     leaves, structure = jax.tree.flatten(tree)
     # As one array of bytes: an exchange takes milliseconds whatever its size, and JAX would truncate 64-bit numbers.
     rows = [np.ascontiguousarray(leaf).ravel().view(np.uint8) for leaf in leaves]
-    found = _exchange(_identity, np.concatenate(rows)[None])
+    with _detect_lost_peers():
+        found = multihost_utils.process_allgather(np.concatenate(rows))
     parts = np.split(found, np.cumsum([len(row) for row in rows])[:-1], axis=1)
     return structure.unflatten(
         np.ascontiguousarray(part).view(leaf.dtype).reshape(-1, *leaf.shape[1:])
@@ -96,8 +111,9 @@ def from_first(make: Callable[[], tuple[Any, Arrays]]) -> tuple[Any, Arrays]:
     if jax.process_count() == 1:
         return make()
     message = np.frombuffer(_pack(*make()), np.uint8) if is_main_process() else np.zeros(0, np.uint8)
-    size = agreed(len(message))
-    return _unpack(_exchange(_sum, (message if is_main_process() else np.zeros(size, np.uint8))[None])[0])
+    message = np.resize(message, agreed(len(message)))  # of the same shape everywhere; only that of process 0 counts
+    with _detect_lost_peers():
+        return _unpack(multihost_utils.broadcast_one_to_all(message))
 
 
 def _pack(about: Any, arrays: Arrays) -> bytes:
@@ -111,33 +127,6 @@ def _unpack(message: np.ndarray) -> tuple[Any, Arrays]:
     with np.load(io.BytesIO(message.tobytes()), allow_pickle=False) as entries:
         arrays = {name[1:]: entries[name] for name in entries.files if name != "about"}
         return json.loads(entries["about"].tobytes()), arrays
-
-
-@cache
-def _mesh() -> Mesh:
-    """One device of each process. One mesh is one set of connections, which are made before the service shuts down."""
-    leaders = {device.process_index: device for device in reversed(jax.devices())}
-    return Mesh(np.array([leaders[process] for process in sorted(leaders)]), (AXIS,))
-
-
-def _exchange(function: Callable[[jax.Array], jax.Array], own: np.ndarray) -> np.ndarray:
-    """A compiled function of the arrays of all processes, as a host array on each of them."""
-    split, whole = NamedSharding(_mesh(), PartitionSpec(AXIS)), NamedSharding(_mesh(), PartitionSpec())
-    with _detect_lost_peers():
-        return np.asarray(_compiled(function, whole)(put(own, split)).addressable_data(0))
-
-
-@cache
-def _compiled(function: Callable[[jax.Array], jax.Array], whole: Sharding) -> Callable[[jax.Array], jax.Array]:
-    return jax.jit(function, out_shardings=whole)
-
-
-def _identity(parts: jax.Array) -> jax.Array:
-    return parts
-
-
-def _sum(parts: jax.Array) -> jax.Array:
-    return jnp.sum(parts, axis=0, keepdims=True, dtype=parts.dtype)
 
 
 @contextlib.contextmanager

@@ -174,9 +174,9 @@ def test_a_killed_process_ends_the_others_fast_and_any_number_goes_on(victim, la
     ("options", "named"),
     [
         (("--processes", "2"), "--coordinator, --processes and --process-id need --distributed"),
-        (("--distributed",), "--distributed: coordinator_address should be defined"),
+        (("--distributed",), "--distributed: coordinator, processes, process: coordinator_address should be defined"),
         (("--distributed", "--coordinator", "127.0.0.1:1", "--processes", "2", "--process-id", "2"),
-         "--distributed: process_id"),
+         "--distributed: coordinator, processes, process: process_id"),
     ],
     ids=["alone", "no cluster", "no such process"],
 )  # fmt: skip
@@ -186,3 +186,15 @@ def test_processes_that_do_not_fit_together_are_refused_in_one_line(options, nam
     assert process.returncode == 2
     assert len(said.strip().splitlines()) == 1, said
     assert named in said
+
+
+def test_processes_of_one_run_are_started_alike(tmp_path):
+    common = "--distributed", "--coordinator", address(), "--processes", "2", "--process-id"
+    both = [
+        experiment(tmp_path / f"out{i}", tmp_path / "cache", *common, str(i), "--max-epochs", str(4 + i))
+        for i in (0, 1)
+    ]
+    texts = [process.communicate(timeout=120)[1] for process in both]
+    assert [process.returncode for process in both] == [2, 2]
+    assert texts[0].strip().endswith("processes of one run must be started alike, [1] differ from this one")
+    assert texts[1].strip().endswith("this one differs from 0 in max_epochs")
