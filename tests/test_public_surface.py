@@ -24,7 +24,7 @@ from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.export import casadi_function, casadi_step, export_program, load_program
 from hybrid_jax.networks.mlp import InputScaling
 from hybrid_jax.sim.domain import SOURCE, Domain
-from hybrid_jax.sim.flight import SplitSpec, fly
+from hybrid_jax.sim.flight import SplitSpec, random_flights
 from hybrid_jax.status import Status
 from hybrid_jax.training.loss import residual_norm
 from hybrid_jax.trajectories import check, concatenate, split, windows_of
@@ -224,7 +224,7 @@ def test_the_simulator_refuses_what_makes_no_domain_split_or_flight(
     assert domain is None or is_finite(domain.quadrotor().parameters)
     spec = outcome(SplitSpec, windows, steps)
     assert spec is None or spec.windows * spec.steps > 0
-    assert outcome(fly, SOURCE, flights, seconds, "no key") is None
+    assert outcome(random_flights, SOURCE, flights, seconds, "no key") is None
 
 
 @cases(0.04)

@@ -16,7 +16,7 @@ from hybrid_jax.flights.checks.motor_response import respond
 from hybrid_jax.flights.formats.csv import read_csv
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import Domain
-from hybrid_jax.sim.flight import fly
+from hybrid_jax.sim.flight import random_flights
 from hybrid_jax.state import STATE_NAMES, input_names
 from hybrid_jax.vehicle import IRIS
 
@@ -40,7 +40,7 @@ HEXA = regular(6)
 @pytest.fixture(scope="module")
 def flown():
     """A second of a hexarotor, of the pilot that knows it, without drag or ground."""
-    flights = fly(Domain("six", HEXA, forces=()), 1, 1.5, jax.random.key(0))
+    flights = random_flights(Domain("six", HEXA, forces=()), 1, 1.5, jax.random.key(0))
     states, u = (np.asarray(part[0]) for part in flights[:2])
     return FlightLog(0.01 * np.arange(len(u)), states[:-1], u, "hexa"), states
 

@@ -174,7 +174,7 @@ def flown(config: ExcitationConfig, domain: Domain, design: Excitation) -> dict[
     steps = round(config.seconds / DT)
     seeds = range(config.seeds)
     flights = {(name, seed): (found[0][i], found[1][i]) for i, name in enumerate(paths) for seed in seeds}
-    drawn = random_flight.fly(domain, 2 * config.seeds, config.seconds, jax.random.key(1))
+    drawn = random_flight.random_flights(domain, 2 * config.seeds, config.seconds, jax.random.key(1))
     sound = np.flatnonzero(~random_flight.gone_wrong(np.asarray(drawn.states)))
     if len(sound) < config.seeds:
         raise ValueError(f"--change {config.change}: {len(sound)} of {2 * config.seeds} random flights stay in bounds")

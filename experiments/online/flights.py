@@ -196,7 +196,7 @@ def after(own: Setup, trial: Trial, first: Segment, moment: Any, fitted: Mapping
 
 def ground_fits(change: str, seeds: int, hardware: Hardware) -> AbstractVectorField:
     """`nominal` with a disturbance, fitted to ten seconds of random flight after a change, stacked over seeds."""
-    flights = random_flight.fly(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
+    flights = random_flight.random_flights(CHANGES[change], seeds, 10.0, jax.random.key(sum(map(ord, change))))
     noisy = jax.vmap(jax.vmap(hardware.measure))(
         jnp.asarray(flights.states, jnp.float32),
         jax.random.split(jax.random.key(1), flights.states.shape[:2]),

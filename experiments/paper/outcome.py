@@ -28,7 +28,7 @@ from hybrid_jax.integrate import compact
 from hybrid_jax.rollouts import predict
 from hybrid_jax.runtime import FASTEST_COMPILE, jit_with
 from hybrid_jax.sim.domain import Domain
-from hybrid_jax.sim.flight import DT, fly
+from hybrid_jax.sim.flight import DT, random_flights
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import lane
 from hybrid_jax.vehicle import IRIS
@@ -144,7 +144,7 @@ def draw(
 ) -> dict[str, tuple[Figure, str]]:
     """Figs. 2/4, 3/5, 7 and the recovered parameters, with captions, by name."""
     title = label(domain.name).capitalize()
-    flight = fly(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
+    flight = random_flights(domain, 1, FLIGHT_SECONDS, jax.random.key(config.data_seed))
     example = example_flight(np.asarray(flight.states[0]), np.asarray(flight.inputs[0]), DT)
     lines = "On source flights: the source's error before the change. Floor: error that no model here can see"
     figures = {

@@ -12,7 +12,7 @@ import numpy as np
 from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.sim.domain import PARAMETER_SHIFT, SOURCE
-from hybrid_jax.sim.flight import DT, fly, gone_wrong
+from hybrid_jax.sim.flight import DT, gone_wrong, random_flights
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 FLIGHTS = {"source": (SOURCE, 10), "target": (PARAMETER_SHIFT, 6)}  # domains, numbers of flights
@@ -25,7 +25,7 @@ def write_logs(folder: Path, seed: int) -> tuple[Path, dict[str, Path]]:
     write_atomic(vehicle, vehicle_toml(IRIS))
     for name, (domain, count) in FLIGHTS.items():
         # Flights that fail are left out, so more are simulated; a chunk of them is simulated in any case.
-        found = fly(domain, 2 * count, SECONDS, jax.random.key(seed))
+        found = random_flights(domain, 2 * count, SECONDS, jax.random.key(seed))
         times = DT * np.arange(found.states.shape[1])
         held = [*range(len(times) - 1), -1]  # a sample holds the inputs of the interval after it; the last are repeated
         for index, i in enumerate(np.flatnonzero(~gone_wrong(found.states))[:count]):

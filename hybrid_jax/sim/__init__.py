@@ -19,7 +19,7 @@ def check_versions(found: dict[str, str]) -> None:
 check_versions(versions("mujoco", "mujoco-mjx"))
 
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain, Quadrotor  # noqa: E402
-from hybrid_jax.sim.flight import Flights, SplitSpec, fly, gone_wrong, make_dataset  # noqa: E402
+from hybrid_jax.sim.flight import Flights, SplitSpec, gone_wrong, make_dataset, random_flights  # noqa: E402
 
 __all__ = [
     "EXTERNAL_FORCE",
@@ -29,7 +29,7 @@ __all__ = [
     "Flights",
     "Quadrotor",
     "SplitSpec",
-    "fly",
     "gone_wrong",
     "make_dataset",
+    "random_flights",
 ]

@@ -151,11 +151,11 @@ class Domain:
         return Quadrotor(parameters_of(self.vehicle, self.drag_coefficient), self.forces)
 
     def describe(self) -> dict[str, Any]:
-        """Its fields as JSON values. The Iris is not listed as the nominal vehicle: earlier datasets knew no other."""
-        nominal = {} if self.nominal == IRIS else {"nominal": asdict(self.nominal)}
-        return nominal | {
+        """Its fields as JSON values."""
+        return {
             "domain": self.name,
             "vehicle": asdict(self.vehicle),
+            "nominal": asdict(self.nominal),
             "drag_coefficient": self.drag_coefficient,
             "forces": [force.__name__ for force in self.forces],
         }

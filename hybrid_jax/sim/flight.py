@@ -57,7 +57,7 @@ class Flights(NamedTuple):
     start: Float[Array | np.ndarray, "*n"]
 
 
-def fly(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
+def random_flights(domain: Domain, flights: int, seconds: float, key: PRNGKeyArray) -> Flights:
     """Simulate random closed-loop flights of `seconds` each, at 100 Hz, always in float64 and on the CPU.
 
     Flight i depends on the key and i alone.
@@ -198,7 +198,7 @@ def _record_split(domain: Domain, spec: SplitSpec, key: PRNGKeyArray) -> tuple[T
     tally, parts = Counter[str](), []
     each = spec.windows // spec.flights if spec.flights else 0
     while tally["windows"] < SPARE * spec.windows if not spec.flights else len(parts) < spec.flights:
-        flights = fly(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally["flights"]))
+        flights = random_flights(domain, CHUNK, SECONDS, jax.random.fold_in(key_flights, tally["flights"]))
         found = cut(flights, spec.steps, tally, domain.nominal)
         whole = round(SECONDS / DT) // spec.steps  # windows of a flight of which none is dropped
         parts += [part[:each] for part in found if len(part) == whole] if spec.flights else found
@@ -260,16 +260,11 @@ def survey(windows: Trajectories) -> dict[str, float]:
     }
 
 
-def _described(spec: SplitSpec) -> dict[str, int]:
-    """Its fields; flights only where they are asked for, as earlier datasets knew none."""
-    return {name: value for name, value in asdict(spec).items() if name != "flights" or value}
-
-
 def configuration(domain: Domain, splits: Mapping[str, SplitSpec], seed: int) -> dict[str, Any]:
     """Everything that determines the windows, as JSON values."""
     return domain.describe() | {
         "recipe": RECIPE,
-        "splits": {name: _described(spec) for name, spec in splits.items()},
+        "splits": {name: asdict(spec) for name, spec in splits.items()},
         "dt": DT,
         "flight_seconds": SECONDS,
         "seed": seed,

@@ -10,7 +10,7 @@ from experiments import make_flights
 from hybrid_jax.io.datasets import content_hash, load_dataset
 from hybrid_jax.sim import flight as recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.flight import Flights, SplitSpec, cut, fly, gone_wrong, make_dataset, permutation
+from hybrid_jax.sim.flight import Flights, SplitSpec, cut, gone_wrong, make_dataset, permutation, random_flights
 from hybrid_jax.vehicle import IRIS, Vehicle
 
 
@@ -52,7 +52,7 @@ SMALL = Vehicle(
 
 @pytest.mark.slow
 def test_a_small_vehicle_flies_as_well_as_the_iris():
-    flights = fly(Domain("small", SMALL), 16, 11.0, jax.random.key(0))
+    flights = random_flights(Domain("small", SMALL), 16, 11.0, jax.random.key(0))
     assert not gone_wrong(flights.states, SMALL).any()
     assert not (flights.lowest_rotor < 0).any()
     speed = np.linalg.norm(flights.states[..., 7:10], axis=-1)
@@ -91,7 +91,7 @@ def test_a_hundred_windows_identify_the_shifted_inertia_and_the_thrust_coefficie
 
 
 def test_the_pilot_stays_in_bounds_in_wind_it_does_not_know():
-    flights = fly(EXTERNAL_FORCE, 64, recording.SECONDS, jax.random.key(1))
+    flights = random_flights(EXTERNAL_FORCE, 64, recording.SECONDS, jax.random.key(1))
     assert not gone_wrong(flights.states).any()
     assert flights.inputs.min() >= 0
     assert flights.inputs.max() <= IRIS.max_rotor_speed
@@ -105,7 +105,7 @@ def test_an_order_is_that_of_jax(n):  # two rounds of sorting from 1626 on
 
 
 def test_a_flight_does_not_depend_on_how_many_are_flown():
-    few, many = (fly(SOURCE, count, recording.SECONDS, jax.random.key(5)) for count in (2, 65))
+    few, many = (random_flights(SOURCE, count, recording.SECONDS, jax.random.key(5)) for count in (2, 65))
     assert few.states.shape[0] == 2
     np.testing.assert_array_equal(few.states, many.states[:2])
 
@@ -138,7 +138,7 @@ def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatc
         flown.append(jax.random.key_data(key).tolist())
         return flights
 
-    monkeypatch.setattr(recording, "fly", numbered)
+    monkeypatch.setattr(recording, "random_flights", numbered)
     dataset = make_dataset(SOURCE, {"a": SplitSpec(300, 10), "b": SplitSpec(150, 20)}, seed=0)
     numbers = {name: set(split.x0[:, 0].tolist()) for name, split in dataset.splits.items()}
     assert not numbers["a"] & numbers["b"]
@@ -152,7 +152,7 @@ def test_splits_come_from_disjoint_flights_and_windows_do_not_overlap(monkeypatc
 def test_a_domain_in_which_every_flight_fails_says_so(monkeypatch):
     broken = level_flights(64)
     broken.states[:, 3, 2] = np.nan
-    monkeypatch.setattr(recording, "fly", lambda *_: broken)
+    monkeypatch.setattr(recording, "random_flights", lambda *_: broken)
     with pytest.raises(ValueError, match="domain source: none of 64 flights"):
         make_dataset(SOURCE, {"train": SplitSpec(1, 10)}, seed=0)
 
