@@ -14,7 +14,7 @@ from jaxtyping import Float
 import hybrid_jax as hj
 from benchmarks.subjects import DT, SCALING
 from hybrid_jax import rotation
-from hybrid_jax.control import Controller, figure_eight, hover, low_pass, sample, step
+from hybrid_jax.control import Controller, figure_eight, hover, low_flyby, sample, step
 from hybrid_jax.control.references import Path
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import disturbed
@@ -47,7 +47,7 @@ def problems() -> dict[str, Problem]:
         "hop": _problem(hop),
         "figure-8 window": _problem(figure_eight(6.0), start=0.5, off=(0.3, 0.3, 0.3)),
         "flip recovery": _problem(hover((0.0, 0.0, 3.0)), turn=2.5),
-        "low pass": _problem(low_pass(3.0, every=2.5), start=0.75, off=(0.0, 0.2, 0.1)),
+        "low pass": _problem(low_flyby(3.0, every=2.5), start=0.75, off=(0.0, 0.2, 0.1)),
         "wind hover": _problem(hover(), off=(0.2, 0.0, 0.0), wind=WIND),
         "step": _problem(step((1.0, -0.5, 0.5), at=0.0, yaw=0.5), begin=hover()),
     }

@@ -16,7 +16,7 @@ from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.load import recording_of
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
-from hybrid_jax.sim.flight import DT, fly, gone_wrong
+from hybrid_jax.sim.flight import DT, gone_wrong, random_flights
 from hybrid_jax.vehicle import IRIS
 
 FLIGHTS, SECONDS = 20, 20.0
@@ -121,7 +121,7 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[Parts], Parts], str]]] = {
 
 
 def sound_logs(domain: Domain, seed: int) -> list[FlightLog]:
-    found, rng = fly(domain, FLIGHTS, SECONDS, jax.random.key(seed)), np.random.default_rng(seed)
+    found, rng = random_flights(domain, FLIGHTS, SECONDS, jax.random.key(seed)), np.random.default_rng(seed)
     logs = []
     for i in np.flatnonzero(~gone_wrong(found.states)):
         x, u = np.array(found.states[i], float), np.array(found.inputs[i], float)

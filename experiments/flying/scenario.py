@@ -19,7 +19,7 @@ ALTITUDE = 1.5  # m
 
 def _crossing(t: Scalar) -> tuple[Float[Array, "3"], Scalar]:
     """A low pass that crosses home after 5 s."""
-    position, yaw = control.low_pass(speed=2.0)(t)
+    position, yaw = control.low_flyby(speed=2.0)(t)
     return position - jnp.array([10.0, 0.0, 0.0]), yaw
 
 

@@ -18,11 +18,11 @@ from hybrid_jax.control.loop import (
     relative_cost_error,
 )
 from hybrid_jax.control.observer import Observer
-from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_pass, sample, step
-from hybrid_jax.control.rotor_lag import rotor_speeds
+from hybrid_jax.control.references import add_body_rates, figure_eight, hover, low_flyby, sample, step
+from hybrid_jax.control.rotor_lag import lagged_speeds
 from hybrid_jax.control.sensitivities import advance
 
 __all__ = ["Controller", "Flight", "Hardware", "Loop", "Observer", "OpenLoopCosts", "Performance"]
-__all__ += ["Plan", "Weights", "rotor_speeds"]
+__all__ += ["Plan", "Weights", "lagged_speeds"]
 __all__ += ["advance", "fly", "open_loop_costs", "performance", "relative_cost_error"]
-__all__ += ["add_body_rates", "figure_eight", "hover", "low_pass", "sample", "step"]
+__all__ += ["add_body_rates", "figure_eight", "hover", "low_flyby", "sample", "step"]

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
-from hybrid_jax.control.sensitivities import advance_lagged, condensed, condensed_lagged
+from hybrid_jax.control.sensitivities import advance_lagged, condensed
 from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.matrices import solve
@@ -82,7 +82,7 @@ class Controller:
         damping: lower bound of the damping.
         min_speed: lower limit of the rotor speeds [rad/s]; the upper one is the vehicle's.
         unit_quaternion: normalise the quaternion after each step of the prediction.
-        rotor_lag: time constant with which rotors follow their commands [s]; see `rotor_speeds`.
+        rotor_lag: time constant with which rotors follow their commands [s]; see `lagged_speeds`.
 
     Raises:
         ValueError: an argument is of another type or out of range, or `interval` is no multiple of `period`.
@@ -281,12 +281,9 @@ class Controller:
         share = jnp.tanh(variables)
         slope = 1 - jnp.square(share)  # of the tanh
         commands, to_speed = self._speeds(share), self._range()[1] * slope
-        if self.rotor_lag:
-            lagged = self.rotor_lag, self.interval, self.unit_quaternion
-            slopes = condensed_lagged(model, x[:-1], before, commands, *lagged)
-            sensitivities = (slopes * to_speed).reshape(self.steps, -1, share.size)
-        else:
-            sensitivities = condensed(model, x[:-1], commands, to_speed, self.interval, self.unit_quaternion)
+        options = self.rotor_lag, self.interval, self.unit_quaternion
+        sensitivities = condensed(model, x[:-1], before, commands, *options) * to_speed
+        sensitivities = sensitivities.reshape(self.steps, -1, share.size)
         slopes = ((factor[:, None, None] * jacobian) @ sensitivities).reshape(-1, variables.size)
         changes = input_rate_penalty(self.weights, self.steps)
         gradient = slopes.T @ (factor[:, None] * residual).reshape(-1) + (slope * (changes @ share)).reshape(-1)

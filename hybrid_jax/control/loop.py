@@ -14,7 +14,7 @@ from hybrid_jax import checks
 from hybrid_jax.control.controller import Controller, Plan, checked_states
 from hybrid_jax.control.cost import Scalar, plan_cost
 from hybrid_jax.control.observer import Observer
-from hybrid_jax.control.rotor_lag import rotor_speeds
+from hybrid_jax.control.rotor_lag import lagged_speeds
 from hybrid_jax.control.sensitivities import advance
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.batching import like
@@ -179,7 +179,7 @@ class Loop(NamedTuple):
         return Moment(x, seen, speeds, sent[1:], plan, estimator.update(now.estimate, seen, mean), key), u
 
     def _lag(self, speeds: Input, command: Input) -> tuple[Input, Input]:
-        return rotor_speeds(speeds, command, self.hardware.rotor_lag, self.controller.period)
+        return lagged_speeds(speeds, command, self.hardware.rotor_lag, self.controller.period)
 
 
 def fly(
@@ -305,14 +305,14 @@ def open_loop_costs(
     lag, delay = hardware.rotor_lag, hardware.delay(controller.period)
 
     def following(speeds, command):
-        mean, speeds = rotor_speeds(speeds, command, lag, controller.period)
+        mean, speeds = lagged_speeds(speeds, command, lag, controller.period)
         return speeds, (mean, speeds)
 
     first = controller.speeds(controller.begin())[0].astype(flight.u.dtype)
     arriving = jnp.concatenate([jnp.tile(first, (delay, 1)), flight.u])
     rotors = jnp.concatenate([first[None], jax.lax.scan(following, first, arriving)[1][1]])  # at each moment
 
-    def advance(x, inputs):
+    def period(x, inputs):
         x = plant(x, *inputs)
         return x, x
 
@@ -321,7 +321,7 @@ def open_loop_costs(
         commands = jnp.repeat(controller.speeds(plan), controller.stride, axis=0)
         speeds = jax.lax.scan(following, rotors[i], commands)[1][0] if lag else commands
         times = controller.period * (i + jnp.arange(len(speeds)))
-        states = jax.lax.scan(advance, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
+        states = jax.lax.scan(period, flight.x[i], (speeds, times))[1][controller.stride - 1 :: controller.stride]
         return plan_cost(controller.weights, controller.horizon(reference, i), states, jnp.tanh(plan.variables))
 
     chosen = jnp.asarray(calls)

@@ -121,7 +121,7 @@ def step(to: tuple[float, float, float], at: float = 1.0, yaw: float = 0.0, alti
     return path
 
 
-def low_pass(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: float = 5.0) -> Path:
+def low_flyby(speed: float = 2.0, low: float = 0.15, high: float = 1.0, every: float = 5.0) -> Path:
     """Fly along x at `speed` [m/s], down to the altitude `low` [m] and up to `high`, every `every` seconds.
 
     The altitude follows cos⁴, which is flat at the bottom: 40 % of the time is spent in the lowest tenth.

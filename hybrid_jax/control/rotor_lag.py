@@ -11,7 +11,7 @@ from hybrid_jax.integrate import RK4, Derivative, traced_once
 from hybrid_jax.state import Input, State
 
 
-def rotor_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
+def lagged_speeds(speeds: Input, command: Input, lag: float, dt: float) -> tuple[Input, Input]:
     """The mean speeds [rad/s] over dt [s] of rotors that follow a command with a lag, τ ẇ = c − w, and those after it.
 
     Exact for a command that is held. To take the mean as speeds that are held is right for velocities, to first order
@@ -50,7 +50,7 @@ def stage_shares(lag: float, dt: float) -> tuple[float, float, float]:
 def lag_matrix(lag: float, dt: float, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """What the speeds before the first of some intervals (t), and the commands of all (t, t), add to those before each
     interval."""
-    kept, k = math.exp(-dt / lag), np.arange(steps)
+    kept, k = math.exp(-dt / lag) if lag else 0.0, np.arange(steps)
     since = np.maximum(k[:, None] - k - 1, 0)
     return kept**k, np.tril((1 - kept) * kept**since, -1)
 

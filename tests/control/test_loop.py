@@ -40,7 +40,7 @@ PATHS = {
     "hover": control.hover(),
     "eight": control.figure_eight(3.5),
     "fast eight": control.figure_eight(6.0),
-    "low pass": control.low_pass(),
+    "low pass": control.low_flyby(),
 }
 
 

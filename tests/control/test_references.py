@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from hybrid_jax.control import Controller, add_body_rates, figure_eight, hover, low_pass, sample, step
+from hybrid_jax.control import Controller, add_body_rates, figure_eight, hover, low_flyby, sample, step
 from hybrid_jax.rotation import body_z, heading, normalise
 
 CONTROLLER = Controller(hj.IRIS)
@@ -65,8 +65,8 @@ def test_hover_and_step_have_zero_velocity():
     np.testing.assert_allclose(samples[-1], sample(hover((2.0, 0.0, 2.5), yaw=1.0), CONTROLLER, 1.0)[0], atol=1e-6)
 
 
-def test_low_pass_is_low_for_two_fifths_of_the_time():
-    altitude = np.asarray(sample(low_pass(low=0.15, high=1.0, every=5.0), CONTROLLER, 9.0)[:, 2])
+def test_low_flyby_is_low_for_two_fifths_of_the_time():
+    altitude = np.asarray(sample(low_flyby(low=0.15, high=1.0, every=5.0), CONTROLLER, 9.0)[:, 2])
     assert altitude.min() == pytest.approx(0.15, abs=1e-4)
     assert altitude.max() == pytest.approx(1.0, abs=1e-4)
     assert np.mean(altitude < 0.15 + 0.085) == pytest.approx(0.4, abs=0.03)
@@ -84,13 +84,13 @@ def test_add_body_rates():
         (lambda: hover((0.0, 0.0, np.nan)), r"position\[2\] is not finite"),
         (lambda: hover("abc"), "position must be an array of real numbers"),
         (lambda: hover(yaw=np.inf), "yaw must be a finite number"),
-        (lambda: low_pass(low=1.0, high=0.5), "high"),
+        (lambda: low_flyby(low=1.0, high=0.5), "high"),
         (lambda: sample(hover(), CONTROLLER, -1.0), "duration"),
         (lambda: figure_eight(0.0), "top_speed"),
         (lambda: figure_eight(3.5, altitude=np.nan), "altitude must be a finite number"),
         (lambda: step(to=(1.0, 2.0)), "to must be three numbers"),
         (lambda: step(to=(1.0, 2.0, 3.0), at=np.nan), "at must be a finite number"),
-        (lambda: low_pass(speed=np.inf), "speed must be a finite number"),
+        (lambda: low_flyby(speed=np.inf), "speed must be a finite number"),
         (lambda: add_body_rates(jnp.zeros(4)), r"state \(13,\) expected"),
         (lambda: add_body_rates(jnp.zeros(13), (1.0,)), "rates must be three numbers"),
         (lambda: sample(None, CONTROLLER, 1.0), "path must be a function of time"),
