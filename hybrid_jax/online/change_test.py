@@ -13,6 +13,8 @@ from jaxtyping import Array, Bool, Float
 from hybrid_jax.online.samples import Sample
 from hybrid_jax.online.tuning import Tuning
 
+NOTHING = 1e-10  # variance of a sum of corrections that are rounding alone
+
 
 class ChangeTest(eqx.Module):
     """Its sums for p parameters, over two spans of time.
@@ -30,7 +32,7 @@ class ChangeTest(eqx.Module):
     @property
     def squares(self) -> Float[Array, "2 p"]:
         """The squared test of each parameter, of one degree of freedom."""
-        return jnp.square(self.pull) / jnp.where(self.spread > 0, self.spread, 1.0)
+        return jnp.square(self.pull) / jnp.where(self.spread > NOTHING, self.spread, 1.0)
 
 
 def started(p: int, dtype) -> ChangeTest:

@@ -8,9 +8,8 @@ and θ, all parameters of the physics and the disturbance.
   of a vehicle are constant between two changes; they do so only where no disturbance is estimated, or beside
   hypotheses, as the filter of all parameters then matters where the model is wrong in a way that none explains.
 - Hypotheses: with these, filters of a few parameters compete with that of all (`multiple_model`).
-- Consistency: while the mean of the normalised innovations squared (NIS) is far too large, what the filter says is not
-  used (Bar-Shalom, Li, Kirubarajan, "Estimation with applications to tracking and navigation", 2001, ch. 5.4), and the
-  last good estimate is.
+- Excitation: what samples do not tell stays as it is, with its variance (`excitation`).
+- Consistency: what the filter says is not used while it cannot be true (`consistency`), and the last good estimate is.
 """
 
 from collections.abc import Mapping
@@ -28,19 +27,19 @@ from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import Interval, intervals
 from hybrid_jax.integrate import check_callable
-from hybrid_jax.online import change_test, kalman, multiple_model
+from hybrid_jax.online import change_test, consistency, excitation, kalman, multiple_model
 from hybrid_jax.online.change_test import ChangeTest
+from hybrid_jax.online.excitation import Filtered
 from hybrid_jax.online.hypotheses import Hypothesis, ModelSet, Subspace, model_set, subspace_of
-from hybrid_jax.online.kalman import Belief, Correction, Each, FilterModel
+from hybrid_jax.online.kalman import Belief, Each, FilterModel
 from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
-from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, named_priors
+from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, flags_of, named_priors
 from hybrid_jax.online.tuning import Tuning
 from hybrid_jax.state_space import StateSpace
 
 FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
 Judged = tuple[ChangeTest, Bool[Array, ""], Verdict]
-UNEXCITED = 0.5  # share of its variance without data, above which the data have said nothing on a parameter
 
 
 class OnlineAdaptation(AbstractEstimator):
@@ -130,11 +129,13 @@ class OnlineAdaptation(AbstractEstimator):
         return OnlineState(
             x=x,
             theta=theta,
-            covariance=jnp.diag(jnp.concatenate([variances, start])),
-            free=start,
+            root=kalman.diagonal_root(variances, start),
+            excitation=excitation.begun(len(x), p, x.dtype),
             test=change_test.started(p, x.dtype),
             mixture=mixture,
             trusted=theta,
+            settled=theta,
+            doubt=zero,
             nis=zero + 1,
             history=SampleHistory(x, none, zero, none),
             changes=zero,
@@ -165,10 +166,11 @@ class OnlineAdaptation(AbstractEstimator):
         x = self._space(x).nearest(x, state.x)
         sample, history = classify(x, u, elapsed, state.history, self.dt, self.tuning.gap)
         model = self._filter_model(sample, each)
-        belief, free = self._predicted(state, model, sample)
-        belief, correction = kalman.correct(belief, sample, model)
-        judged = self._judged(state, model, sample, belief, correction)
-        return self._sound(self._merged(state, belief, free, judged, sample, history), state)
+        filtered = self._filtered(state, model, sample)
+        judged = self._judged(state, model, sample, filtered)
+        begun = self.begin(jnp.where(jnp.abs(history.last) < HUGE, history.last, 0.0))
+        begun = consistency.again(begun, state, model.variances)
+        return consistency.sound(self._merged(state, filtered, judged, sample, history), begun)
 
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
         """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation.
@@ -203,19 +205,7 @@ class OnlineAdaptation(AbstractEstimator):
         Args:
             state: of the filter, or states of several, stacked along leading axes.
         """
-        tuning, d = self.tuning, state.x.shape[-1]
-        variance, free, test = jnp.diagonal(state.covariance, axis1=-2, axis2=-1)[..., d:], state.free, state.test
-        if state.mixture is not None:
-            test = state.mixture.test
-        return Flags(
-            missing=state.history.unseen > 0,
-            frozen=state.history.equal >= tuning.frozen,
-            gap=state.history.silent > tuning.gap,
-            changed=test.quiet < 1,
-            inconsistent=state.nis >= tuning.reject,
-            unexcited=variance > UNEXCITED * free,
-            at_bound=jnp.abs(state.trusted) >= tuning.bound,
-        )
+        return flags_of(state, self.tuning)
 
     def _variances(self, x) -> Float[Array, " d"]:
         return jnp.broadcast_to(jnp.square(jnp.asarray(self.noise, x.dtype)), x.shape)
@@ -239,8 +229,8 @@ class OnlineAdaptation(AbstractEstimator):
         rates, unit = self._rates(sample.u), self._space(x).normalise
         return FilterModel(rates, unit, self._variances(x), added, self.dt, self.tuning, each)
 
-    def _predicted(self, state: OnlineState, model: FilterModel, sample: Sample) -> tuple[Belief, Float[Array, " p"]]:
-        """The filter of all parameters before the sample, and the variances without data."""
+    def _predicted(self, state: OnlineState, model: FilterModel, sample: Sample) -> tuple[Belief, Array]:
+        """The filter of all parameters before the sample, and the Jacobian of its x."""
         tuning, ones = self.tuning, jnp.ones_like(state.theta)
         pulled = jnp.max(state.test.squares, axis=0)
         varies = np.array([name.startswith(DISTURBANCE) for name in self.names])
@@ -248,68 +238,58 @@ class OnlineAdaptation(AbstractEstimator):
         forgotten = np.where(varies | all_vary, tuning.forgetting, 0.0)
         faster = 1 + jnp.asarray(forgotten, ones.dtype) * jnp.maximum(pulled - tuning.eager, 0.0)
         diffusion = self.dt * sample.elapsed * jnp.square(jnp.minimum(tuning.drift * faster, FASTEST))
-        belief = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
-        belief, free = kalman.limit_covariance(belief, ones), jnp.minimum(state.free + diffusion, 1.0)
-        return kalman.reset_state(belief, sample, sample.restart, model.variances), free
+        belief, slope = kalman.predict(state.joint, model, model.field, None, diffusion, sample.acted)
+        belief = kalman.limit_covariance(belief, ones)
+        return kalman.reset_state(belief, sample, sample.restart, model.variances), slope
 
-    def _judged(
-        self, state: OnlineState, model: FilterModel, sample: Sample, belief: Belief, correction: Correction
-    ) -> Judged:
+    def _filtered(self, state: OnlineState, model: FilterModel, sample: Sample) -> Filtered:
+        """The filter of all parameters after the sample, which moves what the samples tell."""
+        predicted, slope = self._predicted(state, model, sample)
+        belief, correction = kalman.correct(predicted, sample, model)
+        told, gains = state.excitation, correction.gains[:, len(state.x) :]
+        if self.tuning.excitation:
+            told = excitation.after_sample(told, slope, correction, sample, self.dt, self.tuning)
+            belief, gains = excitation.consider(predicted, belief, correction, told.considered())
+        return Filtered(kalman.triangular(belief, len(state.x)), told, correction, gains)
+
+    def _judged(self, state: OnlineState, model: FilterModel, sample: Sample, filtered: Filtered) -> Judged:
         """The test of the filter of all parameters, whether that filter opens to its prior, and what is believed."""
-        tuning, (white, gains, _) = self.tuning, correction
+        (belief, _, correction, gains), tuning = filtered, self.tuning
+        white = correction.white
         test, opens = change_test.after_sample(state.test, white, gains, sample, self.dt, tuning, tuning.pause)
         if state.mixture is None:
             return test, opens, Verdict(None, belief.z[len(state.x) :], jnp.square(white), opens, opens)
-        verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction)
+        verdict = multiple_model.update(state.mixture, self._models(), model, sample, belief, correction, gains)
         unexplained = verdict.unexplained & (test.quiet > tuning.hold)
         return change_test.reset(test, unexplained, 0.0), opens | unexplained, verdict
 
     def _merged(
-        self, state: OnlineState, belief: Belief, free: Array, judged: Judged, sample: Sample, history: SampleHistory
+        self, state: OnlineState, filtered: Filtered, judged: Judged, sample: Sample, history: SampleHistory
     ) -> OnlineState:
         """The next state: opened to the prior after a change, and believed if it is consistent."""
-        test, opens, verdict = judged
+        (test, opens, verdict), d, variances = judged, len(state.x), self._variances(state.x)
         # The state, too, has followed the wrong model since the change.
-        belief = kalman.reset_state(belief, sample, opens, self._variances(state.x))
-        d, ones = len(state.x), jnp.ones_like(state.theta)
-        opened = jnp.concatenate([jnp.zeros(d, state.x.dtype), jnp.where(opens, ones, 0.0)])
-        nis = self._mean_square(state.nis, verdict.squares, sample)
+        belief = kalman.reset_state(filtered.belief, sample, opens, variances)
+        fresh = kalman.diagonal_root(variances, jnp.ones_like(state.theta))
+        nis = consistency.mean_square(state.nis, verdict.squares, sample, self.dt / self.tuning.window)
+        doubt = consistency.alarms(state.doubt, verdict, sample, self.dt, self.tuning)
+        believed = jnp.where(nis < self.tuning.reject, verdict.theta, state.trusted)
+        trusted = jnp.where(doubt < self.tuning.alarms, believed, state.settled)
         return OnlineState(
             x=belief.z[:d],
             theta=belief.z[d:],
-            covariance=belief.covariance + jnp.diag(opened),
-            free=jnp.where(opens, ones, free),
+            root=jnp.concatenate([belief.root[:d], jnp.where(opens, fresh, belief.root)[d:]]),
+            excitation=filtered.excitation,
             test=test,
             mixture=verdict.mixture,
-            trusted=jnp.where(nis < self.tuning.reject, verdict.theta, state.trusted),
+            trusted=trusted,
+            settled=jnp.where(doubt < consistency.SETTLED, trusted, state.settled),
+            doubt=doubt,
             nis=nis,
             history=history,
             changes=state.changes + jnp.where(verdict.changed, 1.0, 0.0),
             restarts=state.restarts,
         )
 
-    def _mean_square(self, nis, squares, sample: Sample):
-        """The mean NIS with another sample."""
-        share = jnp.sum(squares) / jnp.maximum(jnp.sum(jnp.where(sample.seen, 1.0, 0.0)), 1.0)
-        return nis + jnp.where(sample.measured, -jnp.expm1(-self.dt / self.tuning.window), 0.0) * (share - nis)
-
     def _models(self) -> ModelSet:
         return model_set(self.hypotheses, len(self.names), self.dt)
-
-    def _sound(self, new: OnlineState, old: OnlineState) -> OnlineState:
-        """The new state, or a beginning at the last good θ if a number of it is not finite."""
-        parts = [new.covariance, new.x, new.theta, new.nis]
-        if new.mixture is not None:
-            parts += [new.mixture.z, new.mixture.covariance, new.mixture.log_weights]
-        total = sum(jnp.sum(jnp.abs(part)) for part in parts)
-        sound = (total < HUGE) & (jnp.min(kalman.diagonal(new.covariance)) > 0)
-        x, ones = jnp.where(jnp.abs(new.history.last) < HUGE, new.history.last, 0.0), jnp.ones_like(old.theta)
-        covariance = jnp.diag(jnp.concatenate([self._variances(x), ones]))
-        values = old.trusted, old.trusted, covariance, ones, old.changes, old.restarts + 1
-        again = eqx.tree_at(
-            lambda s: (s.theta, s.trusted, s.covariance, s.free, s.changes, s.restarts), self.begin(x), values
-        )
-        if (mixture := again.mixture) is not None:
-            # It is for all parameters now.
-            again = eqx.tree_at(lambda s: s.mixture.log_weights, again, mixture.log_weights[::-1])
-        return jax.tree.map(lambda a, b: jnp.where(sound, a, b), new, again)

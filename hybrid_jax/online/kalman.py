@@ -1,7 +1,8 @@
 """Steps of an extended Kalman filter of z = [x, a]: the state of a system, and numbers a that move its parameters.
 
-Samples enter one number after the other, so that an update needs no matrix inverse (Bierman, "Factorization methods for
-discrete sequential estimation", 1977, ch. V.2). All functions are pure and map over filters of one size.
+Samples enter one number after the other, so that an update needs no matrix inverse, and a covariance is kept by a
+square root (Potter's method; Bierman, "Factorization methods for discrete sequential estimation", 1977, ch. II). All
+functions are pure and map over filters of one size.
 """
 
 from collections.abc import Callable
@@ -20,10 +21,20 @@ Field = Callable[[Array, Array], Array]  # ẋ as a function of x and a
 
 
 class Belief(NamedTuple):
-    """Mean and covariance of z."""
+    """Mean of z, and a square root of its covariance, which rounding cannot make negative.
+
+    Attributes:
+        z: the mean.
+        root: S of the covariance S Sᵀ; after `triangular` the rows of a are zero after the first k columns.
+    """
 
     z: Float[Array, " n"]
-    covariance: Float[Array, "n n"]
+    root: Float[Array, "n m"]
+
+    @property
+    def covariance(self) -> Float[Array, "n n"]:
+        """Of z."""
+        return self.root @ self.root.T
 
 
 class FilterModel(NamedTuple):
@@ -50,7 +61,7 @@ class FilterModel(NamedTuple):
     def tidy(self, belief: Belief) -> Belief:
         """With a unit quaternion, and a within its bounds."""
         z, d, bound = belief.z, len(self.variances), self.tuning.bound
-        return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -bound, bound)]), belief.covariance)
+        return Belief(jnp.concatenate([self.unit(z[:d]), jnp.clip(z[d:], -bound, bound)]), belief.root)
 
 
 class Correction(NamedTuple):
@@ -58,12 +69,14 @@ class Correction(NamedTuple):
 
     Attributes:
         white: innovations over their standard deviations.
-        gains: of the numbers a by these.
+        sizes: these standard deviations.
+        gains: of z by these.
         log_likelihood: of the sample, but for a constant.
     """
 
     white: Float[Array, " d"]
-    gains: Float[Array, "d k"]
+    sizes: Float[Array, " d"]
+    gains: Float[Array, "d n"]
     log_likelihood: Float[Array, ""]
 
 
@@ -86,69 +99,84 @@ def predict(
     transition: Float[Array, "k k"] | None,
     diffusion: Float[Array, " k"],
     acted: Bool[Array, ""],
-) -> Belief:
-    """One period later, if a known input acted in it.
+) -> tuple[Belief, Float[Array, "d n"]]:
+    """One period later, if a known input acted in it, and the Jacobian of the next x.
 
     Args:
         field: ẋ as a function of x and a.
         transition: the next a as a matrix times a; None if it stays.
         diffusion: variance that the period adds to a.
     """
-    z, covariance = belief
+    z, root = belief
     d = len(model.variances)
     moved, slope = step_with_jacobian(model, field, z[:d], z[d:])
-    top, own = slope @ covariance, covariance[d:, d:]
-    inner, beside, a = top @ slope.T, top[:, d:], z[d:]
-    by_a = slope[:, d:]
+    own, a = root[d:], z[d:]
     # Products of errors of a and of x, which a linear filter leaves out, move the state while a is uncertain.
-    noise = model.process_noise + model.tuning.caution**2 * jnp.sum((by_a @ own) * by_a, axis=1)
+    noise = model.process_noise + model.tuning.caution**2 * jnp.sum(jnp.square(slope[:, d:] @ own), axis=1)
     if transition is not None:
-        beside, own, a = beside @ transition.T, transition @ own @ transition.T, transition @ a
-    later = jnp.block([[inner, beside], [beside.T, own]])
-    later = jnp.where(acted, (later + later.T) / 2, covariance) + jnp.diag(jnp.concatenate([noise, diffusion]))
-    return Belief(jnp.where(acted, jnp.concatenate([moved, a]), z), later)
+        own, a = transition @ own, transition @ a
+    later = jnp.where(acted, jnp.concatenate([slope @ root, own]), root)
+    later = jnp.concatenate([later, jnp.diag(jnp.sqrt(jnp.concatenate([noise, diffusion])))], axis=1)
+    return Belief(jnp.where(acted, jnp.concatenate([moved, a]), z), later), slope
 
 
 def reset_state(
     belief: Belief, sample: Sample, restart: Bool[Array, ""] | bool, variances: Float[Array, " d"]
 ) -> Belief:
-    """With x as the sample has it, if `restart`; a stays."""
-    z, covariance = belief
+    """With x as the sample has it, if `restart`; a stays. The belief is triangular, or predicted from such a one."""
+    z, root = belief
     d, k = len(variances), len(z) - len(variances)
-    kept = jnp.concatenate([jnp.full(d, jnp.where(restart, 0.0, 1.0), z.dtype), jnp.ones(k, z.dtype)])
-    variance = jnp.where(sample.seen, variances, 1e4 * variances)
-    added = jnp.concatenate([jnp.where(restart, variance, 0.0), jnp.zeros(k, z.dtype)])
+    fresh = jnp.diag(jnp.sqrt(jnp.where(sample.seen, variances, 1e4 * variances)))
+    fresh = jnp.pad(fresh, ((0, 0), (k, root.shape[1] - k - d)))
     z = jnp.concatenate([jnp.where(restart & sample.seen, sample.x, z[:d]), z[d:]])
-    return Belief(z, kept[:, None] * covariance * kept + jnp.diag(added))
+    return Belief(z, jnp.concatenate([jnp.where(restart, fresh, root[:d]), root[d:]]))
+
+
+def triangular(belief: Belief, d: int) -> Belief:
+    """With a root of as many columns as rows, first a triangle for a, by the modified Gram-Schmidt method."""
+    rows, columns = jnp.concatenate([belief.root[d:], belief.root[:d]]), []
+    for i in range(len(rows)):
+        size = jnp.sqrt(jnp.sum(jnp.square(rows[0])))
+        unit = rows[0] / jnp.where(size > 0, size, 1.0)
+        along = rows[1:] @ unit
+        rows = rows[1:] - along[:, None] * unit
+        columns.append(jnp.concatenate([jnp.zeros(i, size.dtype), size[None], along]))
+    root = jnp.stack(columns, axis=1)
+    k = len(root) - d
+    return Belief(belief.z, jnp.concatenate([root[k:], root[:k]]))
 
 
 def correct(belief: Belief, sample: Sample, model: FilterModel) -> tuple[Belief, Correction]:
     """With one measured number after the other; innovations are cut off at some standard deviations."""
-    (z, covariance), variances, clip = belief, model.variances, model.tuning.clip
-    d = len(variances)
-    white, gains, likelihood = [], [], jnp.zeros((), z.dtype)
-    for i in range(d):
-        used, column = sample.used[i], covariance[:, i]
-        variance = column[i] + variances[i]
+    (z, root), variances, clip = belief, model.variances, model.tuning.clip
+    white, sizes, gains, likelihood = [], [], [], jnp.zeros((), z.dtype)
+    for i, noise in enumerate(variances):
+        used = sample.used[i]
+        row = jnp.where(used, root[i], 0.0)
+        variance, column = jnp.sum(jnp.square(row)) + noise, root @ row
         size = jnp.sqrt(variance)
         error = jnp.where(used, jnp.clip((sample.x[i] - z[i]) / size, -clip, clip), 0.0)
-        gain = jnp.where(used, column / size, 0.0)
-        z, covariance = z + gain * error, covariance - gain[:, None] * gain
+        gain = column / size
+        # Potter's update: that of the covariance, column columnᵀ / variance, without a difference of squares.
+        z, root = z + gain * error, root - column[:, None] * row / (variance + jnp.sqrt(noise * variance))
         likelihood = likelihood - jnp.where(used, jnp.square(error) + jnp.log(variance), 0.0) / 2
         white.append(error)
-        gains.append(gain[d:])
-    return model.tidy(Belief(z, covariance)), Correction(jnp.stack(white), jnp.stack(gains), likelihood)
+        sizes.append(size)
+        gains.append(gain)
+    correction = Correction(jnp.stack(white), jnp.stack(sizes), jnp.stack(gains), likelihood)
+    return model.tidy(Belief(z, root)), correction
 
 
 def limit_covariance(belief: Belief, prior: Float[Array, " k"]) -> Belief:
     """No number a becomes less certain than the prior, also if nothing excites it for long."""
-    z, covariance = belief
-    variance = diagonal(covariance)[len(z) - len(prior) :]
-    most = jnp.where(prior > 0, prior, 1.0)
-    shrink = jnp.concatenate([jnp.ones(len(z) - len(prior), z.dtype), jnp.sqrt(most / jnp.maximum(variance, most))])
-    return Belief(z, shrink[:, None] * covariance * shrink)
+    z, root = belief
+    d = len(z) - len(prior)
+    variance, most = jnp.sum(jnp.square(root[d:]), axis=1), jnp.where(prior > 0, prior, 1.0)
+    shrink = jnp.sqrt(most / jnp.maximum(variance, most))
+    return Belief(z, jnp.concatenate([root[:d], shrink[:, None] * root[d:]]))
 
 
-def diagonal(matrix: Float[Array, "n n"]) -> Float[Array, " n"]:
-    """As jnp.diagonal, by operations that the export to C knows."""
-    return matrix.ravel()[:: len(matrix) + 1]
+def diagonal_root(x: Float[Array, " d"], a: Float[Array, " k"]) -> Float[Array, "n n"]:
+    """A square root, as `triangular` makes one, of independent numbers of these variances."""
+    own, state = jnp.diag(jnp.sqrt(a)), jnp.diag(jnp.sqrt(x))
+    return jnp.concatenate([jnp.pad(state, ((0, 0), (len(a), 0))), jnp.pad(own, ((0, 0), (0, len(x))))])

@@ -35,14 +35,14 @@ class Mixture(eqx.Module):
 
     Attributes:
         z: of each, x and the numbers that move θ.
-        covariance: of each z.
+        root: of each, a square root of the covariance of z.
         previous: 1 for the one of the others that the first was before the last alarm, else 0.
         log_weights: logarithms of the weights, the largest 0; the last is that of the filter of all parameters.
         test: the change test of the estimate.
     """
 
     z: Float[Array, "*n h d+k"]
-    covariance: Float[Array, "*n h d+k d+k"]
+    root: Float[Array, "*n h d+k d+k"]
     previous: Float[Array, "*n h-1"]
     log_weights: Float[Array, "*n h+1"]
     test: ChangeTest
@@ -71,10 +71,11 @@ def initial(models: ModelSet, x: Float[Array, " d"], variances: Float[Array, " d
     h, p, k = models.effects.shape
     none = jnp.zeros(k, x.dtype)
     z = jnp.tile(jnp.concatenate([x, none]), (h + 1, 1))
-    covariance = jnp.tile(jnp.diag(jnp.concatenate([variances, none])), (h + 1, 1, 1))
+    root = kalman.diagonal_root(variances, none)
+    root = jnp.tile(root, (h + 1, 1, 1))
     before = jnp.zeros(h, x.dtype).at[0].set(1)
     log_weights = jnp.full(h + 2, -floor, x.dtype).at[0].set(0)
-    return Mixture(z, covariance, before, log_weights, started(p, x.dtype))
+    return Mixture(z, root, before, log_weights, started(p, x.dtype))
 
 
 def weights(mixture: Mixture, least: float) -> Float[Array, " h+1"]:
@@ -104,8 +105,9 @@ def covariance(mixture: Mixture, models: ModelSet, joint: Belief, least: float) 
     share, means = weights(mixture, least), _means(mixture, models, joint)
     effects = with_previous(mixture, models.ahead)
     d = len(joint.z) - effects.shape[1]
-    outside = jax.vmap(jnp.diag)(with_previous(mixture, models.outside) * kalman.diagonal(joint.covariance)[d:])
-    within = jnp.einsum("hpk,hkl,hql->hpq", effects, mixture.covariance[:, d:, d:], effects) + outside
+    outside = jax.vmap(jnp.diag)(with_previous(mixture, models.outside) * jnp.diagonal(joint.covariance)[d:])
+    within = effects @ mixture.root[:, d:]
+    within = within @ within.mT + outside
     away = means - share @ means
     parts = jnp.concatenate([within, joint.covariance[None, d:, d:]]) + away[:, :, None] * away[:, None, :]
     return jnp.tensordot(share, parts, 1)
@@ -118,13 +120,19 @@ def _means(mixture: Mixture, models: ModelSet, joint: Belief) -> Float[Array, "h
 
 
 def update(
-    mixture: Mixture, models: ModelSet, model: FilterModel, sample: Sample, joint: Belief, correction: Correction
+    mixture: Mixture,
+    models: ModelSet,
+    model: FilterModel,
+    sample: Sample,
+    joint: Belief,
+    correction: Correction,
+    gains: Float[Array, "d p"],
 ) -> Verdict:
-    """After a sample, with the filter of all parameters as that sample corrected it."""
+    """After a sample, with the filter of all parameters as that sample corrected it, and the gains of its θ."""
     tuning, shares = model.tuning, weights(mixture, model.tuning.least)
     mixture, white, likelihoods = filtered(mixture, models, model, sample)
     white = jnp.concatenate([white, correction.white[None]])
-    pulled = shares @ white, correction.gains
+    pulled = shares @ white, gains
     test, changed = change_test.after_sample(mixture.test, *pulled, sample, model.dt, tuning, tuning.settle)
     likelihoods = jnp.concatenate([likelihoods, correction.log_likelihood[None]])
     before, mixture = mixture.log_weights[-1], reweighted(mixture, likelihoods, tuning.floor)
@@ -144,18 +152,18 @@ def filtered(
     prior = with_previous(mixture, models.prior)
     diffusion = model.dt * sample.elapsed * (with_previous(mixture, models.diffusion) + model.tuning.drift**2 * prior)
 
-    def one(z, covariance, effects, transition, prior, diffusion):
+    def one(z, root, effects, transition, prior, diffusion):
         def field(x, a):
             return model.field(x, jnp.sum(effects * a, axis=1))
 
-        belief = kalman.predict(Belief(z, covariance), model, field, transition, diffusion, sample.acted)
+        belief, _ = kalman.predict(Belief(z, root), model, field, transition, diffusion, sample.acted)
         belief = kalman.reset_state(kalman.limit_covariance(belief, prior), sample, sample.restart, model.variances)
         belief, correction = kalman.correct(belief, sample, model)
-        return belief, correction.white, correction.log_likelihood
+        return kalman.triangular(belief, len(sample.x)), correction.white, correction.log_likelihood
 
     effects, transition = with_previous(mixture, models.effects), with_previous(mixture, models.transition)
-    belief, white, likelihood = model.each(one)(mixture.z, mixture.covariance, effects, transition, prior, diffusion)
-    return eqx.tree_at(lambda m: (m.z, m.covariance), mixture, tuple(belief)), white, likelihood
+    belief, white, likelihood = model.each(one)(mixture.z, mixture.root, effects, transition, prior, diffusion)
+    return eqx.tree_at(lambda m: (m.z, m.root), mixture, tuple(belief)), white, likelihood
 
 
 def reweighted(mixture: Mixture, likelihoods: Float[Array, " h+1"], floor: float) -> Mixture:
@@ -177,18 +185,17 @@ def reinitialised(
     first = jnp.concatenate([likeliest[:1], likeliest[1:2] + joint, likeliest[2:h]])
     restart = jnp.concatenate([jnp.zeros_like(mixture.previous[:1]), jnp.ones_like(mixture.previous)])
 
-    def one(z, covariance, prior, restart):
-        none = jnp.concatenate([jnp.ones(d, z.dtype), jnp.full(len(prior), 1 - restart)])
-        covariance = none[:, None] * covariance * none + jnp.diag(
-            jnp.concatenate([jnp.zeros(d, z.dtype), prior]) * restart
-        )
-        return kalman.reset_state(Belief(none * z, covariance), sample, True, model.variances)
+    def one(z, root, prior, restart):
+        begun = kalman.reset_state(Belief(z, root), sample, True, model.variances)
+        fresh = kalman.diagonal_root(model.variances, prior)
+        kept = jnp.concatenate([jnp.ones(d, z.dtype), jnp.full(len(prior), 1 - restart)])
+        return Belief(kept * begun.z, jnp.concatenate([begun.root[:d], jnp.where(restart > 0, fresh, root)[d:]]))
 
     z = jnp.concatenate([(first @ mixture.z)[None], mixture.z[1:]])
-    covariance = jnp.concatenate([jnp.tensordot(first, mixture.covariance, 1)[None], mixture.covariance[1:]])
-    belief = model.each(one)(z, covariance, with_previous(mixture, models.prior), restart)
+    root = jnp.concatenate([jnp.tensordot(first, mixture.root, 1)[None], mixture.root[1:]])
+    belief = model.each(one)(z, root, with_previous(mixture, models.prior), restart)
     # What learns goes on with its weight.
     least = jnp.full_like(mixture.log_weights, -model.tuning.change)
     log_weights = least.at[0].set(least[0] * joint).at[-1].set(jnp.maximum(mixture.log_weights[-1], least[0]))
-    new = Mixture(belief.z, belief.covariance, first[0] * mixture.previous + first[1:], log_weights, mixture.test)
+    new = Mixture(belief.z, belief.root, first[0] * mixture.previous + first[1:], log_weights, mixture.test)
     return jax.tree.map(lambda a, b: jnp.where(alarm, a, b), new, mixture)

@@ -14,9 +14,11 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.online.change_test import ChangeTest
+from hybrid_jax.online.excitation import TAKES_PART, Excitation
 from hybrid_jax.online.kalman import Belief
 from hybrid_jax.online.multiple_model import Mixture
 from hybrid_jax.online.samples import SampleHistory
+from hybrid_jax.online.tuning import Tuning
 
 DISTURBANCE = "disturbance"
 Numbers = float | tuple[float, ...] | np.ndarray
@@ -28,11 +30,13 @@ class OnlineState(eqx.Module):
     Attributes:
         x: estimated state.
         theta: change of θ in prior standard deviations, as the filter of all parameters has it.
-        covariance: of both, in these units.
-        free: variances that θ would have, had nothing been measured since the last alarm.
+        root: a square root of the covariance of both, in these units.
+        excitation: what samples of late tell of θ.
         test: the change test of the filter of all parameters.
         mixture: the filters of the hypotheses and their weights; None without hypotheses.
         trusted: the last θ that was consistent, which the model has.
+        settled: the last of these before alarms began, to which it returns if they do not end.
+        doubt: count of alarms of late.
         nis: mean normalised innovation squared, 1 if noise and model are as stated.
         history: what samples were like until now.
         changes: how many alarms there were.
@@ -41,11 +45,13 @@ class OnlineState(eqx.Module):
 
     x: Float[Array, "*n d"]
     theta: Float[Array, "*n p"]
-    covariance: Float[Array, "*n d+p d+p"]
-    free: Float[Array, "*n p"]
+    root: Float[Array, "*n d+p d+p"]
+    excitation: Excitation
     test: ChangeTest
     mixture: Mixture | None
     trusted: Float[Array, "*n p"]
+    settled: Float[Array, "*n p"]
+    doubt: Float[Array, "*n"]
     nis: Float[Array, "*n"]
     history: SampleHistory
     changes: Float[Array, "*n"]
@@ -54,7 +60,12 @@ class OnlineState(eqx.Module):
     @property
     def joint(self) -> Belief:
         """z = [x, θ] of the filter of all parameters."""
-        return Belief(jnp.concatenate([self.x, self.theta]), self.covariance)
+        return Belief(jnp.concatenate([self.x, self.theta]), self.root)
+
+    @property
+    def covariance(self) -> Float[Array, "*n d+p d+p"]:
+        """Of x and θ, in the units of `theta`."""
+        return self.root @ self.root.mT
 
 
 class Flags(NamedTuple):
@@ -65,8 +76,9 @@ class Flags(NamedTuple):
         frozen: of each state, a sensor that repeats its last value.
         gap: nothing was measured for longer than `Tuning.gap`.
         changed: an alarm in the last second.
-        inconsistent: errors are too large for the model at any θ: the last good estimate is used.
-        unexcited: parameters on which the data say nothing.
+        inconsistent: errors are too large for the model at any θ, or alarms do not end, as with a sensor of wrong sign,
+            unit or place: the last good estimate is used.
+        unexcited: parameters that samples of late do not tell, by themselves or in a sum with others.
         at_bound: parameters at the end of their range.
     """
 
@@ -77,6 +89,20 @@ class Flags(NamedTuple):
     inconsistent: Bool[Array, ""]
     unexcited: Bool[Array, " p"]
     at_bound: Bool[Array, " p"]
+
+
+def flags_of(state: OnlineState, tuning: Tuning) -> Flags:
+    """What is wrong with samples, parameters and model in a state, or in stacked ones, or was found."""
+    considered, test = state.excitation.considered(), state.test if state.mixture is None else state.mixture.test
+    return Flags(
+        missing=state.history.unseen > 0,
+        frozen=state.history.equal >= tuning.frozen,
+        gap=state.history.silent > tuning.gap,
+        changed=test.quiet < 1,
+        inconsistent=(state.nis >= tuning.reject) | (state.doubt >= tuning.alarms),
+        unexcited=jnp.diagonal(considered, axis1=-2, axis2=-1) > TAKES_PART,
+        at_bound=jnp.abs(state.trusted) >= tuning.bound,
+    )
 
 
 def named_priors(

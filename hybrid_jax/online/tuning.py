@@ -28,6 +28,11 @@ class Tuning:
         gap: guard: after so long without a sample the state is taken from the next one [s].
         frozen: guard: equal samples in a row from which a sensor counts as frozen.
         bound: guard: prior standard deviations that a parameter may move.
+        excitation: guard: information of a sample, in units of the prior, below which a direction of θ is not
+            learned; 0 to learn all.
+        memory: guard: time constant of that information [s].
+        trial: guard: time constant of the count of alarms [s]; a parameter at its bound counts as 2.5 a second.
+        alarms: guard: count from which the filter is not believed, until it has fallen to half of twice as many.
         caution: guard: share of what uncertain parameters do to a step that counts as noise, for its nonlinearity.
         floor: hypotheses: how many times less likely, as a logarithm, one can become than the likeliest.
         least: hypotheses: weight, relative to the largest, up to which one is left out of the estimate.
@@ -51,6 +56,10 @@ class Tuning:
     gap: float = 0.1
     frozen: int = 3
     bound: float = 4.0
+    excitation: float = 0.05
+    memory: float = 2.0
+    trial: float = 10.0
+    alarms: float = 5.0
     caution: float = 1.5
     floor: float = 25.0
     least: float = 1e-3
@@ -59,8 +68,19 @@ class Tuning:
     hold: float = 0.6
 
     def __post_init__(self):
-        for name in ("drift", "forgetting", "eager", "caution", "pause", "least", "change", "settle", "hold"):
+        for name in (
+            "drift",
+            "forgetting",
+            "eager",
+            "caution",
+            "excitation",
+            "pause",
+            "least",
+            "change",
+            "settle",
+            "hold",
+        ):
             checks.not_negative(name, getattr(self, name))
-        for name in ("window", "alarm", "reject", "clip", "gap", "bound", "floor"):
+        for name in ("window", "memory", "trial", "alarms", "alarm", "reject", "clip", "gap", "bound", "floor"):
             checks.positive(name, getattr(self, name))
         checks.count("frozen", self.frozen)

@@ -14,7 +14,7 @@ from hybrid_jax.integrate import rk4_step
 from hybrid_jax.online import OnlineAdaptation, Tuning
 
 DT, NOISE = 0.05, 0.01
-CALM = Tuning(caution=0.0, alarm=1e3, forgetting=0.0, drift=0.0, clip=1e3)  # the plain Kalman filter
+CALM = Tuning(caution=0.0, alarm=1e3, forgetting=0.0, drift=0.0, clip=1e3, excitation=0.0)  # the plain Kalman filter
 
 
 class Slide(hj.AbstractVectorField):

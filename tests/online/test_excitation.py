@@ -1,0 +1,86 @@
+"""Laws of a filter in hover: what samples do not tell stays as it was, and a wrong sensor is not taken for a change."""
+
+from functools import cache
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.online import OnlineAdaptation
+
+DT, NOISE, SECOND, HOVER = 0.01, 0.02, 100, 9.8
+
+
+class Climb(hj.AbstractVectorField):
+    """v̇ = gain u − g + push, which at a constant u only a sum of gain and push explains."""
+
+    gain: jax.Array
+    push: jax.Array
+
+    def __call__(self, x, u):
+        return self.gain * u - HOVER + self.push
+
+
+@cache
+def filter_of(noise):
+    """It believes that more moves the vehicle than does, as every filter should."""
+    field = Climb(jnp.array(1.0), jnp.array(0.0))
+    return OnlineAdaptation(field, DT, noise, {"gain": 0.2, "push": 3.0}, process=0.005)
+
+
+@eqx.filter_jit
+def hovering(adaptation, noise, key, steps, change=0.0, sensor=1.0, swing=0.0):
+    """States of the filter while a controller holds a speed; halfway the gain changes, or the sensor by a factor."""
+
+    def step(carry, given):
+        v, y, state = carry
+        i, white = given
+        late = i >= steps // 2
+        u = HOVER - 4 * (y - swing * jnp.sin(5 * DT * i))
+        v = v + DT * ((1 + jnp.where(late, change, 0.0)) * u - HOVER)
+        y = jnp.where(late, sensor, 1.0) * v + noise * white
+        state = adaptation.update(state, y[None], u[None])
+        return (v, y, state), state
+
+    zero = jnp.zeros(())
+    given = jnp.arange(steps), jax.random.normal(key, (steps,))
+    return jax.lax.scan(step, (zero, zero, adaptation.begin(zero[None])), given)[1]
+
+
+def gains(adaptation, states):
+    """θ of the gain and its standard deviation, in units of the prior."""
+    at = adaptation.names.index("gain")
+    return np.asarray(states.trusted[:, at]), np.sqrt(np.asarray(states.covariance[:, 1 + at, 1 + at]))
+
+
+@pytest.mark.parametrize("noise", [NOISE, NOISE / 10], ids=["noisy", "quiet"])
+def test_what_hover_does_not_tell_stays_with_its_variance_and_is_flagged(noise):
+    """A filter that learns all is off by three standard deviations of the prior after this minute."""
+    adaptation = filter_of(noise)
+    states = hovering(adaptation, noise, jax.random.key(0), 60 * SECOND)
+    theta, deviation = gains(adaptation, states)
+    assert np.abs(theta).max() < 0.1
+    assert deviation.min() > 0.8
+    assert adaptation.flags(states).unexcited[SECOND:].all()
+    assert np.linalg.eigvalsh(np.asarray(states.covariance[::SECOND], float)).min() > 0
+
+
+def test_a_change_is_found_within_a_second_as_far_as_samples_tell_it():
+    after = 13 * SECOND
+    hover = hovering(filter_of(NOISE), NOISE, jax.random.key(0), 24 * SECOND, change=0.2)
+    assert hover.changes[after] == 1
+    scales = np.array(filter_of(NOISE).scales) * [HOVER, 1.0]
+    assert hover.trusted[after] @ scales == pytest.approx(0.2 * HOVER, rel=0.1)  # by gain or push
+    swung = hovering(filter_of(NOISE), NOISE, jax.random.key(0), 24 * SECOND, change=0.2, swing=1.0)
+    assert gains(filter_of(NOISE), swung)[0][after] == pytest.approx(1.0, rel=0.1)
+
+
+@pytest.mark.parametrize(("sensor", "swing"), [(-1.0, 1.0), (57.3, 0.3)], ids=["sign", "unit"])
+def test_a_wrong_sensor_ends_the_adaptation_at_the_last_model_that_was_consistent(sensor, swing):
+    adaptation = filter_of(NOISE)
+    states = hovering(adaptation, NOISE, jax.random.key(0), 24 * SECOND, sensor=sensor, swing=swing)
+    assert adaptation.flags(states).inconsistent[13 * SECOND :].all()
+    assert np.abs(states.trusted[13 * SECOND :]).max() < 0.1
