@@ -1,0 +1,118 @@
+"""Cascaded tanks, of which one of two levels is measured: python -m experiments.identification.tanks --help
+
+Physics: water leaves each tank through a hole, and over its edge when it is full (Schoukens, Mattsson, Wigren and Noël,
+Cascaded tanks benchmark combining soft and hard nonlinearities, 2016). The record is on nonlinearbenchmark.org.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import hybrid_jax as hj
+from experiments.identification.record import Benchmark, main
+
+FULL, EDGE, LEVEL = 10.0, 0.03, 0.02  # V at which the sensor saturates; widths of smooth corners [V]
+WEIR = 0.1
+MIDDLE, SIZE = jnp.array([6.0, 6.0, 3.0]), jnp.array([2.5, 2.5, 1.0])  # of levels and pump [V]
+RATE = 0.02  # V/s, the size of what the residual adds
+
+
+def _positive(x, width):
+    return width * jax.nn.softplus(x / width)
+
+
+class Tanks(hj.AbstractVectorField):
+    """x = [upper level, lower level], u = [pump], all in V.
+
+    Attributes:
+        log_flow: ln of the flows out of the upper tank, out of the lower tank, and of the pump (3,).
+        log_ratio: ln of the upper tank's cross-section over that of the lower one.
+        power: of the level in the flow out of each tank, 0.5 by Torricelli (2,).
+        offset: of the hole below the sensor's zero [V] (2,).
+        edge: of each tank [V] (2,).
+        log_weir: ln of the flow over each edge, per V (2,).
+        caught: the share of it that the lower tank catches, as a logit.
+    """
+
+    log_flow: jax.Array
+    log_ratio: jax.Array
+    power: jax.Array
+    offset: jax.Array
+    edge: jax.Array
+    log_weir: jax.Array
+    caught: jax.Array
+
+    def __call__(self, x, u):
+        upper, lower, pump = jnp.exp(self.log_flow)
+        over = [jnp.exp(w) * _positive(x[i] - self.edge[i], WEIR) for i, w in enumerate(self.log_weir)]
+        height = [_positive(x[i] + self.offset[i], LEVEL) + 1e-6 for i in range(2)]
+        out = [upper * height[0] ** self.power[0], lower * height[1] ** self.power[1]]
+        falls = jnp.exp(self.log_ratio) * (out[0] + jax.nn.sigmoid(self.caught) * over[0])
+        return jnp.stack([pump * u[0] - out[0] - over[0], falls - out[1] - over[1]])
+
+
+class Residual(hj.AbstractVectorField):
+    """One hidden layer of tanh units, of levels and pump.
+
+    Attributes:
+        inner: weights of the hidden units (h, 3).
+        bias: of the hidden units (h,).
+        outer: weights of the outputs (2, h).
+    """
+
+    inner: jax.Array
+    bias: jax.Array
+    outer: jax.Array
+
+    def __call__(self, x, u):
+        z = (jnp.concatenate([x, u]) - MIDDLE) / SIZE
+        return RATE * (self.outer @ jnp.tanh(self.inner @ z + self.bias))
+
+
+def physics() -> Tanks:
+    """The start of the search."""
+    flow, half = jnp.log(jnp.array([0.05, 0.05, 0.04])), jnp.full(2, 0.5)
+    edge = jnp.array([9.0, 10.0])
+    return Tanks(flow, jnp.zeros(()), half, jnp.full(2, 0.1), edge, jnp.log(half * 0.4), jnp.zeros(()))
+
+
+def level(x, u):
+    """The sensor of the lower tank saturates."""
+    return FULL - _positive(FULL - x[1], EDGE)
+
+
+def model(field) -> hj.StateSpaceModel:
+    """With the level of the upper tank unknown."""
+    return hj.StateSpaceModel(field, ("u",), {"y": level}, start=(4.0, 5.2), spread=(5.0, 0.3))
+
+
+def candidate(size: float | None, hidden: int = 6):
+    """Physics, or with a residual whose outer weights are about that large."""
+    near = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1}
+    if size is None:
+        return model(physics()), {f"field.{name}": value for name, value in near.items()}
+    random = np.random.default_rng(0)
+    inner, bias = random.normal(size=(hidden, 3)), random.normal(size=hidden)
+    residual = Residual(*map(jnp.asarray, (inner, bias, np.zeros((2, hidden)))))
+    prior = {f"field.physics.{name}": value for name, value in near.items()}
+    prior |= {"field.residual.inner": 0.7, "field.residual.bias": 0.7, "field.residual.outer": size}
+    return model(hj.Hybrid(physics(), residual)), prior
+
+
+BENCHMARK = Benchmark(
+    title="Cascaded tanks",
+    columns=("u", "y"),
+    unit=("V", 1.0),
+    candidates={
+        "physics": lambda: candidate(None),
+        "physics and a small residual": lambda: candidate(0.1),
+        "physics and a residual": lambda: candidate(0.4),
+    },
+    options={"dt": 4.0, "substeps": 2, "rounds": 1, "max_steps": 30, "noise": {"y": 0.2}},
+    # The upper level at the start is the same in both records.
+    start=lambda y, fitted: (fitted.start[0], y),
+    hidden=(5.0, 0.3),
+)
+
+if __name__ == "__main__":
+    main(BENCHMARK, "identification.tanks")
