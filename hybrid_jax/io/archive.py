@@ -126,6 +126,8 @@ def from_numpy(array: np.ndarray, kind: Mapping[str, str]) -> Any:
 
 def _read_entries(path: Path) -> dict[str, bytes]:
     """The bytes of each entry by name. Refuses names that leave the folder, and compression, which may hide a size."""
+    if path.exists() and not path.is_file():
+        raise ValueError("it is no regular file")  # a pipe would be waited for, a device read without end
     with zipfile.ZipFile(path) as archive:
         for entry in archive.infolist():
             place = PurePosixPath(entry.filename.replace("\\", "/"))
@@ -140,7 +142,10 @@ def _read_entries(path: Path) -> dict[str, bytes]:
 
 def _read_array(name: str, entry: bytes) -> np.ndarray:
     """The numeric array in a .npy."""
-    array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+    try:
+        array = np.lib.format.read_array(io.BytesIO(entry), allow_pickle=False)
+    except Exception as error:  # NumPy parses the header as Python, which fails in many ways
+        raise ValueError(f"entry {name!r} is no array: {error}") from error
     if array.dtype.newbyteorder("=") not in NUMERIC:
         raise ValueError(f"entry {name!r} is not numeric")
     return array
