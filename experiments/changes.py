@@ -225,7 +225,8 @@ def _candidates(fields: Any, windows: Trajectories, flights: Trajectories, test:
     def of_flight(field, flight):
         blocks = jax.tree.map(lambda leaf: leaf[places[0]], flight), jnp.asarray(places[1])
         return jnp.mean(
-            jax.lax.map(lambda block: predict_block(field, block[0], block[1], shared.solver).ends, blocks), axis=0
+            jax.lax.map(lambda block: predict_block(field, block[0], None, block[1], shared.solver).ends, blocks),
+            axis=0,
         )
 
     return jax.lax.map(one, (fields, windows))

@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float, PyTree
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, left_out_steps, predict_block
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
+from hybrid_jax.estimation.starts import Starts, from_starts
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.trajectories import Trajectories
 
@@ -48,21 +49,23 @@ def fit_anchored(
     scale: Scale = None,
     penalties: tuple[float, ...] = PENALTIES,
     blocks: int = BLOCKS,
+    starts: Starts | None = None,
 ) -> Anchored:
-    """The steps of all penalties for some parts of the network; windows and blocks as for `fit_candidates`.
+    """The steps of all penalties for some parts of the network; windows, blocks and starts as for `fit_candidates`.
 
     Args:
         parts: for each part which of the weights, in the order of `weights_of`, may change.
     """
     weights, _ = weights_of(field)
     places, counted = blocks_of(len(windows), blocks)
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], windows)
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], (windows, starts))
+    smooth, weigh = from_starts(windows, starts)
     rank = min(RANK, weights.size)
 
     def errors(change: Float[Array, " w"]) -> Float[Array, "n e"]:
         changed = with_change(field, change)
         one = jax.vmap(lambda window: prediction_errors(changed, window, solver, scale))
-        return one(windows).reshape(len(windows), -1)
+        return weigh(one(smooth)).reshape(len(windows), -1)
 
     residuals, push = jax.linearize(errors, jnp.zeros_like(weights))
     pull = jax.linear_transpose(push, weights)
@@ -85,13 +88,13 @@ def fit_anchored(
             held = penalty * largest * jnp.eye(rank, dtype=gram.dtype)
             step = -jnp.linalg.solve(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0))
             without = left_out_steps(gram, score, places, counted, held) @ basis
-            return step @ basis, jax.lax.map(error, (without, own, counted))
+            return step @ basis, jax.lax.map(error, (without, *own, counted))
 
         return jax.lax.map(of_penalty, jnp.asarray(penalties, gram.dtype))
 
     def error(block):
-        change, windows, counted = block
-        return predict_block(with_change(field, change), windows, counted, solver, scale)
+        change, windows, starts, counted = block
+        return predict_block(with_change(field, change), windows, starts, counted, solver, scale)
 
     return Anchored(*jax.lax.map(of_part, jnp.asarray(parts)))
 

@@ -12,11 +12,13 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax import checks
 from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
+from hybrid_jax.adaptation.plausible import Plausible, groups_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
 from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
+from hybrid_jax.estimation.starts import smoothed
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.status import ended
@@ -37,10 +39,8 @@ CANDIDATES: Mapping[str, tuple[str, ...]] = {
     "force_torque_drag": ("theta", "force", "torque", "drag"),
     "all": ("theta", "force", "torque", "drag", "efficiency"),
 }
+PLAUSIBLE = Plausible()
 NETWORKS = ("last_layer", "network")  # candidates that change the network
-# Parameters of a corrected rigid body; the others are its own, θ_p.
-GROUPS = {"efficiency": "efficiency", "added_drag": "drag"}
-GROUPS |= {f"disturbance[v{axis}]": "force" for axis in "xyz"} | {f"disturbance[w{axis}]": "torque" for axis in "xyz"}
 CONFOUNDED = ("k", "k_rotors")  # with the rotors' efficiencies
 
 
@@ -78,11 +78,13 @@ class Auto(Method):
         networks: whether the network may change.
         blocks: how many blocks of windows are left out in turn.
         max_steps: the most steps of each fit.
+        plausible: how far the changed system plausibly is from the source.
     """
 
     networks: bool = True
     blocks: int = BLOCKS
     max_steps: int = 100
+    plausible: Plausible = PLAUSIBLE
     uses_validation: ClassVar[bool] = False
     has_intervals: ClassVar[bool] = True
 
@@ -100,11 +102,13 @@ class Auto(Method):
         left = n - blocks_of(n, self.blocks)[0].shape[1]  # windows that fit a block's prediction
         fitted = {name: free for name, free in fitted.items() if name == "source" or free.sum() < left}
         free, sizes = np.stack([*fitted.values()]), np.array([each.sum() for each in fitted.values()])
-        fits = fit_candidates(larger, train, free, solver, self.max_steps, scale, self.blocks)
+        starts, noise = smoothed(field, train, solver, scale)
+        held = jnp.sqrt(noise) / self.plausible.sizes(larger, train)
+        fits = fit_candidates(larger, train, free, solver, self.max_steps, scale, self.blocks, starts, held)
         own = simplest(fits.errors.mse, sizes)
         choice = Choice((*fitted,), fits.errors, own, (*named_parameters(larger),), jnp.asarray(free), fits.theta, None)
         if self.networks and has_network(larger):
-            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks)
+            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks, starts)
         status = ended(fits.converged[own], fits.converged[own] | jnp.isfinite(fits.errors.mse[own]).all())
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
@@ -126,9 +130,7 @@ def extended(field: AbstractVectorField, d: int) -> AbstractVectorField:
 def free_parameters(field: AbstractVectorField) -> dict[str, np.ndarray]:
     """For each candidate, which of the parameters of an extended field it fits (p,)."""
     names = [*named_parameters(field)]
-    steady = {name for name in names if name.startswith("disturbance[")}
-    groups = GROUPS if steady <= GROUPS.keys() else GROUPS | dict.fromkeys(steady, "disturbance")
-    group = [groups.get(name, groups.get(name.split("[")[0], "theta")) for name in names]
+    group = groups_of(names)
     lost = np.array([name.split("[")[0] in CONFOUNDED for name in names])
     found = {}
     for name, fitted in CANDIDATES.items():
@@ -145,10 +147,10 @@ def has_network(field: AbstractVectorField) -> bool:
     )
 
 
-def _with_network(larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks) -> Choice:
+def _with_network(larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks, starts) -> Choice:
     """The choice with two more candidates: the one taken so far with its output layer or its network changed."""
     adapted, parts = candidate(larger, choice, choice.taken), parts_of(larger)
-    steps = fit_anchored(adapted, windows, np.stack([*parts.values()]), solver, scale, blocks=blocks)
+    steps = fit_anchored(adapted, windows, np.stack([*parts.values()]), solver, scale, blocks=blocks, starts=starts)
     # Penalties are in the order of their strength, so that the first of several as good changes least.
     order = np.arange(steps.errors.mse.shape[1])
     best = jnp.stack([simplest(errors, order) for errors in steps.errors.mse])

@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.estimation.least_squares import Scale, Solver, fit_and_linearise, ravel_parameters
 from hybrid_jax.estimation.normal_equations import equations_of, has_effect, masked, steps_without
+from hybrid_jax.estimation.starts import Starts, Sums, from_starts, unknown_starts
 from hybrid_jax.integrate import compact, rollout
 from hybrid_jax.trajectories import Trajectories
 
@@ -66,6 +67,8 @@ def fit_candidates(
     max_steps: int = 100,
     scale: Scale = None,
     blocks: int = BLOCKS,
+    starts: Starts | None = None,
+    held: Float[Array, " p"] | float = 0.0,
 ) -> Fits:
     """Fit the parameters that each candidate leaves free; the others stay as they are.
 
@@ -74,18 +77,29 @@ def fit_candidates(
     Args:
         free: for each candidate which of the parameters, in the order of `ravel_parameters`, are fitted.
         windows: in the order of time.
+        starts: of the windows, see `smoothed`; by default as they were measured.
+        held: what a parameter's distance from the field's counts as, see `fit_and_linearise`.
     """
-    _, at = ravel_parameters(field)
+    start, at = ravel_parameters(field)
+    smooth, weigh = from_starts(windows, starts)
+    held = jnp.broadcast_to(jnp.asarray(held, start.dtype), start.shape)
     places, counted = blocks_of(len(windows), blocks)
-    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], windows)
+    own = jax.tree.map(lambda leaf: jnp.asarray(leaf)[places], (windows, starts))
 
     def one(free: Bool[Array, " p"]):
-        found, jacobian, r = fit_and_linearise(field, windows, solver, max_steps, scale, free)
+        found, jacobian, r = fit_and_linearise(field, smooth, solver, max_steps, scale, free, weigh, held)
         theta = ravel_parameters(found.field)[0]
         equations = jax.vmap(equations_of)(jacobian, r)
         equations = masked(equations, free & has_effect(equations, windows, scale))
-        without = theta + left_out_steps(equations.gram, equations.score, places, counted)
-        errors = jax.lax.map(lambda a: predict_block(at(a[0]), a[1], a[2], solver, scale), (without, own, counted))
+        prior = jnp.diag(jnp.square(held)) * (free & free[:, None])
+        pull = prior @ (theta - start)
+        without = theta + left_out_steps(equations.gram, equations.score, places, counted, prior, pull)
+
+        def error(left_out):
+            theta, windows, starts, counted = left_out
+            return predict_block(at(theta), windows, starts, counted, solver, scale)
+
+        errors = jax.lax.map(error, (without, *own, counted))
         return theta, errors, found.steps, found.converged
 
     return Fits(*jax.lax.map(one, jnp.asarray(free)))
@@ -104,39 +118,48 @@ def left_out_steps(
     places: Int[np.ndarray, "b m"],
     counted: Bool[np.ndarray, "b m"],
     held: Float[Array, "p p"] | float = 0.0,
+    pull: Float[Array, " p"] | float = 0.0,
 ) -> Float[Array, "b p"]:
-    """The Gauss-Newton step on all blocks but one, for each block; `held` is the matrix of a penalty."""
+    """The Gauss-Newton step on all blocks but one, for each block; `held` is the matrix of a penalty, `pull` its half
+    slope."""
     weight = counted[..., None]
     gram = jnp.sum(gram[places] * weight[..., None], axis=1)
     score = jnp.sum(score[places] * weight, axis=1)
-    return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0), gram, score)
+    return steps_without(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0) + pull, gram, score)
 
 
 def predict_block(
     field: AbstractVectorField,
     block: Trajectories,
+    starts: Starts | None,
     counted: Bool[Array, " m"],
     solver: Solver = None,
     scale: Scale = None,
 ) -> BlockErrors:
-    """The errors of a field on the windows of a block that count."""
+    """The errors of a field on the windows of a block that count, without what other starts would change."""
+    free = starts is not None
+    starts = unknown_starts(block) if starts is None else starts
 
     def one(carry, item):
-        end, recorded = carry
-        window, counted, i = item
+        (end, smooth_end), recorded, sums = carry
+        window, start, counted, i = item
         touches = counted & jnp.all(window.x0 == recorded) & (i % JOINED > 0)
-        starts = jnp.stack([window.x0, jnp.where(touches, end, window.x0)])
-        alone, predicted = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver)))(starts)
-        difference = predicted - window.x if scale is None else (predicted - window.x) / scale
-        error = jnp.mean(jnp.sum(jnp.square(difference), axis=-1))
+        begin = jnp.stack([window.x0, jnp.where(touches, end, window.x0), jnp.where(touches, smooth_end, start.x0)])
+        alone, predicted, smooth = jax.vmap(lambda x0: rollout(field, x0, window.u, block.dt, compact(solver)))(begin)
+        difference = window.x - smooth if scale is None else (window.x - smooth) / scale
+        sums = jax.tree.map(lambda one, new: jnp.where(touches, one, new), sums, Sums.of(start.jump, start.trust))
+        sums = sums.and_those(difference, start.effect)
+        error = sums.unexplained() if free else sums.square
         ends = jnp.square(jnp.stack([alone[-1], predicted[-1]]) - window.x[-1])
-        return (predicted[-1], window.x[-1]), (jnp.where(counted, error, 0.0), ends, touches)
+        return ((predicted[-1], smooth[-1]), window.x[-1], sums), (jnp.where(counted, error, 0.0), ends, touches)
 
-    start = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
-    _, (errors, ends, touches) = jax.lax.scan(one, (start, start), (block, counted, jnp.arange(len(counted))))
+    nowhere = jnp.full_like(block.x0[0], jnp.nan)  # touches nothing
+    begin = (nowhere, nowhere), nowhere, Sums.of(starts.jump[0], starts.trust[0])
+    _, (errors, ends, touches) = jax.lax.scan(one, begin, (block, starts, counted, jnp.arange(len(counted))))
     last = counted & ~jnp.roll(touches, -1).at[-1].set(False)  # windows after which no other goes on
     weights = jnp.stack([counted / jnp.sum(counted), last / jnp.sum(last)], axis=1)
-    return BlockErrors(jnp.sum(errors) / jnp.sum(counted), jnp.einsum("mh,mhd->hd", weights, ends))
+    mse = jnp.sum(jnp.where(last, errors, 0.0)) / (jnp.sum(counted) * block.x.shape[1])
+    return BlockErrors(mse, jnp.einsum("mh,mhd->hd", weights, ends))
 
 
 def correlated(windows: Trajectories) -> int:

@@ -105,16 +105,28 @@ def fit_free(
 
 
 def fit_and_linearise(
-    field: AbstractVectorField, windows: Trajectories, solver: Solver, max_steps: int, scale: Scale, free=None
-) -> tuple[LeastSquaresFit, Float[Array, "n t d p"], Float[Array, "n t d"]]:
+    field: AbstractVectorField,
+    windows: Trajectories,
+    solver: Solver,
+    max_steps: int,
+    scale: Scale,
+    free=None,
+    weigh: Callable[[Float[Array, "n t d"]], Float[Array, "n s d"]] = lambda errors: errors,
+    held: Theta | float = 0.0,
+) -> tuple[LeastSquaresFit, Float[Array, "n s d p"], Float[Array, "n s d"]]:
     """`fit_free`, and there the Jacobian of the predictions, and their errors with the opposite sign.
 
     Points are in units, see `_units`; the best one is kept with its errors, their Jacobian and the units.
+
+    Args:
+        weigh: a linear map of the errors, such as `starts.projected`.
+        held: what a parameter's distance from the start counts as, an error over a unit of the parameter.
     """
     start, unravel = ravel_parameters(field)
 
     def errors(theta: Theta):
-        return 2 * (jax.vmap(lambda window: prediction_errors(unravel(theta), window, solver, scale))(windows),)
+        found = jax.vmap(lambda window: prediction_errors(unravel(theta), window, solver, scale))(windows)
+        return 2 * (weigh(found),)
 
     def theta_at(z: Theta, unit: Theta) -> Theta:
         return (start + unit * z).astype(start.dtype)
@@ -122,16 +134,22 @@ def fit_and_linearise(
     def scaled(array, size):
         return (array / size).astype(float).reshape(-1, *array.shape[3:])
 
+    def anchor(units):
+        return (jnp.broadcast_to(held, start.shape) * units[0] / units[1]).astype(float)
+
     def evaluate(z: Theta, state: State):
         units = state.best[3]
         jacobian, found = jax.jacfwd(errors, has_aux=True)(theta_at(z, units[0]))
-        own = _units(jacobian, found, windows, scale, free)
+        own = _units(jacobian, found, windows, scale, free, held)
         units = jax.tree.map(partial(jnp.where, state.steps == 0), own, units)
-        return jnp.sum(jnp.square(scaled(found, units[1]))), (z, found, jacobian, units)
+        cost = jnp.sum(jnp.square(scaled(found, units[1]))) + jnp.sum(jnp.square(anchor(units) * z))
+        return cost, (z, found, jacobian, units)
 
     def aim(best, damping):
         z, found, jacobian, (unit, size) = best
-        move, expected = move_of_rows(scaled(jacobian * unit, size), scaled(found, size), damping)
+        to_start = anchor((unit, size))
+        rows = jnp.concatenate([scaled(jacobian * unit, size), jnp.diag(to_start)])
+        move, expected = move_of_rows(rows, jnp.concatenate([scaled(found, size), to_start * z]), damping)
         return z + move, expected, jnp.square(LEAST * rounding(windows, scale) / size)
 
     shape = jax.eval_shape(lambda: errors(start)[0])
@@ -145,7 +163,7 @@ def fit_and_linearise(
     return LeastSquaresFit(unravel(theta), mse, end.steps, end.status), jacobian, found
 
 
-def _units(jacobian, errors, windows: Trajectories, scale: Scale, free) -> tuple[Theta, Float[Array, ""]]:
+def _units(jacobian, errors, windows: Trajectories, scale: Scale, free, held) -> tuple[Theta, Float[Array, ""]]:
     """Of parameters and of errors.
 
     Each parameter is measured by what it does to the errors, and these by their size at the start, so that the damping
@@ -153,7 +171,7 @@ def _units(jacobian, errors, windows: Trajectories, scale: Scale, free) -> tuple
     """
     size = _nonzero(jnp.linalg.norm(errors))
     effect = jnp.linalg.norm(jacobian.reshape(-1, jacobian.shape[-1]), axis=0)
-    seen = effect > rounding(windows, scale)
+    seen, effect = effect > rounding(windows, scale), jnp.sqrt(jnp.square(effect) + jnp.square(held))
     return jnp.where(seen if free is None else free & seen, size / _nonzero(effect), 0), size
 
 

@@ -64,7 +64,8 @@ def test_a_disturbance_of_the_pendulum_is_found_with_the_length():
     assert list(result.parameters) == ["log_length", "disturbance[0]", "disturbance[1]"]
     assert result.parameters["disturbance[1]"].low > 1
     again = adapt(result.field, noisy(flown(truth)), method=LeastSquares(disturbance=False))
-    np.testing.assert_allclose(again.disturbance, result.disturbance, rtol=1e-2)  # it is part of the physics by then
+    # It is part of the physics by then; starts count otherwise, within two standard errors.
+    np.testing.assert_allclose(again.disturbance, result.disturbance, atol=0.02)
 
 
 class Stretched(AbstractVectorField):

@@ -111,9 +111,9 @@ def test_windows_that_touch_are_predicted_as_one():
              for x0, at in zip((whole.x0, whole.x[:, 7], whole.x[:, 15]), (0, 8, 16), strict=True)]  # fmt: skip
     chained = jax.tree.map(lambda *leaves: jnp.stack(leaves, 1).reshape(6, *leaves[0].shape[1:]), *parts)
     field, counted = pendulum(0.8), jnp.ones(6, bool)
-    np.testing.assert_allclose(predict_block(field, chained, counted).mse, rollout_mse(field, whole), rtol=1e-5)
+    np.testing.assert_allclose(predict_block(field, chained, None, counted).mse, rollout_mse(field, whole), rtol=1e-5)
     apart = chained[np.array([0, 2, 4, 1, 3, 5])]  # none touches the next
-    np.testing.assert_allclose(predict_block(field, apart, counted).mse, rollout_mse(field, apart), rtol=1e-5)
+    np.testing.assert_allclose(predict_block(field, apart, None, counted).mse, rollout_mse(field, apart), rtol=1e-5)
 
 
 ERRORS = np.exp(np.random.default_rng(0).normal(size=(1, 10)) * 0.3)

@@ -1,0 +1,155 @@
+"""Windows whose first state was measured, too: errors that are free of the noise in it.
+
+A prediction begins at a measured state, and its noise is in the errors of the whole window. Worse, it is in the
+derivatives along the parameters as well: where nothing moves, a drag that is far too large predicts best, since it
+forgets the noise of the measured velocity (errors in variables; Fuller, Measurement Error Models, 1987). So each window
+starts where all of its samples say that it started, and what another start would change is taken out of the errors.
+For errors that are normal, these are then independent of the start.
+"""
+
+import math
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.estimation.least_squares import Scale, Solver, prediction_errors
+from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.matrices import solve
+from hybrid_jax.trajectories import Trajectories
+
+ORDER = 3  # of the differences
+MOST = 32  # states: with more, such as those of a grid, the measured start is taken as it is
+
+
+class Starts(NamedTuple):
+    """What is known of the start of each window.
+
+    Attributes:
+        x0: the smoothed start.
+        jump: the measured start minus it, over scale.
+        effect: of a start on each state of the window, both over scale.
+        inverse: of the normal equations of the start, see `Sums`.
+        trust: what the square of a measured start counts over that of a prediction's error. Where the field errs more
+            than the measurements, as after a large change, a start is as it was measured.
+    """
+
+    x0: Float[Array, "*n d"]
+    jump: Float[Array, "*n d"]
+    effect: Float[Array, "*n t d d"]
+    inverse: Float[Array, "*n d d"]
+    trust: Float[Array, "*n"]
+
+
+class Sums(NamedTuple):
+    """Normal equations of the start of windows that touch, from their errors.
+
+    Attributes:
+        effect: of the start on the last state.
+        gram: AᵀA, with A its effects on all states.
+        score: Aᵀr, with r the errors.
+        square: rᵀr.
+    """
+
+    effect: Float[Array, "d d"]
+    gram: Float[Array, "d d"]
+    score: Float[Array, " d"]
+    square: Float[Array, ""]
+
+    @staticmethod
+    def of(jump: Float[Array, " d"], trust: Float[Array, ""]) -> "Sums":
+        """Of the measured start alone."""
+        one, trust = jnp.eye(len(jump), dtype=jump.dtype), trust.astype(jump.dtype)
+        return Sums(one, trust * one, trust * jump, trust * jump @ jump)
+
+    def and_those(self, r: Float[Array, "t d"], effect: Float[Array, "t d d"]) -> "Sums":
+        """With the errors of a window that begins where the last one ended."""
+        rows = effect @ self.effect
+        flat, r = rows.reshape(-1, rows.shape[-1]), r.ravel().astype(rows.dtype)
+        return Sums(rows[-1], self.gram + flat.T @ flat, self.score + flat.T @ r, self.square + r @ r)
+
+    def unexplained(self) -> Float[Array, ""]:
+        """The square of what no start explains."""
+        return jnp.maximum(self.square - self.score @ solve(self.gram, self.score), 0.0)
+
+
+def unknown_starts(windows: Trajectories) -> Starts:
+    """Starts as they were measured, without any effect."""
+    t, d = windows.x.shape[1:]
+    n, x0 = len(windows), jnp.asarray(windows.x0)
+    return Starts(
+        x0, jnp.zeros_like(x0), jnp.zeros((n, t, d, d), x0.dtype), jnp.zeros((n, d, d), x0.dtype), jnp.zeros(n)
+    )
+
+
+def smoothed(
+    field: AbstractVectorField, windows: Trajectories, solver: Solver, scale: Scale
+) -> tuple[Starts | None, Float[Array, ""]]:
+    """The starts, from the field's predictions around the measured ones, and the noise of one number over scale.
+
+    The noise is what differences of the errors, sample by sample, say of it, since an error of the field grows slowly
+    (von Neumann 1941); zero, with no starts, where the state has too many numbers.
+    """
+    t, d = windows.x.shape[1:]
+    order = min(ORDER, t)
+    if d > MOST:
+        return None, jnp.zeros(())
+    unit = jnp.ones(d) if scale is None else scale
+    counts = jnp.isfinite(unit)
+    unit = jnp.where(counts, unit, 1).astype(windows.x0.dtype)
+
+    def one(window: Trajectories):
+        def predicted(start):
+            return rollout(field, window.x0 + unit * start, window.u, window.dt, compact(solver))
+
+        effect = jax.jacfwd(predicted)(jnp.zeros_like(window.x0)) / unit[:, None]
+        effect = effect * counts[:, None] * counts
+        r = prediction_errors(field, window, solver, scale)
+        rows = jnp.concatenate([jnp.eye(d, dtype=r.dtype)[None], effect])
+        errors = jnp.concatenate([jnp.zeros_like(r[:1]), r])
+        return effect, r, _unexplained(rows, errors), jnp.sum(jnp.square(jnp.diff(errors, n=order, axis=0)))
+
+    effect, r, left, noise = jax.lax.map(one, windows, batch_size=64)
+    noise = jnp.sum(noise) / (len(windows) * (t + 1 - order) * d * math.comb(2 * order, order))
+    left = jnp.sum(left) / (len(windows) * t * d)
+    trust = jnp.clip(left / jnp.maximum(noise, 1e-12), 1.0, 1e6)
+
+    def start(each):
+        effect, r = each
+        sums = Sums.of(jnp.zeros_like(r[0]), trust).and_those(r, effect)
+        inverse = solve(sums.gram, jnp.eye(d, dtype=r.dtype))
+        return inverse @ sums.score, inverse
+
+    change, inverse = jax.lax.map(start, (effect, r))
+    many = jnp.broadcast_to(trust, len(windows))
+    return Starts(windows.x0 + unit * change, -change, effect, inverse, many), noise
+
+
+def _unexplained(rows: Float[Array, "t d k"], r: Float[Array, "t d"]) -> Float[Array, ""]:
+    """The square of what no combination of the rows explains."""
+    flat = rows.reshape(-1, rows.shape[-1])
+    gram = flat.T @ flat
+    damped = gram + 1e-6 * jnp.diag(jnp.diagonal(gram) + 1e-6)
+    return jnp.sum(jnp.square(r.ravel() - flat @ solve(damped, flat.T @ r.ravel())))
+
+
+def from_starts(windows: Trajectories, starts: Starts | None) -> tuple[Trajectories, Callable[[Array], Array]]:
+    """The windows from smoothed starts, and what takes other starts out of their errors; as they are without any."""
+    if starts is None:
+        return windows, lambda errors: errors
+    return replace(windows, x0=starts.x0), partial(projected, starts)
+
+
+def projected(starts: Starts, errors: Float[Array, "n t d"]) -> Float[Array, "n 1+t d"]:
+    """Errors, and those of the measured starts, without what another start would change."""
+
+    def one(start: Starts, r):
+        change = start.inverse @ (start.trust * start.jump + jnp.einsum("tij,ti->j", start.effect, r))
+        return jnp.concatenate([jnp.sqrt(start.trust) * (start.jump - change)[None], r - start.effect @ change])
+
+    return jax.vmap(one)(starts, errors)

@@ -1,0 +1,55 @@
+"""Seconds that excite nothing, after which nothing changed, must not make a model worse on flight that moves."""
+
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.terms import Terms
+
+DRAG = np.array([0.4, 0.3, 0.1])
+NOISE = np.repeat([1e-3, 2e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s
+
+
+def body(drag):
+    return hj.rigid_body(hj.IRIS, terms=Terms(drag=tuple((drag * DRAG).tolist())))
+
+
+def flown(seed, size, noise=1.0, count=100, steps=10):
+    """Windows of hover, of a `size` from 0 to 1, about 1 m/s; every measured state has its own noise."""
+    rng = np.random.default_rng(seed)
+    x0 = np.zeros((count, 13))
+    axis = 0.35 * size * rng.normal(size=(count, 3)) + [0.02, -0.01, 0]  # it hovers tilted by a degree
+    angle = np.linalg.norm(axis, axis=1, keepdims=True)
+    x0[:, 3:7] = np.concatenate([np.cos(angle / 2), axis / angle * np.sin(angle / 2)], axis=1)
+    x0[:, 7:10], x0[:, 10:13] = 2 * size * rng.normal(size=(count, 3)), 1.2 * size * rng.normal(size=(count, 3))
+    shakes = 0.12 * rng.normal(size=(count, 1, 4)) + 0.05 * rng.normal(size=(count, steps, 4))
+    u = (hj.IRIS.hover_speed * (1 + size * shakes)).astype(np.float32)
+    x = np.asarray(hj.rollout_batch(body(1.0), x0.astype(np.float32), u, 0.01))
+    x0, x = (a + noise * NOISE * rng.normal(size=a.shape) for a in (x0, x))
+    for states in (x0, x):
+        states[..., 3:7] /= np.linalg.norm(states[..., 3:7], axis=-1, keepdims=True)
+    return hj.Trajectories(x0.astype(np.float32), u, x.astype(np.float32), 0.01)
+
+
+def error(field, windows):
+    predicted = hj.rollout_batch(field, windows.x0, windows.u, windows.dt)
+    return float(np.mean(np.sum(np.square(np.asarray(predicted) - windows.x), axis=-1)))
+
+
+def ratios(cases, **options):
+    """The error after adaptation over the source's, on moving flight; the source has nine tenths of the drag."""
+    source, moving = body(0.9), flown(99, 1.0, noise=0.0, steps=50)
+    before = error(source, moving)
+    fields = [hj.adapt(source, flown(seed, *case, **options)).field for seed, case in enumerate(cases)]
+    return np.array([error(field, moving) for field in fields]) / before
+
+
+def test_hover_still_or_lively_and_slow_flight_with_more_noise_make_no_model_worse():
+    found = ratios([(0.003,), (0.01,), (0.03,), (0.1,), (0.01, 3.0), (0.1, 3.0)])
+    assert found.mean() <= 1.05
+    assert found.max() <= 1.2
+
+
+@pytest.mark.slow
+def test_nor_do_three_seconds():
+    assert ratios([(0.003,), (0.03,), (0.1,)], count=30).max() <= 1.2
