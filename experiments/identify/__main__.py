@@ -11,15 +11,17 @@ from typing import Annotated
 import tyro
 from rich.console import Console
 
-from experiments.identify.checked import check_consistent, check_whole, content_of
+from experiments.identify.checked import check_consistent, check_whole
 from experiments.identify.report import figure, tables
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results
 from experiments.runner import command
-from experiments.runner.log_options import LogOptions, require_distinct
 from experiments.runner.options import Count, Positive, check_numbers
 from experiments.runner.run_record import environment
 from hybrid_jax import checks, runtime
+from hybrid_jax.cli.command import split_lists
+from hybrid_jax.cli.log_options import LogOptions, require_distinct
+from hybrid_jax.cli.logs import content_of
 from hybrid_jax.dynamics.actuators import NAMES, Actuated
 from hybrid_jax.dynamics.measurement import MEASURED
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
@@ -192,7 +194,7 @@ def run(config: Config) -> None:
 
 def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
-    command.call(NAME, Config, run, command.split_lists(given, LISTS))
+    command.call(NAME, Config, run, split_lists(given, LISTS))
 
 
 if __name__ == "__main__":

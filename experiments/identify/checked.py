@@ -1,6 +1,5 @@
 """Checks of logs before a vehicle is identified from them, as far as their signals allow."""
 
-import itertools
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -10,8 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from experiments.runner.command import ChecksFailed
-from experiments.runner.flags import in_flags
+from hybrid_jax.cli.command import ChecksFailed
+from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
@@ -21,7 +20,6 @@ from hybrid_jax.flights.formats.raw import WXYZ, XYZ
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.identification.slow_commands import SLOW
-from hybrid_jax.io.archive import digest
 from hybrid_jax.vehicle import Vehicle
 
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
@@ -39,12 +37,6 @@ COMPARED = (
     (("rates", MOTORS), SLOW, ("columns", ORDER, SPIN)),
     ((MOTORS,), np.inf, ("interval between samples",)),
 )
-
-
-def content_of(recording: Recording) -> str:
-    """What tells a recording apart from others, whatever its file is called."""
-    parts = itertools.product(recording.signals.items(), ("t", "values"))
-    return digest(None, {f"{name} {part}": getattr(signal, part) for (name, signal), part in parts})
 
 
 def check_whole(recordings: Sequence[Recording], vehicle: Vehicle, anyway: bool) -> list[str]:

@@ -13,9 +13,10 @@ from experiments.inspect_logs.estimates import estimate
 from experiments.inspect_logs.page import Inspected, write_page
 from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.runner import command
-from experiments.runner.flags import in_flags
-from experiments.runner.log_options import SpeedOptions
 from experiments.runner.options import Positive, check_numbers
+from hybrid_jax.cli.command import split_lists
+from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.log_options import SpeedOptions
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, check_log
 from hybrid_jax.flights.load import RawLog, find_logs, read_log, read_recording
@@ -68,7 +69,7 @@ class Options(SpeedOptions):
 
 def main(arguments: Sequence[str] | None = None) -> None:
     given = list(sys.argv[1:] if arguments is None else arguments)
-    command.call(NAME, Options, inspect, command.split_lists(given, LISTS))
+    command.call(NAME, Options, inspect, split_lists(given, LISTS))
 
 
 def inspect(options: Options) -> None:

@@ -21,6 +21,7 @@ from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment
 from experiments.runner import command
 from experiments.runner.stages import stages_of
+from hybrid_jax.cli.command import ChecksFailed, split_lists
 from hybrid_jax.dynamics.vehicle_file import LAG, NEED_PURPOSE, VehicleModel, learned_by_field, vehicle_model_of
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.cleaning import choose_time_constant
@@ -54,7 +55,7 @@ LISTS = ("--horizon", "--n", "--polynomial", "--motor-order", "--topics", "--lea
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the experiment; without any flights, print how to get some and exit with code 2."""
-    given = command.split_lists(sys.argv[1:] if arguments is None else arguments, LISTS)
+    given = split_lists(sys.argv[1:] if arguments is None else arguments, LISTS)
     if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
         command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
         print(GUIDE, file=sys.stderr)
@@ -112,7 +113,7 @@ def prepare(config: RealFlightConfig, console: Console) -> Experiment:
         else:
             say(line, style="yellow")
     if failed:
-        raise command.ChecksFailed(*failed, logs.MEND)
+        raise ChecksFailed(*failed, logs.MEND)
     return Experiment(config, before, after, sets, dt, stages_of(config, console))
 
 

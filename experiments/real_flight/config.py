@@ -5,8 +5,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from experiments.real_flight.models import Model, RecipeName
-from experiments.runner.log_options import SpeedOptions
 from experiments.runner.options import Activation, Count, Positive, Run, distinct
+from hybrid_jax.cli.log_options import SpeedOptions
 from hybrid_jax.dynamics.vehicle_file import check_learned
 from hybrid_jax.flights.checks.cleaning import Cleaning
 

@@ -6,9 +6,9 @@ from pathlib import Path
 from typing import Any
 
 from experiments.real_flight.config import RealFlightConfig
-from experiments.runner import log_options
-from experiments.runner.command import ChecksFailed
-from experiments.runner.flags import in_flags
+from hybrid_jax.cli import log_options
+from hybrid_jax.cli.command import ChecksFailed
+from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.flights.checks.cleaning import clean, lag_motors
 from hybrid_jax.flights.checks.consistency import FAILS, Check, check_log
 from hybrid_jax.flights.checks.suitability import failures

@@ -17,7 +17,7 @@ from experiments.real_flight.folds import Fold, motion_of_logs
 from experiments.real_flight.log_tables import log_tables
 from experiments.real_flight.models import RECIPES
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, cell_name, cells, pooled, score_labels
-from experiments.real_flight.selection import LEVEL, Selection
+from experiments.real_flight.selection import Selection
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment
 from experiments.reporting import names, report
@@ -27,6 +27,7 @@ from experiments.reporting.results import Results
 from experiments.reporting.statistics import spread
 from experiments.reporting.tables import EMPTY, Table, mean_over_seeds, print_tables, spread_text, tabulate
 from experiments.runner.run_record import environment
+from hybrid_jax.cli.choice import LEVEL
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.windows import flight_of

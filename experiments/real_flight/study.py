@@ -8,7 +8,7 @@ from typing import Any
 import jax
 import numpy as np
 
-from experiments.real_flight import scoring, selection, train
+from experiments.real_flight import scoring, train
 from experiments.real_flight.config import RealFlightConfig
 from experiments.real_flight.folds import (
     GROUP_BY,
@@ -35,6 +35,7 @@ from experiments.real_flight.selection import Candidate, Selection
 from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting import names
 from experiments.reporting.results import Results
+from hybrid_jax.cli import choice
 from hybrid_jax.dynamics.base import AbstractVectorField, Blend
 from hybrid_jax.dynamics.baselines import HoldState
 from hybrid_jax.dynamics.rigid_body import rigid_body
@@ -214,13 +215,13 @@ def select(trainer: Trainer, inner: Sequence[Trainer], size: int) -> Selection:
         return (errors(candidate) - errors(Candidate(names.THRUST)))[:, :, judged].mean(axis=(2, 3))
 
     scores = {candidate: scored(candidate) for candidate in candidates(config)}
-    if pair := selection.undecided(scores, baselines):
+    if pair := choice.undecided(scores, baselines):
         both = Candidate.blend(pair)
         scores[both] = scored(both)
-    chosen = selection.choose(scores, baselines)
+    chosen = choice.choose(scores, baselines)
     left_out = [name for each in inner for name in each.tested]
     observed = np.exp(trainer.log_errors(chosen, config.seeds, size).mean(axis=1))
-    expected = selection.expected(errors(chosen).mean(axis=1))
+    expected = choice.expected(errors(chosen).mean(axis=1))
     found = dict(zip(trainer.tested, observed, strict=True))
     return Selection(trainer.fold.name, size, chosen, left_out, scores, expected, labels, found)
 

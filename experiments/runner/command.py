@@ -3,9 +3,6 @@
 import argparse
 import contextlib
 import gc
-import inspect
-import io
-import re
 import signal
 import sys
 import threading
@@ -13,20 +10,19 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
-import tyro
 from filelock import FileLock, Timeout
 from rich.console import Console
 
 from experiments.runner.cache import source_digest
-from experiments.runner.flags import in_flags
 from experiments.runner.options import Run
-from experiments.runner.run_record import ChecksFailed, OtherRun, recorded
+from experiments.runner.run_record import OtherRun, recorded
 from hybrid_jax import checks, kernels
+from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, ChecksFailed, parsed
+from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
 Options = TypeVar("Options")
-BAD_INPUT, FAILED_CHECKS = 2, 3  # exit codes; that of a signal is 128 + its number
 
 
 def run(
@@ -88,17 +84,7 @@ def call(
 ) -> None:
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
     with _exit_codes(name, "interrupted, nothing was written"):
-        command(_parsed(partial(tyro.cli, kind, description=inspect.cleandoc(kind.__doc__ or "")), name, arguments))
-
-
-def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
-    """Split comma-separated values, such as 10,50, of the options that take several values."""
-    words, option = [], ""
-    for word in arguments:
-        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
-        several = option in lists and word != option
-        words += [option] * word.startswith("--") + value.split(",") if several else [word]
-    return words
+        command(parsed(kind, _program(name), arguments))
 
 
 def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> Run:
@@ -110,20 +96,11 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
         raise ValueError(f"--preset must be one of {', '.join(presets)}, got {chosen!r}")
     kind = type(presets[chosen])
     description = "\n\n".join([about, *(each.__doc__ or "" for each in kind.__mro__ if issubclass(each, Run))])
-    cli = partial(tyro.cli, kind, description=description, default=presets[chosen])
-    return _parsed(cli, name, arguments)
+    return parsed(kind, _program(name), arguments, description=description, default=presets[chosen])
 
 
-def _parsed(cli: Callable[..., Options], name: str, arguments: Sequence[str] | None) -> Options:
-    """The options that a command line gives; ValueError if it gives none."""
-    output = io.StringIO()
-    try:
-        with contextlib.redirect_stderr(output):
-            return cli(prog=f"python -m experiments.{name}", args=arguments)
-    except SystemExit as stop:
-        if not stop.code:
-            raise  # --help
-        raise ValueError(f"{_message(output.getvalue())}; see --help") from None
+def _program(name: str) -> str:
+    return f"python -m experiments.{name}"
 
 
 @contextlib.contextmanager
@@ -142,14 +119,6 @@ def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
     except KeyboardInterrupt as stop:
         print(f"{name}: {interrupted}", file=sys.stderr)
         sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
-
-
-def _message(box: str) -> str:
-    """The text in the first part of the box that tyro draws around an error, without the name of our class."""
-    lines = [line.strip("│ ") for line in box.splitlines()]
-    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰"))]
-    text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
-    return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
 
 
 def _interrupt(number: int, frame) -> None:

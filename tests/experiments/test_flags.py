@@ -2,7 +2,7 @@
 
 import pytest
 
-from experiments.runner.flags import in_flags
+from hybrid_jax.cli.flags import in_flags
 
 SAID = {
     "the motors are u3 u0 u1 u2: motor_order=(3, 0, 1, 2)": "the motors are u3 u0 u1 u2: --motor-order 3,0,1,2",

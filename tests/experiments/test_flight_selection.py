@@ -8,8 +8,9 @@ from recorded import CONFIG, LOGS, OTHERS, samples
 
 from experiments.real_flight.folds import Fold, leave_out, make_folds, motion_of_logs, require_windows
 from experiments.real_flight.report import expected_table, warnings_of
-from experiments.real_flight.selection import Candidate, Selection, choose, expected, undecided
+from experiments.real_flight.selection import Candidate, Selection
 from experiments.real_flight.study import candidates, recipe_of
+from hybrid_jax.cli.choice import choose, expected, undecided
 from hybrid_jax.extrapolation import WARN, shares_outside
 from hybrid_jax.flights.windows import cut_windows, flight_of, manoeuvre_of
 

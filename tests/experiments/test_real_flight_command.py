@@ -15,7 +15,8 @@ from experiments.real_flight.config import PRESETS, RealFlightConfig
 from experiments.real_flight.folds import make_folds
 from experiments.real_flight.scoring import QUANTITIES
 from experiments.real_flight.simulated import vehicle_toml
-from experiments.runner.command import FAILED_CHECKS, ChecksFailed, read, split_lists
+from experiments.runner.command import read
+from hybrid_jax.cli.command import FAILED_CHECKS, ChecksFailed, split_lists
 from hybrid_jax.dynamics.vehicle_file import LAG
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.vehicle import IRIS

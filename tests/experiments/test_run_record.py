@@ -6,7 +6,8 @@ from dataclasses import replace
 import pytest
 
 from experiments.paper.config import SMOKE
-from experiments.runner.run_record import FILE, ChecksFailed, OtherRun, recorded
+from experiments.runner.run_record import FILE, OtherRun, recorded
+from hybrid_jax.cli.command import ChecksFailed
 
 
 def record(folder):

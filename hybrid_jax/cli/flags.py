@@ -6,11 +6,13 @@ from collections.abc import Mapping
 # Command → argument → option. Those of the pages on logs are options of real_flight, which trains on the logs.
 _CLEANING = ("in_flight", "resample", "longest_gap", "low_pass", "align", "delay")
 _LOGS = {name: f"--{name.replace('_', '-')}" for name in ("columns", "polynomial", "topics", "motor_order", "dt")}
+_TOOL = _LOGS | {"failed": "--anyway"}  # which cuts and resamples flights by itself
 _LOGS |= {name: f"--cleaning.{name.replace('_', '-')}" for name in _CLEANING} | {"failed": "--anyway"}
 FLAGS: Mapping[str, Mapping[str, str]] = {
     "real_flight": _LOGS | {"dt": "--cleaning.resample"},
     "inspect_logs": _LOGS,
     "identify": _LOGS,
+    **dict.fromkeys(("fit", "adapt", "check"), _TOOL),
 }
 _KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value
 _VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"

@@ -1,0 +1,23 @@
+"""The console script `hybrid-jax`: from folders of logs to a model that can be trusted, and into a controller."""
+
+import sys
+from collections.abc import Sequence
+
+__all__ = ["main"]
+EXTRA = ("tyro", "matplotlib")  # what the script needs beside the library
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run a command line.
+
+    Args:
+        arguments: a verb and its options; by default those of the process.
+    """
+    try:
+        from hybrid_jax.cli.command import run
+    except ModuleNotFoundError as error:
+        if error.name not in EXTRA:
+            raise
+        print(f"hybrid-jax: needs {error.name}: pip install 'hybrid_jax[cli]'", file=sys.stderr)
+        sys.exit(2)
+    run(sys.argv[1:] if arguments is None else arguments)

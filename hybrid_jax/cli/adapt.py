@@ -1,0 +1,112 @@
+"""`hybrid-jax adapt`: what changed, and a model of it."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from hybrid_jax import checks
+from hybrid_jax.adaptation import Adaptation, Parameter, adapt
+from hybrid_jax.cli import errors, page
+from hybrid_jax.cli.command import NOTHING_CHANGED, step
+from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, windows_of
+from hybrid_jax.cli.model import Known, flights_for, load_known, unlike
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.io.files import json_value
+from hybrid_jax.io.models import save
+
+__all__ = ["LISTS", "Options", "run"]
+MOST = 600  # windows
+SHOWN = 5  # parameters beside the answer
+LACKED = (
+    "Effects that the model lacked explain these flights as well: {}. Flights before may have had them: name those "
+    "that the vehicle always has, such as drag, in `learn` of the vehicle file, and fit again."
+)
+
+
+@dataclass(frozen=True)
+class Options(FlightOptions):
+    """Adapt a model to logs after a change: ten seconds of flight or more.
+
+    Ends with exit code 4, and writes no model, if nothing changed that these flights can tell.
+    """
+
+    source: Annotated[Path, tyro.conf.Positional]
+    """Model that `hybrid-jax fit` wrote."""
+    after: Annotated[Path, tyro.conf.Positional]
+    """Folder of logs after the change."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """File for the adapted model."""
+    out: Path = Path("runs/adapt")
+    """Folder of the page."""
+
+
+def run(options: Options) -> int:
+    checks.writable_folder("--out", options.out)
+    checks.writable_folder("--output", options.output.parent)
+    known = load_known(options.source)
+    flights = flights_for(known, options.after, options, changed=True)
+    windows = windows_of(flights.logs, known.steps, known.steps, MOST).windows
+    with step(f"adapting to {len(windows)} windows") as told:
+        found = adapt(known.field, windows)
+        told(f"chose {found.chosen}")
+    same = found.chosen == "source"
+    if not same:
+        about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
+        about |= {"learned_from": known.about["learned_from"] | flights.contents}
+        save(options.output, found.field, json_value(about))
+    model = None if same else options.output
+    page.write(options.out, "adapt", _page(options, known, flights, found), found.to_dict() | {"model": model})
+    return NOTHING_CHANGED if same else 0
+
+
+def _page(options: Options, known: Known, flights: Flights, found: Adaptation) -> page.Page:
+    before = {name: float(value) for name, value in named_parameters(known.field).items()}
+    changed = [
+        (name, before.get(name, 0.0), one) for name, one in found.parameters.items() if _other(one, before, name)
+    ]
+    changed.sort(key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
+    own, lacked = ([each for each in changed if (each[0] in before) == of] for of in (True, False))
+    curves = {
+        name: errors.rmse_by_flight(field, flights.logs, known.steps)
+        for name, field in (("before", known.field), ("adapted", found.field))
+    }
+    seconds, (old, new) = known.steps * known.dt, (errors.texts(each.mean(axis=0)[-1]) for each in curves.values())
+    what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
+    told = f"Changed: {what}." if own else "These flights differ from the model, and no parameter of its own says how."
+    todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
+    if found.chosen == "source":
+        told = "Nothing changed that these flights can tell."
+        todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
+    rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]
+    expected = [
+        (horizon, name, *(f"{number:.3g}" for number in one))
+        for horizon, each in found.expected.items()
+        for name, one in each.items()
+    ]
+    header = ("after", "of", "RMSE", "from", "to")
+    return page.Page(
+        f"What changed, by {len(flights.logs)} flights of {options.after}, {flights.seconds:.0f} s?",
+        told,
+        page.Table("What changed (95 % intervals)", ("parameter", "before", "after"), rows) if rows else None,
+        [("RMSE on these flights, to which the model was adapted", errors.figure(curves, known.dt))],
+        [
+            f"Velocity after {seconds:g} s was off by {old[1]}, and is by {new[1]}, on these flights.",
+            *([LACKED.format(", ".join(name for name, *_ in lacked))] if lacked else []),
+            *errors.unknown(found),
+            *unlike(known, flights),
+        ],
+        todo,
+        [
+            errors.parameter_table(found),
+            page.Table("Error to expect on a flight not seen (80 % intervals)", header, expected),
+        ],
+        [*flights.said, *found.report().splitlines()],
+    )
+
+
+def _other(one: Parameter, before: dict[str, float], name: str) -> bool:
+    """Whether the interval leaves the value before out; a term that was not there was 0, an efficiency 1."""
+    value = before.get(name, 1.0 if name.startswith("efficiency") else 0.0)
+    return one.has_interval and not one.low <= value <= one.high

@@ -1,0 +1,89 @@
+"""`hybrid-jax check`: a model's predictions against flights and the simplest others, where and when they are wrong."""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+
+from hybrid_jax import checks
+from hybrid_jax.cli import errors, page
+from hybrid_jax.cli.command import step
+from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights
+from hybrid_jax.cli.model import Known, flights_for, load_known, unlike
+from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.flights.windows import flight_of
+
+__all__ = ["LISTS", "Options", "run"]
+LONGER = 5  # times the window that the model learned from
+WORST = 5  # moments that are listed
+
+
+@dataclass(frozen=True)
+class Options(FlightOptions):
+    """Compare the predictions of a model with flights that it has not learned from, and with the simplest others."""
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Model that `hybrid-jax fit` or `adapt` wrote."""
+    flights: Annotated[Path, tyro.conf.Positional]
+    """Folder of logs."""
+    out: Path = Path("runs/check")
+    """Folder of the page."""
+
+
+def run(options: Options) -> int:
+    checks.writable_folder("--out", options.out)
+    known = load_known(options.model)
+    flights = flights_for(known, options.flights, options, changed=False)
+    with step("predicting") as told:
+        others = {"thrust, rates frozen": FrozenRates(rigid_body(known.vehicle)), "no forces": Kinematics()}
+        steps = LONGER * known.steps
+        each = [errors.errors_of(known.field, log, steps) for log in flights.logs]
+        curves = {"model": np.stack([errors.rmse(one) for one in each])}
+        curves |= {name: errors.rmse_by_flight(field, flights.logs, steps) for name, field in others.items()}
+        told(f"{sum(map(len, each))} windows")
+    ends = {name: {"short": found[:, known.steps - 1], "long": found[:, -1]} for name, found in curves.items()}
+    shown = _page(options, known, flights, curves, each)
+    page.write(options.out, "check", shown, {"flights": list(flights.contents), "units": errors.UNITS, "rmse": ends})
+    return 0
+
+
+def _page(options: Options, known: Known, flights: Flights, curves: dict[str, Any], each) -> page.Page:
+    at, frozen = known.steps - 1, curves["thrust, rates frozen"]
+    better = float(np.exp(np.log(frozen[:, at] / curves["model"][:, at]).mean()))
+    rows = [(name, *errors.texts(np.sqrt(np.mean(np.square(found[:, at]), axis=0)))) for name, found in curves.items()]
+    header = ("", *(name.replace("_", " ") for name in errors.UNITS))
+    names = [flight_of(log) for log in flights.logs]
+    by_flight = [(name, *errors.texts(curves["model"][i, at])) for i, name in enumerate(names)]
+    beaten = f"{better:.2g} times as exact as with frozen rates" if better > 1 else "no better than with frozen rates"
+    worse = [name for i, name in enumerate(names) if (curves["model"][i, at] > frozen[i, at]).all()]
+    meaning = [f"The model is worse than frozen rates in every quantity on {', '.join(worse)}."] if worse else []
+    return page.Page(
+        f"How well does {options.model.name} predict {len(names)} flights of {options.flights}?",
+        f"Its predictions of {known.steps * known.dt:g} s are {beaten}.",
+        page.Table(f"RMSE after {known.steps * known.dt:g} s", header, rows),
+        [("RMSE over the time since a prediction began, all flights", errors.figure(curves, known.dt))],
+        [*meaning, *unlike(known, flights)],
+        ["Where it is wrong for long, adapt it to such flights: hybrid-jax adapt."],
+        [
+            page.Table("When it is most wrong", ("flight", "at", *header[1:]), _worst(known, flights, names, each)),
+            page.Table("RMSE on each flight", ("flight", *header[1:]), by_flight),
+        ],
+        flights.said,
+    )
+
+
+def _worst(known: Known, flights: Flights, names: list[str], each: list[Float[np.ndarray, "n t 4"]]) -> list[tuple]:
+    """The moments of the largest errors, in units of the typical one."""
+    typical = np.sqrt(np.mean(np.concatenate([np.square(one[:, -1]) for one in each]), axis=0))
+    size = [(one[:, -1] / typical).max(axis=1) for one in each]
+    found = sorted(((float(size[i][j]), i, j) for i in range(len(size)) for j in range(len(size[i]))), reverse=True)
+    times = [np.asarray(log.t) - log.t[0] for log in flights.logs]
+    length = LONGER * known.steps
+    return [
+        (names[i], f"{times[i][min(j * length, len(times[i]) - 1)]:.1f} s", *errors.texts(each[i][j, -1]))
+        for _, i, j in found[:WORST]
+    ]

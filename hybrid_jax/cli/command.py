@@ -1,0 +1,130 @@
+"""From the command line to a verb: its options, its errors in one line, and its exit code."""
+
+import contextlib
+import difflib
+import inspect
+import io
+import re
+import signal
+import sys
+import time
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
+from importlib import import_module
+from typing import Any, NoReturn, TypeVar
+
+import tyro
+
+from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.runtime import configure
+
+Options = TypeVar("Options")
+# Exit codes; that of a signal is 128 + its number. ADAPTED is 0.
+BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
+VERBS = {
+    "fit": "learn a vehicle from its logs",
+    "adapt": "adapt a model to logs after a change, and say what changed",
+    "check": "compare a model's predictions with flights",
+}
+USAGE = """usage: hybrid-jax VERB ...
+
+From folders of logs to a model that can be trusted:
+
+{verbs}
+
+hybrid-jax VERB --help says more. Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
+
+
+class ChecksFailed(Exception):
+    """Logs failed checks; `args` are lines for the user."""
+
+
+def run(arguments: Sequence[str]) -> None:
+    """Run a verb; end the process with a line on stderr and an exit code if it cannot be."""
+    if not arguments or arguments[0] in ("-h", "--help"):
+        print(USAGE.format(verbs="\n".join(f"  {name:<8} {about}" for name, about in VERBS.items())))
+        return
+    verb, *given = arguments
+    with exit_codes(f"hybrid-jax {verb}", verb, "interrupted, nothing was written"):
+        if verb not in VERBS:
+            raise ValueError(f"no such verb{_meant(verb, VERBS)}; see hybrid-jax --help")
+        module = import_module(f"hybrid_jax.cli.{verb}")
+        options = parsed(module.Options, f"hybrid-jax {verb}", split_lists(given, module.LISTS))
+        configure()
+        code = module.run(options)
+    sys.exit(code)
+
+
+def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, **more: Any) -> Options:
+    """The options that a command line gives, an instance of a dataclass; ValueError if it gives none."""
+    output = io.StringIO()
+    more = {"description": inspect.cleandoc(kind.__doc__ or "")} | more
+    try:
+        with contextlib.redirect_stderr(output):
+            return tyro.cli(kind, prog=program, args=arguments, **more)
+    except SystemExit as stop:
+        if not stop.code:
+            raise  # --help
+        message = _message(output.getvalue())
+        wrong = re.search(r"Unrecognized options: (--[\w-]+)", message)
+        known = [f"--{field.name.replace('_', '-')}" for field in fields(kind)]  # pyright: ignore[reportArgumentType]
+        raise ValueError(f"{message}{_meant(wrong[1], known) if wrong else ''}; see --help") from None
+
+
+def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:
+    """Split comma-separated values, such as 10,50, of the options that take several values."""
+    words, option = [], ""
+    for word in arguments:
+        option, _, value = word.partition("=") if word.startswith("--") else (option, "", word)
+        several = option in lists and word != option
+        words += [option] * word.startswith("--") + value.split(",") if several else [word]
+    return words
+
+
+@contextlib.contextmanager
+def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
+    """End the process with one line on stderr and an exit code on bad input and on a signal.
+
+    Args:
+        program: as it is called, which begins the line.
+        command: whose options messages name; see `in_flags`.
+        interrupted: what is said on Ctrl-C.
+    """
+    try:
+        yield
+    except (ValueError, OSError, ImportError) as error:
+        _end(program, [in_flags(command, " ".join(str(error).split()))], BAD_INPUT)
+    except ChecksFailed as failed:
+        _end(program, [in_flags(command, line) for line in failed.args], FAILED_CHECKS)
+    except KeyboardInterrupt as stop:
+        _end(program, [interrupted], 128 + (stop.args[0] if stop.args else signal.SIGINT))
+
+
+def _end(program: str, lines: Sequence[str], code: int) -> NoReturn:
+    for line in lines:
+        print(f"{program}: {line}", file=sys.stderr)
+    sys.exit(code)
+
+
+def _meant(word: str, known: Any) -> str:
+    near = difflib.get_close_matches(word, list(known), 1)
+    return f"; did you mean {near[0]}?" if near else ""
+
+
+def _message(box: str) -> str:
+    """The text in the first part of the box that tyro draws around an error, without the name of our class."""
+    lines = [line.strip("│| ") for line in box.splitlines()]
+    rules = [i for i, line in enumerate(lines) if line.startswith(("─", "╭", "╰", "---", "+"))]
+    text = " ".join(lines[rules[0] + 1 : rules[1]]) if len(rules) > 1 else " ".join(box.split())
+    return re.sub(r"^Error parsing \w+: ", "", text).removesuffix(".")
+
+
+@contextlib.contextmanager
+def step(doing: str) -> Iterator[Callable[[str], None]]:
+    """Say on stderr what is being done, then, by the function that is given, what came of it and how long it took."""
+    began, found = time.perf_counter(), [""]
+    print(f"{doing} …", file=sys.stderr, flush=True)
+    yield lambda text: found.__setitem__(0, text)
+    print(
+        f"{doing}: {f'{found[0]}, ' * bool(found[0])}{time.perf_counter() - began:.1f} s", file=sys.stderr, flush=True
+    )

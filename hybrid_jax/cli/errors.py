@@ -1,0 +1,69 @@
+"""Errors of predictions on flights, and what verbs show of them."""
+
+from collections.abc import Mapping, Sequence
+
+import matplotlib as mpl
+import numpy as np
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from hybrid_jax.adaptation import Adaptation
+from hybrid_jax.cli.logs import windows_of
+from hybrid_jax.cli.page import STYLE, Table
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.scores import flight_errors
+
+UNITS = {"position": "m", "velocity": "m/s", "rotation": "rad", "body_rates": "rad/s"}
+MOST = 500  # windows of a flight
+
+
+def rmse_by_flight(
+    field: AbstractVectorField, logs: Sequence[FlightLog], steps: int
+) -> Float[np.ndarray, "flights t 4"]:
+    """RMSE of each of UNITS on each flight at the end of each interval."""
+    return np.stack([rmse(errors_of(field, log, steps)) for log in logs])
+
+
+def errors_of(field: AbstractVectorField, log: FlightLog, steps: int) -> Float[np.ndarray, "n t 4"]:
+    """The errors of each of UNITS for windows of a flight at the end of each interval."""
+    windows = windows_of([log], steps, steps).windows
+    places = np.arange(-(-len(windows) // MOST) * MOST) % len(windows)  # so that flights share a program
+    return np.stack(flight_errors(field, windows[places], chunk=MOST), axis=-1)[: len(windows)]
+
+
+def rmse(errors: Float[np.ndarray, "n t 4"]) -> Float[np.ndarray, "t 4"]:
+    return np.sqrt(np.mean(np.square(errors), axis=0))
+
+
+def texts(values: Float[np.ndarray, " 4"]) -> list[str]:
+    """A number with its unit for each of UNITS."""
+    return [f"{value:.3g} {unit}" for value, unit in zip(values, UNITS.values(), strict=True)]
+
+
+@mpl.rc_context(STYLE)
+def figure(errors: Mapping[str, Float[np.ndarray, "flights t 4"]], dt: float) -> Figure:
+    """RMSE over the time since the prediction began, a panel for each of UNITS and a line for each model."""
+    drawn = Figure(figsize=(7.5, 4.5), layout="constrained")
+    panels = drawn.subplots(2, 2, sharex=True)
+    for i, (panel, (name, unit)) in enumerate(zip(panels.flat, UNITS.items(), strict=True)):
+        for label, found in errors.items():
+            mean = np.sqrt(np.mean(np.square(found[..., i]), axis=0))
+            panel.plot(dt * np.arange(1, len(mean) + 1), mean, label=label)
+        panel.set(title=name.replace("_", " "), ylabel=f"RMSE [{unit}]", ylim=(0, None))
+    for panel in panels[-1]:
+        panel.set_xlabel("time since the prediction began [s]")
+    panels[0, 0].legend()
+    return drawn
+
+
+def parameter_table(found: Adaptation) -> Table:
+    """All parameters with their intervals."""
+    lines = [(name, str(one)) for name, one in found.parameters.items()]
+    return Table(f"Parameters ({found.level:.0%} intervals)", ("parameter", "value"), lines)
+
+
+def unknown(found: Adaptation) -> list[str]:
+    """A sentence on parameters that the flights do not tell, if there are any."""
+    names = [name for name, one in found.parameters.items() if one.high == np.inf]
+    return [f"The flights do not tell {', '.join(names)}: other values fit them as well."] if names else []

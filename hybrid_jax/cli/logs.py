@@ -1,0 +1,137 @@
+"""Logs of a folder as flights: read, checked, cut to the time in the air and into windows, as every verb does."""
+
+import itertools
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hybrid_jax.cli.command import ChecksFailed, step
+from hybrid_jax.cli.log_options import SpeedOptions, require_distinct
+from hybrid_jax.flights.checks.cleaning import Cleaning, clean
+from hybrid_jax.flights.checks.consistency import RATIO, check_log
+from hybrid_jax.flights.checks.suitability import failures
+from hybrid_jax.flights.load import RawLog, find_logs, read_log
+from hybrid_jax.flights.log import FlightLog, unevenness
+from hybrid_jax.flights.recording import Recording
+from hybrid_jax.flights.windows import LogWindows, cut_windows
+from hybrid_jax.io.archive import digest
+from hybrid_jax.vehicle import Vehicle
+
+LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
+CUT = ("time on the ground",)  # is cut out
+CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
+
+
+@dataclass(frozen=True, kw_only=True)
+class FlightOptions(SpeedOptions):
+    """How logs become flights."""
+
+    anyway: bool = False
+    """Use logs that fail checks as well, instead of leaving them out: the page then says so."""
+
+
+class Flights(NamedTuple):
+    """The flights of a folder, at one interval.
+
+    Attributes:
+        logs: in the air, of those logs that passed.
+        contents: of these what tells them apart, by name.
+        said: lines on what was read, left out and cut.
+    """
+
+    logs: list[FlightLog]
+    contents: dict[str, str]
+    said: list[str]
+
+    @property
+    def seconds(self) -> float:
+        """In the air."""
+        return sum(len(log) * log.dt for log in self.logs)
+
+
+def content_of(recording: Recording) -> str:
+    """What tells a recording apart from others, whatever its file is called."""
+    parts = itertools.product(recording.signals.items(), ("t", "values"))
+    return digest(None, {f"{name} {part}": getattr(signal, part) for (name, signal), part in parts})
+
+
+def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path, Any]], list[str]]:
+    """What `read` makes of each log of a folder, or of one log, and a line for each file that is none."""
+    if not folder.exists():
+        raise ValueError(f"{folder}: no such file or folder")
+    paths, left = find_logs(folder) if folder.is_dir() else ([folder], {})
+    if not paths:
+        raise ValueError(f"{folder}: holds no logs, only {', '.join(path.name for path in left) or 'nothing'}")
+    return [(path, read(path)) for path in paths], [f"{path.name}: left: {why}" for path, why in left.items()]
+
+
+def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False) -> Flights:
+    """Read, check and cut all logs; those that fail are left out, with a line.
+
+    Args:
+        folder: of logs, or one log.
+        vehicle: that they are compared with.
+        dt: interval of the flights [s].
+        options: how they are read.
+        changed: the thrust may differ, as that may be what changed.
+
+    Raises:
+        ChecksFailed: none is left.
+        ValueError: a log cannot be read, or is there twice.
+    """
+    with step(f"reading {folder}") as told:
+        raws, said = raw_logs(folder, lambda path: read_log(path, **options.reading))
+        contents = {path.name: content_of(raw.recording) for path, raw in raws}
+        require_distinct(list(contents.items()))
+        logs, failed = [], []
+        for path, raw in raws:
+            log, lines, notes = _flight(path, raw, vehicle, dt, options, changed)
+            said += [f"{path.name}: {note}" for note in (*raw.recording.notes, *notes)]
+            failed += lines
+            if log is not None and (options.anyway or not lines):
+                logs.append(log)
+            else:
+                del contents[path.name]
+        for line in failed:
+            print(f"  {line}", file=sys.stderr)
+        if not logs:
+            raise ChecksFailed(*failed, "no log passed its checks; mend them as the lines above say, or --anyway")
+        found = Flights(logs, contents, said + failed)
+        told(f"{len(logs)} of {len(raws)} flights, {found.seconds:.0f} s in the air")
+    return found
+
+
+def _flight(
+    path: Path, raw: RawLog, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool
+) -> tuple[FlightLog | None, list[str], list[str]]:
+    """The flight, if it can be one; lines on checks that failed; and what was cut."""
+    checks = raw.checks(vehicle, dt)
+    try:
+        log = raw.flight(dt, options.polynomial)
+        fits = log.dt == dt and not unevenness(log).any()
+        log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt), vehicle)
+        checks += check_log(log, vehicle)
+    except ValueError as error:
+        refusal = str(error).removeprefix(f"{path}: ")
+        return None, failures(checks, path.name) or [f"{path.name}: no flight: {refusal}"], []
+    excused = [each for each in checks if each.name in CUT or (changed and each.name == RATIO and _near(each.value))]
+    return log, failures([each for each in checks if each not in excused], path.name), notes
+
+
+def _near(ratio: float) -> bool:
+    return 1 / CHANGED < ratio < CHANGED
+
+
+def windows_of(logs: Sequence[FlightLog], steps: int, stride: int, most: int | None = None) -> LogWindows:
+    """Windows of flights, of which at most so many are kept, evenly spaced."""
+    found = cut_windows(list(logs), steps, stride)
+    if most is None or len(found) <= most:
+        return found
+    kept = np.round(np.linspace(0, len(found) - 1, most)).astype(int)
+    of = np.repeat(np.arange(len(found.sizes)), found.sizes)[kept]
+    sizes = [int(np.sum(of == i)) for i in range(len(found.sizes))]
+    return LogWindows(found.windows[kept], sizes, stride)

@@ -1,0 +1,73 @@
+"""Models that `hybrid-jax fit` and `adapt` wrote, as the other verbs need them."""
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hybrid_jax.cli.logs import FlightOptions, Flights, read_flights
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.export.program import vehicle_in
+from hybrid_jax.extrapolation import WARN, shares_outside
+from hybrid_jax.io.models import load
+from hybrid_jax.vehicle import Vehicle
+
+
+class Known(NamedTuple):
+    """A model of a vehicle.
+
+    Attributes:
+        field: the model.
+        vehicle: its constants.
+        about: what `fit` wrote beside it.
+    """
+
+    field: AbstractVectorField
+    vehicle: Vehicle
+    about: Mapping[str, Any]
+
+    @property
+    def dt(self) -> float:
+        return self.about["dt"]
+
+    @property
+    def steps(self) -> int:
+        return self.about["steps"]
+
+
+def load_known(path: Path) -> Known:
+    """Read a model; ValueError if `fit` or `adapt` did not write it."""
+    model = load(path)
+    vehicle = vehicle_in(model.field)
+    if vehicle is None or not {"dt", "steps", "learned_from", "motion"} <= model.about.keys():
+        raise ValueError(f"{path}: is no model that hybrid-jax fit wrote")
+    return Known(model.field, vehicle, model.about)
+
+
+def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool) -> Flights:
+    """The flights of a folder, of which none may be one that the model learned from."""
+    if not options.polynomial and known.about.get("polynomial"):
+        options = replace(options, polynomial=tuple(known.about["polynomial"]))
+    found = read_flights(folder, known.vehicle, known.dt, options, changed)
+    names = {content: name for name, content in known.about["learned_from"].items()}
+    for name, content in found.contents.items():
+        if content in names:
+            raise ValueError(f"{name}: the same flight as {names[content]}, which the model learned from; leave it out")
+    return found
+
+
+def unlike(known: Known, flights: Flights) -> list[str]:
+    """A sentence for each quantity that is often outside of what the model learned from."""
+    learned = {name: np.asarray(values) for name, values in known.about["motion"].items()}
+    x, u = (np.concatenate([getattr(log, part) for log in flights.logs]) for part in ("x", "u"))
+    asked = RIGID_BODY_SPACE.features(x, u)
+    shares = shares_outside(learned, asked)
+    unit = "of the time, so errors there may be larger than expected"
+    return [
+        f"{name} is outside of what was learned from {share:.0%} {unit}."
+        for name, share in shares.items()
+        if share > WARN
+    ]

@@ -1,0 +1,126 @@
+"""What a verb leaves in its folder: report.html, one file that needs no other, and report.json with stable keys."""
+
+import base64
+import html
+import io
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib as mpl
+from matplotlib.figure import Figure
+
+from hybrid_jax.io.files import json_text, json_value, write_atomic
+
+FORMAT = 1  # of report.json
+STYLE: dict[Any, Any] = {"axes.spines.top": False, "axes.spines.right": False, "axes.grid": True, "grid.alpha": 0.3}
+CSS = """
+body { font: 16px/1.5 system-ui, sans-serif; max-width: 56rem; margin: 0 auto; padding: 1rem; color: #1a1a1a }
+h1 { font-size: 1.3rem } h2 { font-size: 1.1rem } .answer { font-size: 1.2rem; font-weight: 600 }
+.scroll { overflow-x: auto } table { border-collapse: collapse; font-size: .9rem }
+td, th { padding: .25rem .6rem; text-align: left; border-bottom: 1px solid #ddd; vertical-align: top }
+figure { margin: 1rem 0 } img { max-width: 100% } figcaption { font-size: .9rem; color: #555 }
+details { margin: .5rem 0 } summary { cursor: pointer } li { overflow-wrap: anywhere }
+@media (prefers-color-scheme: dark) { body { background: #161616; color: #e6e6e6 } td, th { border-color: #444 }
+img { background: #fff } figcaption { color: #aaa } }
+"""
+
+
+class Table(NamedTuple):
+    """A table of texts.
+
+    Attributes:
+        title: above it.
+        header: of its columns.
+        lines: its cells.
+    """
+
+    title: str
+    header: Sequence[str]
+    lines: Sequence[Sequence[str]]
+
+
+@dataclass(frozen=True)
+class Page:
+    """What a verb found, in the order in which it is read.
+
+    Attributes:
+        question: that the verb answers.
+        answer: in a sentence.
+        table: of a few rows.
+        figures: caption and picture; the first stands beside the answer, the others are folded.
+        meaning: sentences on what it means.
+        todo: sentences on what to do next.
+        details: folded tables.
+        notes: folded lines.
+    """
+
+    question: str
+    answer: str
+    table: Table | None = None
+    figures: Sequence[tuple[str, Figure]] = ()
+    meaning: Sequence[str] = ()
+    todo: Sequence[str] = ()
+    details: Sequence[Table] = ()
+    notes: Sequence[str] = field(default_factory=tuple)
+
+
+def write(out: Path, verb: str, page: Page, found: dict[str, Any]) -> None:
+    """Write report.html and report.json into a folder, and say where they are.
+
+    Args:
+        out: the folder.
+        verb: that was run.
+        page: what people read.
+        found: what programs read, JSON values by name.
+    """
+    record = {"format": FORMAT, "verb": verb, "answer": page.answer, "notes": list(page.notes)} | found
+    write_atomic(out / "report.json", json_text(json_value(record)).encode())
+    write_atomic(out / "report.html", document(page).encode())
+    print(page.answer)
+    for line in (*page.meaning, *page.todo):
+        print(f"- {line}")
+    print(f"page: {out / 'report.html'}")
+
+
+def document(page: Page) -> str:
+    """The page as HTML."""
+    first, *others = [_figure(*each) for each in page.figures] or [""]
+    parts = [f"<h1>{_text(page.question)}</h1><p class=answer>{_text(page.answer)}</p>", first]
+    parts += [_table(page.table)] if page.table else []
+    for title, lines in (("What it means", page.meaning), ("What to do next", page.todo)):
+        parts += [f"<h2>{title}</h2>{_list(lines)}"] if lines else []
+    parts += [_folded(table.title, _table(table._replace(title=""))) for table in page.details]
+    parts += [_folded("More pictures", "".join(others))] if others else []
+    parts += [_folded("Notes", _list(page.notes))] if page.notes else []
+    head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    title = f"<title>{_text(page.question)}</title><style>{CSS}</style>"
+    return f'<!doctype html><html lang="en"><head>{head}{title}</head><body>{"".join(parts)}</body></html>\n'
+
+
+def _figure(caption: str, figure: Figure) -> str:
+    data = io.BytesIO()
+    with mpl.rc_context(STYLE):
+        figure.savefig(data, format="png", dpi=130)
+    picture = f'<img alt="{_text(caption)}" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+    return f"<figure>{picture}<figcaption>{_text(caption)}</figcaption></figure>"
+
+
+def _table(table: Table) -> str:
+    head = "".join(f"<th>{_text(cell)}</th>" for cell in table.header)
+    body = "".join(f"<tr>{''.join(f'<td>{_text(cell)}</td>' for cell in line)}</tr>" for line in table.lines)
+    title = f"<h2>{_text(table.title)}</h2>" if table.title else ""
+    return f"{title}<div class=scroll><table><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table></div>"
+
+
+def _list(lines: Sequence[str]) -> str:
+    return f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>"
+
+
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{_text(title)}</summary>{content}</details>"
+
+
+def _text(words: object) -> str:
+    return html.escape(str(words))
