@@ -108,7 +108,7 @@ def test_states_are_compared_with_what_there_is_of_them():
 
 
 def test_a_thrust_that_is_learned_may_be_off_but_not_in_another_unit():
-    weak, ratio = replace(IRIS, thrust_coefficient=IRIS.thrust_coefficient / 2), "specific force over thrust per mass"
+    weak, ratio = replace(IRIS, thrust_coefficient=IRIS.thrust_coefficient / 3), "specific force over thrust per mass"
     assert ratio not in failed(recording_of(LOGS[0]), vehicle=weak)
     assert ratio in failed(recording_of(LOGS[0]), learn=("Ix",), vehicle=weak)
     rpm = replace(LOGS[0], u=LOGS[0].u * 30 / np.pi)

@@ -12,7 +12,7 @@ from hybrid_jax.flights.log import FlightLog, sound_intervals
 from hybrid_jax.state import BODY_RATES
 from hybrid_jax.vehicle import Vehicle
 
-LONGEST_LAG = 0.25  # s, either way
+LONGEST_LAG, SHORT_LAG = 0.25, 0.1  # s, either way; of logs of less than 2 s
 # Moving means of torque and motors: the short one removes noise. Subtracting the long one removes aerodynamic moments
 # and offsets of the centre of mass, which motors counteract and would appear to cause.
 FAST, SLOW = 0.03, 0.2  # s
@@ -34,8 +34,8 @@ class Response(NamedTuple):
 
 def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     """Find the best order and lag up to ±0.1 s by correlation, then the sign of yaw; None with too little flight."""
-    reach = round(LONGEST_LAG / log.dt)
     torque, squares = _quick(log, vehicle)
+    reach = round(min(LONGEST_LAG, max(SHORT_LAG, len(squares) * log.dt / 8)) / log.dt)
     if np.count_nonzero(squares.any(axis=1)) < 4 * reach + 8 or not (torque.std(axis=0) > 0).all():
         return None
     arms = np.asarray(vehicle.rotor_positions)
