@@ -65,7 +65,7 @@ class Checkpoints:
 
 
 class DeferredSignals(AbstractContextManager):
-    """Defer the first SIGINT or SIGTERM until `raise_pending` or the end of the context; a second one acts at once.
+    """Defer the first SIGINT, SIGTERM or SIGHUP to `raise_pending` or the end of the context; a second acts at once.
 
     Only signals with a Python handler are deferred, and only in the main thread.
     """
@@ -75,7 +75,7 @@ class DeferredSignals(AbstractContextManager):
         self._before: dict[int, Any] = {}
 
     def __enter__(self) -> Self:
-        for number in (signal.SIGINT, signal.SIGTERM):
+        for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
             if callable(handler := signal.getsignal(number)):
                 self._before[number] = handler
                 signal.signal(number, self._note)

@@ -3,6 +3,7 @@
 import argparse
 import contextlib
 import gc
+import io
 import signal
 import sys
 import threading
@@ -57,7 +58,9 @@ def run(
                 raise ValueError(f"--distributed: {error}") from error
         # Compiles the kernels beside what comes first, if there are none yet: GCC takes some seconds.
         threading.Thread(target=kernels.status, daemon=True).start()
-        signal.signal(signal.SIGTERM, _interrupt)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            if signal.getsignal(number) != signal.SIG_IGN:  # as `nohup` leaves it
+                signal.signal(number, _interrupt)
         main = hosts.is_main_process()  # it alone prints and writes
         console, folder = Console(stderr=True, quiet=not main), config.out / name
         with contextlib.ExitStack() as stack:
@@ -106,6 +109,9 @@ def _program(name: str) -> str:
 @contextlib.contextmanager
 def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
     """End the process with one line on stderr and an exit code on bad input and on a signal."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
