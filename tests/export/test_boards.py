@@ -116,7 +116,7 @@ def test_it_fits_and_finds_the_same(processor, paper):
 
 
 def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
-    """Its covariance is corrected 13 times; with an array for each it would take 130 KB."""
+    """The square root of its covariance is corrected 13 times; with an array for each it would take 250 KB."""
     adaptation = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, 1e-3, disturbance=2.0)
     source = export_adaptation_c(tmp_path, adaptation)[1]
     compiled = tmp_path / "filter.o"
@@ -125,4 +125,4 @@ def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
     stack = max(int(line.split("\t")[1]) for line in compiled.with_suffix(".su").read_text().splitlines())
     print(f"\nfilter of physics: flash {flash} B, static RAM {sum(ram)} B, {stack} B of stack")
     assert sum(ram) == 0
-    assert stack < 20_000
+    assert stack < 60_000
