@@ -116,7 +116,7 @@ def test_it_fits_and_finds_the_same(processor, paper):
 
 
 def test_the_filter_of_physics_fits_on_a_stack(tmp_path):
-    """The square root of its covariance is corrected 13 times; with an array for each it would take 250 KB."""
+    """The square root of its covariance is corrected 13 times, in arrays that are used again."""
     adaptation = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, 1e-3, disturbance=2.0)
     source = export_adaptation_c(tmp_path, adaptation)[1]
     compiled = tmp_path / "filter.o"
