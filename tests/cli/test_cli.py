@@ -144,7 +144,7 @@ def test_nothing_changed_has_an_exit_code_of_its_own(fitted, tmp_path, capsys):
 @pytest.mark.slow
 def test_the_wheel_holds_the_script(tmp_path):
     """In an environment that sees the packages of this one, and nothing of the checkout."""
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT]
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT]
     subprocess.run(build, check=True)
     venv.create(tmp_path / "env", system_site_packages=True, symlinks=True)
     site = next((tmp_path / "env").glob("lib/python*/site-packages"))
