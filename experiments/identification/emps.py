@@ -24,42 +24,45 @@ class Slide(hj.AbstractVectorField):
         log_viscous: ln of the viscous friction at 0.1 m/s [N s/m].
         log_coulomb: ln of the Coulomb friction in the middle [N].
         offset: of the force [N].
-        along: how the Coulomb friction changes along the guide, linear and square, in 10 N (2,).
-        power: of the velocity in the viscous friction, beyond 1.
+        along: how the Coulomb friction changes along the guide, linear and square, in 10 N (2,); None if it does not.
+        power: of the velocity in the viscous friction, beyond 1; None if it is linear.
     """
 
     log_mass: jax.Array
     log_viscous: jax.Array
     log_coulomb: jax.Array
     offset: jax.Array
-    along: jax.Array
-    power: jax.Array
+    along: jax.Array | None
+    power: jax.Array | None
 
     def __call__(self, x, u):
-        place = (x[0] - MIDDLE) / REACH
-        coulomb = jnp.exp(self.log_coulomb) + FORCE * (self.along[0] * place + self.along[1] * place**2)
-        viscous = jnp.exp(self.log_viscous) * (jnp.abs(x[1]) / SPEED + 0.01) ** self.power
+        coulomb, viscous = jnp.exp(self.log_coulomb), jnp.exp(self.log_viscous)
+        if self.along is not None:
+            place = (x[0] - MIDDLE) / REACH
+            coulomb = coulomb + FORCE * (self.along[0] * place + self.along[1] * place**2)
+        if self.power is not None:
+            viscous = viscous * (jnp.abs(x[1]) / SPEED + 0.01) ** self.power
         force = u[0] - viscous * x[1] - coulomb * jnp.tanh(x[1] / STICK) - self.offset
         return jnp.stack([x[1], force / jnp.exp(self.log_mass)])
 
 
-def candidate(along: float, power: float):
-    """A slide whose friction may depend on position and speed by about that much."""
-    start = Slide(*map(jnp.array, (4.55, 5.3, 3.0, -3.0, [0.0, 0.0], 0.0)))
+def candidate(along: bool = False, power: bool = False):
+    """A slide, whose friction may depend on position and speed."""
+    known = map(jnp.array, (4.55, 5.3, 3.0, -3.0))
+    start = Slide(*known, jnp.zeros(2) if along else None, jnp.zeros(()) if power else None)
     model = hj.StateSpaceModel(start, ("u",), {"q": lambda x, u: x[0]}, start=(0.0, 0.0), spread=(1e-5, 1e-6))
-    return model, {"field.along": along, "field.power": power}
+    return model, {f"field.{name}": 0.3 for name, used in (("along", along), ("power", power)) if used}
 
 
-NONE = 1e-9
 BENCHMARK = Benchmark(
     title="EMPS",
     columns=("u", "q"),
     unit=("mm", 1e3),
     candidates={
-        "physics": lambda: candidate(NONE, NONE),
-        "friction changes along the guide": lambda: candidate(0.3, NONE),
-        "friction is no line in velocity": lambda: candidate(NONE, 0.3),
-        "both": lambda: candidate(0.3, 0.3),
+        "physics": candidate,
+        "friction changes along the guide": lambda: candidate(along=True),
+        "friction is not linear in velocity": lambda: candidate(power=True),
+        "both": lambda: candidate(along=True, power=True),
     },
     options={"dt": 0.01, "substeps": 2, "between": "linear", "rounds": 1, "max_steps": 40, "noise": {"q": 3e-3}},
     start=lambda q, fitted: (q, 0.0),

@@ -4,7 +4,7 @@ import csv
 import dataclasses
 import gzip
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -70,9 +70,9 @@ def read(path: Path, columns: tuple[str, str]) -> hj.Record:
     return hj.Record.of(path.name, **{columns[0]: (t, u), columns[1]: (t, y)})
 
 
-def main(benchmark: Benchmark, name: str) -> None:
+def main(benchmark: Benchmark, name: str, arguments: Sequence[str] | None = None) -> None:
     """The command of one benchmark."""
-    command.call(name, Options, lambda options: run(benchmark, options, Console()))
+    command.call(name, Options, lambda options: run(benchmark, options, Console()), arguments)
 
 
 def run(benchmark: Benchmark, options: Options, console: Console) -> None:

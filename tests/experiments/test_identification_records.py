@@ -1,0 +1,63 @@
+"""The programs for public records: a record that a model made is fitted, and a wrong one is refused in a line."""
+
+import csv
+import dataclasses
+
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from experiments.identification import emps, record, tanks
+
+
+def write(path, columns, t, u, y):
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([("t", *columns), *zip(t, u, y, strict=True)])
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def slide(tmp_path_factory):
+    """Two records of a slide that is pushed to and fro."""
+    paths = []
+    for name, phase in (("one", 0.0), ("two", 1.0)):
+        t = np.arange(0, 6, 0.01)
+        u = 90 * np.sin(2 * t + phase) + 40 * np.sin(5.3 * t)
+        model, _ = emps.candidate()
+        made = hj.Record.of(name, u=(t, u), q=(t, 0 * t))
+        q = hj.simulate(model, made, (0.0, 0.0), dt=0.01, between="linear", substeps=2)[0]["q"][:, 0]
+        path = tmp_path_factory.mktemp("slide") / f"{name}.csv"
+        paths.append(write(path, ("u", "q"), t, u, q + 1e-4 * np.random.default_rng(0).normal(size=len(t))))
+    return paths
+
+
+@pytest.mark.slow
+def test_the_model_that_made_a_record_predicts_another(slide, capsys):
+    one = dataclasses.replace(emps.BENCHMARK, candidates={"physics": emps.candidate})
+    record.main(one, "identification.emps", [slide[0], "--test", slide[1]])
+    said = capsys.readouterr().out
+    assert "Chosen: physics" in said
+    assert float(said.split("two.csv: ")[1].split(" mm")[0]) < 2.0
+
+
+def test_a_residual_of_zero_is_no_residual():
+    plain, hybrid = tanks.candidate(None)[0], tanks.candidate(0.1)[0]
+    x, u = np.array([4.0, 6.0]), np.array([3.0])
+    np.testing.assert_allclose(plain.field(x, u), hybrid.field(x, u))
+
+
+@pytest.mark.parametrize(
+    ("header", "row", "said"),
+    [
+        (("t", "u", "y"), (0, 1, 2), "has no column q; it has t, u, y"),
+        (("t", "u", "q"), (0, "x", 2), "row 2: three numbers expected"),
+    ],
+)
+def test_a_wrong_record_is_refused_in_a_line(tmp_path, header, row, said, capsys):
+    path = tmp_path / "wrong.csv"
+    with path.open("w", newline="") as file:
+        csv.writer(file).writerows([header, row])
+    with pytest.raises(SystemExit) as ended:
+        record.main(emps.BENCHMARK, "identification.emps", [str(path)])
+    assert ended.value.code == 2
+    assert said in " ".join(capsys.readouterr().err.split())
