@@ -48,8 +48,8 @@ class Slide(hj.AbstractVectorField):
 
 def candidate(along: bool = False, power: bool = False):
     """A slide, whose friction may depend on position and speed."""
-    known = map(jnp.array, (4.55, 5.3, 3.0, -3.0))
-    start = Slide(*known, jnp.zeros(2) if along else None, jnp.zeros(()) if power else None)
+    mass, viscous, coulomb, offset = (jnp.array(number) for number in (4.55, 5.3, 3.0, -3.0))
+    start = Slide(mass, viscous, coulomb, offset, jnp.zeros(2) if along else None, jnp.zeros(()) if power else None)
     model = hj.StateSpaceModel(start, ("u",), {"q": lambda x, u: x[0]}, start=(0.0, 0.0), spread=(1e-5, 1e-6))
     return model, {f"field.{name}": 0.3 for name, used in (("along", along), ("power", power)) if used}
 

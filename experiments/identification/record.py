@@ -126,10 +126,10 @@ def left_out(benchmark: Benchmark, candidate, record: hj.Record) -> tuple[float,
     """
     signal = record.signals[benchmark.columns[1]]
     begin, span = signal.t[0], signal.t[-1] - signal.t[0]
-    first = fit(benchmark, *candidate(), record.part(begin, begin + 2 / 3 * span))
+    model, prior = candidate()
+    first = fit(benchmark, model, prior, record.part(begin, begin + 2 / 3 * span))
     late = signal.t > begin + 2 / 3 * span
     one = rmse(free_run(benchmark, first.model, record, first.starts[0])[late])
-    model, prior = candidate()
     at = float(np.interp(begin + span / 3, signal.t, signal.values[:, 0]))
     inside = dataclasses.replace(model, start=benchmark.start(at, model), spread=benchmark.hidden)
     second = fit(benchmark, inside, prior, record.part(begin + span / 3, np.inf))
