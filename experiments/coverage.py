@@ -205,7 +205,7 @@ def conclusion(rows: Results) -> list[str]:
     }
     worst = min(shares, key=shares.__getitem__)
     trust = (
-        "So they can be taken at their word, after changes of these kinds."
+        "So they are not too narrow, after changes of these kinds."
         if shares[worst] >= ASKED
         else "Where it is below that, something acts that no parameter stands for, and the interval does not show it."
     )
