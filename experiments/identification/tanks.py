@@ -13,7 +13,7 @@ from experiments.identification.record import Benchmark, main
 
 FULL, EDGE, LEVEL = 10.0, 0.03, 0.02  # V at which the sensor saturates; widths of smooth corners [V]
 WEIR = 0.1
-MIDDLE, SIZE = jnp.array([6.0, 6.0, 3.0]), jnp.array([2.5, 2.5, 1.0])  # of levels and pump [V]
+MIDDLE, SIZE = np.array([6.0, 6.0, 3.0]), np.array([2.5, 2.5, 1.0])  # of levels and pump [V]
 RATE = 0.02  # V/s, the size of what the residual adds
 
 

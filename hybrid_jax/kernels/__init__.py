@@ -9,6 +9,9 @@ from hybrid_jax.kernels.fields import trained as trained
 from hybrid_jax.kernels.library import obstacle
 
 
+__all__ = ["status"]
+
+
 def status() -> str:
     """Whether kernels are used in this process: "used", or why not. Compiles them if need be."""
     reason = obstacle()
