@@ -103,6 +103,8 @@ def prediction(name, model):
     size, inputs = {"convolution": (16, 1), "no physics": (13, 4)}.get(name, (2, 1))
     rng = np.random.default_rng(0)
     x0 = rng.normal(size=(3, size)).astype(np.float32)
+    if x0.shape[-1] == 13:
+        x0[:, 3:7] /= np.linalg.norm(x0[:, 3:7], axis=1, keepdims=True)
     return np.asarray(model.predict(x0, rng.normal(size=(3, 4, inputs)).astype(np.float32), 0.01))
 
 
