@@ -8,7 +8,6 @@ from hybrid_jax.kernels.fields import serves_training as serves_training
 from hybrid_jax.kernels.fields import trained as trained
 from hybrid_jax.kernels.library import obstacle
 
-
 __all__ = ["status"]
 
 
