@@ -13,7 +13,7 @@ from hybrid_jax.cli.command import ChecksFailed
 from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.flights.checks.airborne import airborne, within
-from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, UNUSUAL, Check, check_log
+from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import DT, STATES, to_flight
 from hybrid_jax.flights.formats.raw import WXYZ, XYZ
@@ -26,7 +26,6 @@ MEND = "nothing was identified; mend the logs as the lines above say, or go on w
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
 MOTORS = "rotor_speed"
 GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
-LOOSE = 0.8  # relative error of the thrust that follows from commands, whose lag and curve are guesses
 OF_THRUST = {"curve", "mass", "k", "k_rotors"}
 # Checks of a flight: what they need, and the longest interval [s] of that at which they tell something. Identification
 # leaves out gaps and the ground by itself, and learns or ignores the lag.
@@ -77,8 +76,6 @@ def compared(recording: Recording, field: Any, learn: Sequence[str]) -> list[Che
     excused = set()
     if not OF_THRUST.isdisjoint(learn):
         excused |= {each for each in found if each.name == RATIO and 1 / GUESSED < each.value < GUESSED}
-    if isinstance(field, Actuated):
-        excused |= {each for each in found if each.suggestion == UNUSUAL and each.name == THRUST and each.value < LOOSE}
     return [each for each in found if each not in excused]
 
 

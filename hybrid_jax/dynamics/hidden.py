@@ -16,6 +16,11 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 Indices = tuple[int, ...]
 
 
+def _at(places: Indices, values: Float[Array, " k"], d: int) -> Float[Array, " d"]:
+    """The values at their places among d numbers, the others zero."""
+    return jnp.zeros(d).at[jnp.array(places)].set(values)
+
+
 class AbstractHidden(eqx.Module):
     """A part with states z of its own. Every array inside is learned."""
 
@@ -120,7 +125,7 @@ class RandomWalk(AbstractHidden):
         return jnp.zeros_like(z)
 
     def added(self, z, d):
-        return jnp.zeros(d).at[jnp.array(self.places)].set(z)
+        return _at(self.places, z, d)
 
 
 class Oscillator(AbstractHidden):
@@ -151,7 +156,7 @@ class Oscillator(AbstractHidden):
         return jnp.stack([z[1], pushed - frequency**2 * z[0] - 2 * jnp.exp(self.log_damping) * frequency * z[1]])
 
     def added(self, z, d):
-        return jnp.zeros(d).at[jnp.array(self.places)].set(self.gain * z[0])
+        return _at(self.places, self.gain * z[0], d)
 
 
 class LinearDynamics(AbstractHidden):
@@ -177,7 +182,7 @@ class LinearDynamics(AbstractHidden):
         return self.a @ z + self.b @ jnp.concatenate([x, u])
 
     def added(self, z, d):
-        return jnp.zeros(d).at[jnp.array(self.places)].set(self.c @ z)
+        return _at(self.places, self.c @ z, d)
 
 
 class WithHidden(AbstractVectorField):

@@ -29,7 +29,7 @@ from hybrid_jax.integrate import RK4
 from hybrid_jax.records import Between, Record, Signal, on_grid
 from hybrid_jax.status import Status
 
-CONTINUOUS = 1e-6  # the same of a state without process noise beside one that has some
+CONTINUOUS = 1e-6  # what a segment's end may be off, over the size of a state, where that state has no process noise
 
 
 class RecordFit(eqx.Module):

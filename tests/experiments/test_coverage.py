@@ -37,7 +37,7 @@ def test_the_claim_fails_from_above_where_intervals_are_too_wide(change, holds):
     assert verdict.holds is holds
 
 
-@pytest.mark.parametrize(("inside", "means"), [(97, "So they can be taken"), (80, "something acts")])
+@pytest.mark.parametrize(("inside", "means"), [(97, "So they are not too narrow"), (80, "something acts")])
 def test_the_conclusion_says_how_many_hold_and_where_fewest(inside, means):
     first, second = conclusion(rows(inside))
     assert first == f"Of 100 pooled 95 % intervals {inside}% contain the true value, of single sources 50%."
