@@ -1,5 +1,6 @@
 """Records of which not every state was measured: what made them is recovered, and what they do not tell is said."""
 
+import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -141,6 +142,27 @@ def test_a_hidden_part_is_found(part, extra, at, truth):
     model = StateSpaceModel(frozen, ("torque",), {"angle": angle}, np.zeros(2 + extra), (np.inf,) * 2 + (1.0,) * extra)
     fit = fit_records(model, data, dt=0.02, noise={"angle": 1e-2})
     assert np.asarray(at(fit.model.field.parts[0])) == pytest.approx(truth, abs=0.05)
+
+
+class Stiff(hj.AbstractVectorField):
+    """A slow state, and one that follows within a tenth of a millisecond."""
+
+    log_rate: jax.Array
+
+    def __call__(self, x, u):
+        return jnp.stack([x[1] - jnp.exp(self.log_rate) * x[0], 1e4 * (jnp.cos(x[0]) - x[1])])
+
+
+@pytest.mark.slow
+def test_a_stiff_system_is_fitted_with_an_implicit_solver():
+    def model(rate, spread):
+        return StateSpaceModel(Stiff(jnp.log(jnp.array(rate))), (), {"y": angle}, (1.0, 0.5), spread)
+
+    t, solver = np.arange(0, 5, 0.1), diffrax.Kvaerno5()
+    y = simulate(model(0.7, (0, 0)), Record.of("r", y=(t, 0 * t)), dt=0.1, solver=solver)[0]["y"][:, 0]
+    data = Record.of("r", y=(t, y + 1e-3 * np.random.default_rng(0).normal(size=len(t))))
+    fit = fit_records(model(1.2, (0.5, 0.5)), [data], dt=0.1, solver=solver)
+    assert float(fit.intervals["log_rate"].value) == pytest.approx(np.log(0.7), abs=3e-3)
 
 
 def test_linear_dynamics_are_an_oscillator():
