@@ -44,7 +44,7 @@ real_flight needs flights: --vehicle FILE --source FOLDER [--target FOLDER] [--t
 
   Your own logs: one file per flight, CSV with the columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 (SI
   units, z up, forward-left-up, rotor speeds in rad/s); any other CSV with --columns MAP.toml; PX4's .ulg; a log of a
-  Crazyflie's SD card; a ROS bag. python -m experiments.inspect_logs FOLDER says what is in them and what to do. Ten
+  Crazyflie's SD card; a ROS bag. hybrid-jax inspect FOLDER says what is in them and what to do. Ten
   flights of ten seconds before the change and five after it are a good start. docs/howto/logs.md explains the formats.
 
   Public flights: IMRCLab/crazyflie-data-collection (a Crazyflie with and without a load) and

@@ -23,7 +23,7 @@ class RealFlightConfig(SpeedOptions, Run):
 
     A flight is a file: CSV (.csv, .csv.gz; columns t,px,py,pz,qw,qx,qy,qz,vx,vy,vz,wx,wy,wz,u0,u1,u2,u3 in SI units,
     z up, forward-left-up, rotor speeds in rad/s), any other CSV with --columns MAP.toml, PX4's .ulg, a log of a
-    Crazyflie's SD card, a ROS bag or Betaflight's blackbox; python -m experiments.inspect_logs FOLDER says what is in
+    Crazyflie's SD card, a ROS bag or Betaflight's blackbox; hybrid-jax inspect FOLDER says what is in
     them. A check that fails stops the run before anything is trained, with exit code 3; --anyway goes on.
 
     Without --test, the target's flights are held out in turn (--folds). Without --target, nothing is adapted and the

@@ -22,6 +22,7 @@ Options = TypeVar("Options")
 # Exit codes; that of a signal is 128 + its number. ADAPTED is 0.
 BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
+    "inspect": "say what logs hold and lack, and write a vehicle file from them",
     "fit": "learn a vehicle from its logs",
     "adapt": "adapt a model to logs after a change, and say what changed",
     "check": "compare a model's predictions with flights",

@@ -15,7 +15,7 @@ from hybrid_jax.adaptation import METHODS, Adaptation, adapt
 from hybrid_jax.cli import errors, page
 from hybrid_jax.cli.choice import choose, expected
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, read_flights, windows_of
+from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, read_flights, windows_of
 from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
@@ -31,7 +31,6 @@ from hybrid_jax.training.channels import scaled_loss
 from hybrid_jax.trajectories import Trajectories
 
 __all__ = ["LISTS", "Options", "run"]
-STEPS = 10  # intervals of a window
 TRAINED, VALIDATED = 2000, 500  # windows
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60

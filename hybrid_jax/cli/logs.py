@@ -12,16 +12,18 @@ import numpy as np
 from hybrid_jax.cli.command import ChecksFailed, step
 from hybrid_jax.cli.log_options import SpeedOptions, require_distinct
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
-from hybrid_jax.flights.checks.consistency import RATIO, check_log
+from hybrid_jax.flights.checks.consistency import RATIO, Check, check_log
 from hybrid_jax.flights.checks.suitability import failures
 from hybrid_jax.flights.load import RawLog, find_logs, read_log
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import Recording
-from hybrid_jax.flights.windows import LogWindows, cut_windows
+from hybrid_jax.flights.windows import LogWindows, cut_windows, require_length
 from hybrid_jax.io.archive import digest
 from hybrid_jax.vehicle import Vehicle
 
 LISTS = ("--polynomial", "--motor-order", "--topics", "--learn")
+STEPS = 10  # intervals of a window
+ONE_TO_ONE = (0.0, 1.0)  # rotor speed = command, in whatever unit: motors are still compared with the motion
 CUT = ("time on the ground",)  # is cut out
 CHANGED = 2.0  # factor by which thrust may differ from the vehicle's where a change is asked for
 
@@ -53,6 +55,22 @@ class Flights(NamedTuple):
         return sum(len(log) * log.dt for log in self.logs)
 
 
+class Looked(NamedTuple):
+    """What a log is worth to a model.
+
+    Attributes:
+        log: its flight, in the air; none if it cannot be one.
+        checks: of its signals, less those that every verb mends.
+        refusal: why it is no flight, or empty.
+        notes: what was cut.
+    """
+
+    log: FlightLog | None
+    checks: list[Check]
+    refusal: str
+    notes: list[str]
+
+
 def content_of(recording: Recording) -> str:
     """What tells a recording apart from others, whatever its file is called."""
     parts = itertools.product(recording.signals.items(), ("t", "values"))
@@ -63,10 +81,11 @@ def raw_logs(folder: Path, read: Callable[[Path], Any]) -> tuple[list[tuple[Path
     """What `read` makes of each log of a folder, or of one log, and a line for each file that is none."""
     if not folder.exists():
         raise ValueError(f"{folder}: no such file or folder")
-    paths, left = find_logs(folder) if folder.is_dir() else ([folder], {})
+    paths, others = find_logs(folder) if folder.is_dir() else ([folder], {})
+    left = [f"{path.name}: left: {why.replace('FILE', path.name)}" for path, why in others.items()]
     if not paths:
-        raise ValueError(f"{folder}: holds no logs, only {', '.join(path.name for path in left) or 'nothing'}")
-    return [(path, read(path)) for path in paths], [f"{path.name}: left: {why}" for path, why in left.items()]
+        raise ValueError(f"{folder}: holds no logs, only {'; '.join(left) or 'nothing'}")
+    return [(path, read(path)) for path in paths], left
 
 
 def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool = False) -> Flights:
@@ -89,11 +108,12 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
         require_distinct(list(contents.items()))
         logs, failed = [], []
         for path, raw in raws:
-            log, lines, notes = _flight(path, raw, vehicle, dt, options, changed)
-            said += [f"{path.name}: {note}" for note in (*raw.recording.notes, *notes)]
+            one = look(path, raw, vehicle, dt, options.polynomial, changed)
+            lines = failures(one.checks, path.name) or [f"{path.name}: no flight: {one.refusal}"] * bool(one.refusal)
+            said += [f"{path.name}: {note}" for note in (*raw.recording.notes, *one.notes)]
             failed += lines
-            if log is not None and (options.anyway or not lines):
-                logs.append(log)
+            if one.log is not None and (options.anyway or not lines):
+                logs.append(one.log)
             else:
                 del contents[path.name]
         for line in failed:
@@ -105,21 +125,26 @@ def read_flights(folder: Path, vehicle: Vehicle, dt: float, options: FlightOptio
     return found
 
 
-def _flight(
-    path: Path, raw: RawLog, vehicle: Vehicle, dt: float, options: FlightOptions, changed: bool
-) -> tuple[FlightLog | None, list[str], list[str]]:
-    """The flight, if it can be one; lines on checks that failed; and what was cut."""
-    checks = raw.checks(vehicle, dt)
+def look(
+    path: Path, raw: RawLog, vehicle: Vehicle | None, dt: float, polynomial: Sequence[float], changed: bool = False
+) -> Looked:
+    """Check a log and cut it to its flight; what cannot be compared with the vehicle is compared with itself."""
+    checks, notes = raw.checks(vehicle, dt), []
+    scaled = "rotor_speed" in raw.recording.signals or bool(polynomial)
     try:
-        log = raw.flight(dt, options.polynomial)
+        log = raw.flight(dt, polynomial if scaled else ONE_TO_ONE)
         fits = log.dt == dt and not unevenness(log).any()
         log, notes = clean(log, Cleaning(in_flight=True, resample=None if fits else dt), vehicle)
-        checks += check_log(log, vehicle)
+        other = vehicle is not None and log.u.shape[1] != vehicle.rotors  # a check that failed says so
+        checks += check_log(log, None if other or not scaled else vehicle)
+        require_length([log], STEPS)
+        if not scaled:
+            raw.flight(dt)  # says what is missing
+        refusal = ""
     except ValueError as error:
-        refusal = str(error).removeprefix(f"{path}: ")
-        return None, failures(checks, path.name) or [f"{path.name}: no flight: {refusal}"], []
+        log, refusal = None, str(error).removeprefix(f"{path}: ")
     excused = [each for each in checks if each.name in CUT or (changed and each.name == RATIO and _near(each.value))]
-    return log, failures([each for each in checks if each not in excused], path.name), notes
+    return Looked(log, [each for each in checks if each not in excused], refusal, notes)
 
 
 def _near(ratio: float) -> bool:

@@ -7,7 +7,6 @@ import subprocess
 import sys
 import venv
 from pathlib import Path
-from unittest import mock
 
 import jax
 import numpy as np
@@ -21,29 +20,15 @@ from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, random_flights
 from hybrid_jax.vehicle import IRIS
 
 
-@pytest.fixture(scope="module", autouse=True)
-def devices():
-    """Those of this process are fixed by now."""
-    with mock.patch("hybrid_jax.cli.command.configure"):
-        yield
-
-
-def called(capsys, *arguments):
-    """The exit code, stdout and stderr of a command line."""
-    with pytest.raises(SystemExit) as stop:
-        main([*map(str, arguments)])
-    return (stop.value.code or 0, *capsys.readouterr())
-
-
 def test_help_lists_the_verbs(capsys):
     main([])
     said = capsys.readouterr().out
-    assert all(f"  {verb} " in said for verb in ("fit", "adapt", "check"))
+    assert all(f"  {verb} " in said for verb in ("inspect", "fit", "adapt", "check"))
 
 
-@pytest.mark.parametrize("verb", ["fit", "adapt", "check"])
-def test_help_of_a_verb_has_at_most_a_dozen_options(capsys, verb):
-    code, said, _ = called(capsys, verb, "--help")
+@pytest.mark.parametrize("verb", ["inspect", "fit", "adapt", "check"])
+def test_help_of_a_verb_has_at_most_a_dozen_options(called, verb):
+    code, said, _ = called(verb, "--help")
     assert code == 0
     assert len(re.findall(r"│ +(?:-\w, )?--(?!help)[a-z-]+", said)) <= 14
 
@@ -53,13 +38,14 @@ def test_help_of_a_verb_has_at_most_a_dozen_options(capsys, verb):
     [
         (["fitt"], "hybrid-jax fitt: no such verb; did you mean fit?; see hybrid-jax --help"),
         (["check", "m.npz", "flights", "--otu", "x"], "did you mean --out?"),
+        (["inspect", "none"], "hybrid-jax inspect: none: no such file or folder"),
         (["check", "none.npz", "flights"], "none.npz"),
         (["fit", "none", "-o", "m.npz", "--vehicle", "none.toml"], "none.toml: not a readable TOML file"),
     ],
 )
-def test_bad_input_ends_in_one_line(tmp_path, monkeypatch, capsys, arguments, words):
+def test_bad_input_ends_in_one_line(tmp_path, monkeypatch, called, arguments, words):
     monkeypatch.chdir(tmp_path)
-    code, _, said = called(capsys, *arguments)
+    code, _, said = called(*arguments)
     assert code == BAD_INPUT
     (line,) = said.splitlines()
     assert words in line
@@ -90,9 +76,9 @@ def fitted(tmp_path_factory):
 
 
 @pytest.mark.slow
-def test_from_two_folders_to_what_changed(fitted, capsys):
+def test_from_two_folders_to_what_changed(fitted, called):
     after, out = fitted / "after", fitted / "adapt"
-    code, said, _ = called(capsys, "adapt", fitted / "source.npz", after, "-o", fitted / "adapted.npz", "--out", out)
+    code, said, _ = called("adapt", fitted / "source.npz", after, "-o", fitted / "adapted.npz", "--out", out)
     assert code == 0
     assert "Changed: " in said
     record = json.loads((out / "report.json").read_text())
@@ -105,37 +91,37 @@ def test_from_two_folders_to_what_changed(fitted, capsys):
 
 
 @pytest.mark.slow
-def test_predictions_are_compared_with_the_simplest(fitted, capsys):
+def test_predictions_are_compared_with_the_simplest(fitted, called):
     options = ["check", fitted / "source.npz", fitted / "after", "--out", fitted / "check"]
-    code, said, _ = called(capsys, *options)
+    code, said, _ = called(*options)
     assert code == 0
     assert "times as exact as with frozen rates" in said
     assert set(json.loads((fitted / "check" / "report.json").read_text())["rmse"]) >= {"model", "no forces"}
 
 
 @pytest.mark.slow
-def test_a_flight_that_the_model_learned_from_is_refused(fitted, capsys):
+def test_a_flight_that_the_model_learned_from_is_refused(fitted, called):
     shutil.copy(fitted / "before" / "flight0.csv.gz", fitted / "copy.csv.gz")
-    code, _, said = called(capsys, "check", fitted / "source.npz", fitted / "copy.csv.gz", "--out", fitted / "check")
+    code, _, said = called("check", fitted / "source.npz", fitted / "copy.csv.gz", "--out", fitted / "check")
     assert code == BAD_INPUT
     assert "copy.csv.gz: the same flight as flight0.csv.gz, which the model learned from" in said
 
 
 @pytest.mark.slow
-def test_logs_that_fail_all_checks_are_no_flights(fitted, tmp_path, capsys):
+def test_logs_that_fail_all_checks_are_no_flights(fitted, tmp_path, called):
     flown = random_flights(PARAMETER_SHIFT, 1, 11.0, jax.random.key(5))
     x, u = np.asarray(flown.states[0, :-1]), np.asarray(flown.inputs[0])
     (tmp_path / "mm.csv.gz").write_bytes(csv_of(0.01 * np.arange(len(u)), x * np.repeat([1000.0, 1.0], [3, 10]), u))
-    code, _, said = called(capsys, "check", fitted / "source.npz", tmp_path / "mm.csv.gz", "--out", tmp_path)
+    code, _, said = called("check", fitted / "source.npz", tmp_path / "mm.csv.gz", "--out", tmp_path)
     assert code == FAILED_CHECKS
     assert "position is in mm" in said
 
 
 @pytest.mark.slow
-def test_nothing_changed_has_an_exit_code_of_its_own(fitted, tmp_path, capsys):
+def test_nothing_changed_has_an_exit_code_of_its_own(fitted, tmp_path, called):
     same = written(tmp_path / "same", SOURCE, 1, 7)
     options = ["-o", tmp_path / "adapted.npz", "--out", tmp_path / "out"]
-    code, said, _ = called(capsys, "adapt", fitted / "source.npz", same, *options)
+    code, said, _ = called("adapt", fitted / "source.npz", same, *options)
     assert (code, (tmp_path / "adapted.npz").exists()) in ((NOTHING_CHANGED, False), (0, True))
     if code:
         assert "Nothing changed" in said

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from experiments.inspect_logs.estimates import estimate
+from hybrid_jax.cli.estimates import estimate
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import CRAZYFLIE, ULOG, find_logs, format_of, read_recording

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 
-from experiments.inspect_logs.estimates import GRAVITY, Estimate
+from hybrid_jax.cli.estimates import GRAVITY, Estimate
 
 ARM, MASS = 0.1, 1.0  # m and kg, where they were not given
 LEARN, OF_VELOCITY = ("Ix", "Iy", "Iz", "k_rotors", "rate_damping"), ("drag", "aerodynamic_moment")
@@ -22,7 +22,7 @@ def vehicle_text(found: Estimate, name: str, mass: float | None, arm: float | No
     top = TOP if found.commands else 1.2 * found.largest
     k = thrust / top**2 if found.commands else thrust
     lines = [
-        "# Written from logs by python -m experiments.inspect_logs. Numbers with a # are explained; those marked",
+        "# Written from logs by hybrid-jax inspect. Numbers with a # are explained; those marked",
         "# PLACEHOLDER are not told by any log: measure them.",
         f"learn = {json.dumps([*LEARN, *(OF_VELOCITY if found.moves else ())])}",
         "",

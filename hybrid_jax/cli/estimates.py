@@ -29,18 +29,31 @@ LEAST_SPREAD = 0.3  # m/s², of the specific force, for a curve of thrust
 
 
 class Estimate(NamedTuple):
-    """Numbers of one vehicle with n rotors; motors are speeds [rad/s] or commands from 0 to 1."""
+    """Numbers of one vehicle with n rotors.
+
+    Attributes:
+        commands: whether motors are commands from 0 to 1, else speeds [rad/s].
+        largest: motor value in the logs.
+        hover: root mean square of each motor in hover.
+        voltage: in hover [V]; not a number if unknown.
+        effect: B, the angular acceleration that each squared motor adds [rad/s² of a squared motor].
+        correlations: of roll, pitch and yaw with the regression.
+        lag: τ [s].
+        curve: c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command.
+        seconds: in flight.
+        moves: whether a log tells of the velocity, without which none tells of drag.
+    """
 
     commands: bool
-    largest: float  # motor value in the logs
-    hover: Float[np.ndarray, " n"]  # root mean square of each motor in hover
-    voltage: float  # in hover [V]; not a number if unknown
-    effect: Float[np.ndarray, "3 n"]  # B, angular acceleration for each s [rad/s² of a squared motor]
-    correlations: Float[np.ndarray, " 3"]  # of roll, pitch and yaw with the regression
-    lag: float  # τ [s]
-    curve: Float[np.ndarray, " 3"] | None  # c0, c1, c2: specific force of one rotor's thrust [m/s²] over its command
-    seconds: float  # in flight
-    moves: bool  # whether a log tells of the velocity, without which none tells of drag
+    largest: float
+    hover: Float[np.ndarray, " n"]
+    voltage: float
+    effect: Float[np.ndarray, "3 n"]
+    correlations: Float[np.ndarray, " 3"]
+    lag: float
+    curve: Float[np.ndarray, " 3"] | None
+    seconds: float
+    moves: bool
 
     @property
     def placed(self) -> bool:

@@ -6,13 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import LOGS, write
-from rich.console import Console
 from scipy.signal import lfilter
 
-from experiments.inspect_logs.__main__ import Options, look, main, trusted
-from experiments.inspect_logs.estimates import estimate
-from experiments.inspect_logs.vehicle import vehicle_text
 from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.cli.estimates import estimate
+from hybrid_jax.cli.inspect import Options, inspected, trusted
+from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.flights.recording import Recording, Signal
 from hybrid_jax.state import STATE_NAMES, input_names
 from hybrid_jax.vehicle import IRIS, load_vehicle
@@ -69,6 +68,7 @@ def test_what_a_log_tells_is_found(commanded, tmp_path):
     text = (tmp_path / "v.toml").read_text()
     assert "nominal_voltage = 11.1" in text
     assert "PLACEHOLDER: weigh it" not in text
+    assert found.curve is not None
     x, y = found.centre(found.positions(ARM))
     assert x > 0.001 > abs(y)
     np.testing.assert_allclose(np.polynomial.polynomial.polyval(0.7, MASS * found.curve), MASS * 9.81 / 4, rtol=0.03)
@@ -84,67 +84,49 @@ def test_what_a_log_does_not_tell_is_a_placeholder(commanded, tmp_path):
         assert "PLACEHOLDER" in line
 
 
-def test_a_folder_that_is_not_there_ends_in_one_line(tmp_path, capsys):
-    with pytest.raises(SystemExit) as stop:
-        main([str(tmp_path / "none"), "--out", str(tmp_path)])
-    assert stop.value.code == 2
-    assert capsys.readouterr().err == f"inspect_logs: {tmp_path / 'none'}: no such file or folder\n"
-
-
-def test_a_folder_is_described_whatever_is_in_it(tmp_path, capsys):
+def test_a_folder_is_described_whatever_is_in_it(tmp_path, called):
     folder = write(tmp_path / "flights", LOGS[:2])
     (folder / "broken.csv").write_text("t,px\n0,0\n")
     (folder / "notes.txt").write_text("windy")
     (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
-    options = ["--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path)]
-    main([str(folder), *options])
-    said = capsys.readouterr().out
+    _, said, _ = called("inspect", folder, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
     assert "broken.csv: not read: row 1, field py" in said
     assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
-    assert "notes.txt: left: no format that is read" in said
-    assert "2 of 3 logs are ready" in said
-    page = (tmp_path / "inspect_logs" / "report.md").read_text()
-    for words in (
-        "## Signals at their own rates",
-        "## Checks",
-        "## What the checks ask",
-        "## What to do",
-        "signals_1.png",
-    ):
-        assert words in page
-    results = json.loads((tmp_path / "inspect_logs" / "report.json").read_text())["rows"]
+    assert "2 of 3 logs are ready for a model" in said
+    page = (tmp_path / "report.html").read_text()
+    titles = ("Signals at their own rates", "Checks (? cannot tell)", "What the checks ask", "What to do")
+    assert all(words in page for words in (*titles, "notes.txt: left: no format that is read"))
+    assert page.count("data:image/png;base64,") == 2
+    results = json.loads((tmp_path / "report.json").read_text())["rows"]
     assert [row["result"].split(":")[0] for row in results] == ["not read", "ready", "ready"]
 
 
-def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, capsys):
+def test_without_a_vehicle_a_log_is_checked_against_itself(tmp_path, called):
     in_mm = [replace(log, x=log.x * np.repeat([1000.0, 1.0], [3, 10])) for log in LOGS[1:2]]
-    main([str(write(tmp_path / "flights", [LOGS[0], *in_mm])), "--out", str(tmp_path)])
-    said = capsys.readouterr().out
+    _, said, _ = called("inspect", write(tmp_path / "flights", [LOGS[0], *in_mm]), "--out", tmp_path)
     assert "chirp_run1.csv.gz: CSV, unknown vehicle, 0.9 s, 4 motors: ready" in said
     assert "FAILS dp/dt against v: position is in mm" in said
-    unchecked = "not checked for want of --vehicle: number of motors, largest speed; specific force"
-    assert all(unchecked in text for text in (said, (tmp_path / "inspect_logs" / "report.md").read_text()))
+    assert "not checked for want of --vehicle: number of motors, largest speed; specific force" in said
 
 
-def test_a_log_of_other_motors_hides_no_other(tmp_path, capsys):
+def test_a_log_of_other_motors_hides_no_other(tmp_path, called):
     six = replace(LOGS[1], u=np.concatenate([LOGS[1].u, LOGS[1].u[:, :2] + 1], axis=1))
     (tmp_path / "v.toml").write_text(vehicle_toml(IRIS))
     folder = write(tmp_path / "flights", LOGS[:1])
     header = ",".join(["t", *STATE_NAMES, *input_names(6)])
     np.savetxt(folder / "six.csv", np.column_stack([six.t, six.x, six.u]), "%.9g", ",", header=header, comments="")
-    main([str(folder), "--vehicle", str(tmp_path / "v.toml"), "--out", str(tmp_path)])
-    said = capsys.readouterr().out
+    _, said, _ = called("inspect", folder, "--vehicle", tmp_path / "v.toml", "--out", tmp_path)
     assert "six.csv: CSV, unknown vehicle, 0.9 s, 6 motors: FAILS number of motors: 6 motors are logged" in said
     assert "1 of 2 logs are ready" in said
 
 
-def test_a_log_that_training_refuses_is_not_ready(tmp_path, capsys):
+def test_a_log_is_ready_if_fit_takes_it(tmp_path, called):
+    """Uneven samples are put on even times by every verb; two samples are no window."""
     uneven = replace(LOGS[1], t=LOGS[1].t + 0.002 * (np.arange(len(LOGS[1])) % 2))
-    main([str(write(tmp_path / "flights", [LOGS[0], uneven, LOGS[2][:2]])), "--out", str(tmp_path)])
-    said = capsys.readouterr().out
-    assert "no flight: the interval at 0.012 s is 0.008 s, the median is 0.012 s; put the samples on even times" in said
+    folder = write(tmp_path / "flights", [LOGS[0], uneven, LOGS[2][:2]])
+    _, said, _ = called("inspect", folder, "--out", tmp_path)
     assert "no flight: no window of 10 intervals without gaps" in said
-    assert "1 of 3 logs are ready" in said
+    assert "2 of 3 logs are ready" in said
 
 
 def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
@@ -154,13 +136,13 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
     folder = write(tmp_path / "flights", [LOGS[0], wrong])
     paths = [folder / "chirp_run1.csv.gz", folder / "chirp_run2.csv.gz"]
     options = Options(folder, columns=tmp_path / "map.toml")
-    logs = [look(path, None, options) for path in paths]
+    logs = [inspected(path, None, options) for path in paths]
     assert ["has only motor commands" in log.refusal for log in logs] == [True, True]
     assert "FAILS q̇ against ω: body rates are in degrees per second" in logs[1].result
-    assert [kept.name for kept in trusted(logs, Console())] == [str(paths[0])]
+    assert [kept.name for kept in trusted(logs)] == [str(paths[0])]
     assert "left out of the vehicle file, as checks failed: chirp_run2.csv.gz" in capsys.readouterr().out
     with pytest.raises(ValueError, match=r"^--write-vehicle: no log flew and passed its checks"):
-        trusted(logs[1:], Console())
+        trusted(logs[1:])
 
 
 @pytest.mark.parametrize(
@@ -173,13 +155,11 @@ def test_a_vehicle_file_rests_on_sound_logs_alone(tmp_path, capsys):
         (["--vehicle", "mas.toml"], "mas.toml: learn must be names of"),  # which real_flight would refuse later
     ],
 )
-def test_bad_options_end_in_one_line(tmp_path, monkeypatch, capsys, options, words):
+def test_bad_options_end_in_one_line(tmp_path, monkeypatch, called, options, words):
     write(tmp_path / "flights", LOGS[:1])
     (tmp_path / "mas.toml").write_text('learn = ["Ix", "mas"]\n' + vehicle_toml(IRIS))
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit) as stop:
-        main(["flights", *options])
-    assert stop.value.code == 2
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("inspect_logs: ")
+    code, _, said = called("inspect", "flights", *options)
+    assert code == 2
+    (line,) = said.splitlines()
     assert words in line

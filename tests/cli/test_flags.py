@@ -31,4 +31,4 @@ def test_arguments_become_options(said, printed):
 
 
 def test_each_command_names_its_own_option():
-    assert in_flags("inspect_logs", "put the samples on even times first: dt=0.01").endswith("--dt 0.01")
+    assert in_flags("inspect", "put the samples on even times first: dt=0.01").endswith("--dt 0.01")

@@ -1,0 +1,277 @@
+"""`hybrid-jax inspect`: what logs hold and lack, what mends them, and a vehicle file of what they tell."""
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Annotated, NamedTuple
+
+import matplotlib as mpl
+import numpy as np
+import tyro
+from matplotlib.figure import Figure
+
+from hybrid_jax import checks
+from hybrid_jax.cli import page
+from hybrid_jax.cli.command import BAD_INPUT
+from hybrid_jax.cli.estimates import estimate
+from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.log_options import SpeedOptions
+from hybrid_jax.cli.logs import LISTS, look, raw_logs
+from hybrid_jax.cli.vehicle_text import vehicle_text
+from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
+from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
+from hybrid_jax.flights.load import RawLog, read_log, read_recording
+from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording, Signal
+from hybrid_jax.io.files import write_atomic
+from hybrid_jax.vehicle import Vehicle
+
+__all__ = ["LISTS", "Options", "run"]
+PICTURED, POINTS = 6, 3000  # logs that get a picture; samples of each line at most
+LINES = 5  # of what is not folded
+# Checks that a log may fail and still tell of its vehicle: it needs no position, and is cut at gaps.
+BORNE = ("quantities", "slowest signal", "gaps", "repeated samples")
+SHOWN = {FAILS: "FAILS", WARNS: "warns", UNKNOWN: "?"}
+NOT_RUN = f"not checked for want of --vehicle: number of motors, largest speed; {'; '.join(NEED_VEHICLE)}"
+EMPTY = "–"
+LEGEND = {
+    "whole file": "the log ends where its program ended it, and no bit was changed",
+    "airframe": "a multirotor flew; a model of one stands for nothing else",
+    "quantities": "position, velocity, attitude, body rates and motors, which training on states needs",
+    "number of motors": "as many as the vehicle file has rotors; none is dropped in silence",
+    "slowest signal": "every signal is as fast as the model's interval (--dt), before anything is interpolated",
+    "longest gap": "no clock jumps; shorter gaps are kept as gaps and nothing is interpolated across them",
+    "motors within limits": "commands from 0 to 1, speeds up to the vehicle's largest",
+    "motors turn": "something flew",
+}
+
+
+@dataclass(frozen=True)
+class Options(SpeedOptions):
+    """Say what is in the logs of a folder, whether it suffices for a model, and what to log instead.
+
+    Reads PX4's .ulg, logs of a Crazyflie's SD card, ROS bags, Betaflight's blackbox and CSV, each file by itself, so
+    that one that is damaged hides no other. Nothing is trained and no log is changed.
+
+    First look at the logs, then write a vehicle file from them, correct it by hand, and look again with it:
+
+      hybrid-jax inspect flights/
+      hybrid-jax inspect flights/ --write-vehicle v.toml --mass 0.68 --arm 0.12
+      hybrid-jax inspect flights/ --vehicle v.toml
+    """
+
+    folder: Annotated[Path, tyro.conf.Positional]
+    """Folder of logs, or one log."""
+    vehicle: Path | None = None
+    """Vehicle file that the logs are compared with: number and order of motors, spin, thrust, largest speed."""
+    write_vehicle: Path | None = None
+    """Write a vehicle file to start from: hover and thrust, where the rotors are, spin, lag and centre of thrust as the
+    logs tell that fail no check, with a comment on each number that they do not. No file is overwritten."""
+    mass: float | None = None
+    """With --write-vehicle: what the vehicle weighs [kg]. No log tells it; thrust and inertia grow with it."""
+    arm: float | None = None
+    """With --write-vehicle: distance of a rotor from the centre [m]. No log tells it; inertia grows with it."""
+    dt: float = 0.01
+    """Interval [s] that a model is to have. A signal that is slower fails a check, as half of it would be invented."""
+    out: Path = Path("runs/inspect")
+    """Folder of the page."""
+
+
+class Inspected(NamedTuple):
+    """One log: what was read, its checks, why it is no flight for a model, or nothing, and what was said on it."""
+
+    name: str
+    recording: Recording | None
+    checks: Sequence[Check] = ()
+    refusal: str = ""
+    notes: Sequence[str] = ()
+
+    @property
+    def failed(self) -> list[Check]:
+        return [check for check in self.checks if check.verdict == FAILS]
+
+    @property
+    def result(self) -> str:
+        """In a few words: refused, fails, or ready."""
+        if self.recording is None:
+            return f"not read: {self.refusal}"
+        if more := self.failed:
+            rest = f" (and {len(more) - 1} more)" if len(more) > 1 else ""
+            return f"FAILS {more[0].name}: {more[0].suggestion}{rest}"
+        return f"no flight: {self.refusal}" if self.refusal else "ready"
+
+
+def run(options: Options) -> int:
+    for name in ("dt", "mass", "arm"):
+        if (value := getattr(options, name)) is not None:
+            checks.positive(f"--{name}", value)
+    _ = options.reading  # topics are checked before anything is read
+    checks.writable_folder("--out", options.out)
+    if options.write_vehicle is not None and options.write_vehicle.exists():
+        raise ValueError(f"--write-vehicle: {options.write_vehicle} exists; name another file")
+    vehicle = None if options.vehicle is None else load_vehicle_model(options.vehicle).vehicle
+    read, left = raw_logs(options.folder, lambda path: inspected(path, vehicle, options))
+    logs = [log for _, log in read]
+    left = [printable(line) for line in left]
+    for log in logs:
+        print(f"{log.name}: {described(log)}{log.result}")
+    rows = [{"log": log.name, "result": log.result} for log in logs]
+    page.write(options.out, "inspect", _page(options, logs, left), {"rows": rows})
+    if options.write_vehicle is not None:
+        found = estimate(trusted(logs))
+        name = options.folder.resolve().stem
+        write_atomic(options.write_vehicle, vehicle_text(found, name, options.mass, options.arm))
+        print(f"{options.write_vehicle}: written; read its comments before it is used")
+    return BAD_INPUT if all(log.recording is None for log in logs) else 0  # the lines above say why
+
+
+def inspected(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
+    """Read and check one log; what refuses it is part of the result."""
+    name = printable(path.name)
+    try:
+        raw = _read(path, options)
+    except ValueError as error:
+        why = str(error).removeprefix(f"{path}: ")
+        return Inspected(name, None, refusal=printable(in_flags("inspect", why)))
+    found = look(path, raw, vehicle, options.dt, options.polynomial)
+    told = [replace(each, suggestion=in_flags("inspect", each.suggestion)) for each in found.checks]
+    return Inspected(
+        name, raw.recording, told, in_flags("inspect", found.refusal), (*raw.recording.notes, *found.notes)
+    )
+
+
+def _read(path: Path, options: Options) -> RawLog:
+    """The log, also where it is a CSV file without all that a flight needs."""
+    if options.columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
+        return RawLog(read_recording(path, **options.reading))
+    return read_log(path, **options.reading)
+
+
+def trusted(logs: Sequence[Inspected]) -> list[Recording]:
+    """The recordings that a vehicle file may rest on; which are not is printed."""
+    left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
+    kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
+    if not kept:
+        raise ValueError("--write-vehicle: no log flew and passed its checks; mend the logs as the page says")
+    if left:
+        print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
+    return kept
+
+
+def printable(text: str) -> str:
+    """A text that may hold a file's name, which may hold anything: with escapes for what is no character."""
+    return "".join(each if each.isprintable() else repr(each)[1:-1] for each in text)
+
+
+def described(log: Inspected) -> str:
+    """Format, vehicle, length and motors of a log that was read."""
+    if (found := log.recording) is None:
+        return ""
+    kind = found.facts.get("vehicle", "unknown vehicle")
+    return f"{found.facts.get('format')}, {kind}, {found.duration:.1f} s, {found.rotors} motors: "
+
+
+def _page(options: Options, logs: Sequence[Inspected], left: Sequence[str]) -> page.Page:
+    ready = sum(log.result == "ready" for log in logs)
+    mends = [(log.name, c.name, c.suggestion) for log in logs for c in log.checks if c.verdict in (FAILS, WARNS)] + [
+        (log.name, "flight", log.refusal) for log in logs if log.refusal
+    ]
+    learn = f"hybrid-jax fit {options.folder} -o source.npz --vehicle {options.vehicle or 'v.toml'}"
+    read = [log for log in logs if log.recording is not None]
+    worst = sorted(logs, key=lambda log: log.result == "ready")
+    return page.Page(
+        f"Do the logs of {printable(str(options.folder))} suffice for a model?",
+        f"{ready} of {len(logs)} logs are ready for a model.",
+        _overview(worst[:LINES]),
+        [
+            (f"{log.name}: its signals; grey: gaps", _drawn(log.recording))
+            for log in read[:PICTURED]
+            if log.recording is not None
+        ],
+        [NOT_RUN] if options.vehicle is None and read else [],
+        [f"{log}: {check}: {mend}" for log, check, mend in mends[:LINES]]
+        if not ready
+        else [f"Learn from them: {learn}"],
+        [
+            *([_overview(logs)] if len(logs) > LINES else []),
+            page.Table("What to do", ("log", "check", "what it found, and what mends it"), mends),
+            _signals(read),
+            *_checks(read),
+        ],
+        [*(f"{log.name}: {note}" for log in logs for note in log.notes), *left],
+    )
+
+
+def _overview(logs: Sequence[Inspected]) -> page.Table:
+    lines = []
+    for log in logs:
+        found = log.recording
+        told = (found.facts.get(key, EMPTY) if found else EMPTY for key in ("format", "vehicle", "airframe", "program"))
+        size = (f"{found.duration:.1f}", str(found.rotors)) if found else (EMPTY, EMPTY)
+        lines.append((log.name, log.result, *told, *size))
+    return page.Table("Logs", ("log", "result", "format", "vehicle", "airframe", "program", "s", "motors"), lines)
+
+
+def _signals(logs: Sequence[Inspected]) -> page.Table:
+    lines = []
+    for log in logs:
+        for name, signal in log.recording.signals.items() if log.recording else ():
+            rate = f"{1 / signal.interval:.4g}" if 0 < signal.interval < math.inf else EMPTY
+            gaps = signal.gaps()
+            longest = f", longest {max(end - start for start, end in gaps):.3g} s" if gaps else ""
+            spread = f"{signal.values.min():.3g} … {signal.values.max():.3g} {_unit(name)}" if len(signal) else EMPTY
+            lines.append((log.name, name, signal.source, str(len(signal)), rate, f"{len(gaps)}{longest}", spread))
+    header = ("log", "quantity", "from", "samples", "Hz", "gaps", "values")
+    return page.Table("Signals at their own rates, in the library's frames and units", header, lines)
+
+
+def _unit(name: str) -> str:
+    return ROTOR_UNITS[name] if name in ROTOR_UNITS else AXES[name][1]
+
+
+def _checks(logs: Sequence[Inspected]) -> tuple[page.Table, page.Table]:
+    """What came of each check, and what it asks."""
+    every = {check.name: check for log in logs for check in log.checks}
+    lines = []
+    for log in logs:
+        own = {check.name: check for check in log.checks}
+        lines.append((log.name, *(_verdict(own[name]) if name in own else EMPTY for name in every)))
+    said = "two records of one motion agree: docs/howto/own_flights.md"
+    limits = [
+        (name, LEGEND.get(name, said), _number(check.limit, check.unit) or EMPTY) for name, check in every.items()
+    ]
+    return (
+        page.Table("Checks (? cannot tell)", ("log", *every), lines),
+        page.Table("What the checks ask", ("check", "passes if", "limit"), limits),
+    )
+
+
+def _verdict(check: Check) -> str:
+    return f"{SHOWN.get(check.verdict, 'ok')} {_number(check.value, check.unit)}".rstrip()
+
+
+def _number(value: float, unit: str) -> str:
+    return f"{value:.3g} {unit}" if unit and math.isfinite(value) else ""
+
+
+@mpl.rc_context(page.STYLE)
+def _drawn(recording: Recording) -> Figure:
+    """A panel for each signal over time, gaps in grey."""
+    figure = Figure((8, 1.2 + 1.3 * len(recording.signals)), layout="constrained")
+    panels = figure.subplots(len(recording.signals), 1, sharex=True, squeeze=False)[:, 0]
+    for panel, (name, signal) in zip(panels, recording.signals.items(), strict=True):
+        panel.plot(*_broken(signal), linewidth=0.8, label=signal.axes)
+        for start, end in signal.gaps():
+            panel.axvspan(start, end, color="0.85")
+        panel.set_ylabel(f"{name.replace('_', chr(10))}\n[{_unit(name)}]", fontsize=7)
+        panel.legend(loc="upper right", fontsize=6, ncols=len(signal.axes))
+    panels[-1].set_xlabel("time [s]")
+    return figure
+
+
+def _broken(signal: Signal) -> tuple[np.ndarray, np.ndarray]:
+    """Times and values with a break at each gap, so that no line is drawn across it."""
+    step, starts = max(1, len(signal) // POINTS), [start for start, _ in signal.gaps()]
+    t = signal.t[::step]
+    cuts = np.searchsorted(t, starts, side="right")
+    return np.insert(t, cuts, starts), np.insert(signal.values[::step].astype(float), cuts, np.nan, axis=0)

@@ -1,0 +1,25 @@
+"""The script is called in this process, whose devices are fixed by now."""
+
+from unittest import mock
+
+import pytest
+
+from hybrid_jax.cli import main
+
+
+@pytest.fixture(scope="session", autouse=True)
+def devices():
+    with mock.patch("hybrid_jax.cli.command.configure"):
+        yield
+
+
+@pytest.fixture
+def called(capsys):
+    """The exit code, stdout and stderr of a command line."""
+
+    def call(*arguments):
+        with pytest.raises(SystemExit) as stop:
+            main([*map(str, arguments)])
+        return (stop.value.code or 0, *capsys.readouterr())
+
+    return call
