@@ -11,7 +11,8 @@ import optax
 from jaxtyping import Array, Float
 
 from benchmarks.subjects import DT
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, RunningStats, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, RunningStats, trainable
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.networks.mlp import ResidualNetwork
 from hybrid_jax.networks.normalisation import BatchNorm
 from hybrid_jax.vehicle import Vehicle

@@ -15,7 +15,7 @@ import torch
 from torch import nn
 from torch.nn import functional
 
-from hybrid_jax.dynamics.base import Hybrid as OurHybrid
+from hybrid_jax.dynamics.composition import Hybrid as OurHybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, nominal
 from hybrid_jax.dynamics.rigid_body import RigidBody as OurRigidBody
 from hybrid_jax.networks.mlp import ResidualNetwork

@@ -15,7 +15,7 @@ from experiments.paper.conditions import Noise
 from experiments.runner import command
 from experiments.runner.options import NotNegative, Positive, check_numbers
 from hybrid_jax import AbstractVectorField, Model, OnlineAdaptation, checks, load, rotation
-from hybrid_jax.dynamics.base import infer_batch, state_space
+from hybrid_jax.dynamics.base import state_space
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
@@ -202,7 +202,7 @@ def _change(config: Config, field: AbstractVectorField, beta: float) -> str:
     where = "the box of states" if config.data is None else str(config.data)
     x, u = _box(field, config) if config.data is None else _states(config.data)
     columns = jnp.asarray(x.T), jnp.asarray(u.T)
-    before, after = (np.asarray(eqx.filter_jit(infer_batch)(one, *columns)) for one in (field, smoothed(field, beta)))
+    before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
     off = np.abs(after - before).max(axis=1)
     entry = int(off.argmax())
     named = state_space(field, len(off)).names[entry]

@@ -18,13 +18,14 @@ import optimistix
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, features_first, infer_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.composition import Hybrid
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
-_infer = eqx.filter_jit(infer_batch)
+_infer = eqx.filter_jit(lambda field, x, u: as_field(field).infer_batch(x, u))
 
 
 class RK4(diffrax.AbstractSolver):
@@ -211,7 +212,7 @@ def rollout_batch(
 
 @eqx.filter_jit
 def _integrate_batch(field, x0, u, solver, dt, substeps):
-    if isinstance(solver, diffrax.AbstractImplicitSolver) or not features_first(field):
+    if isinstance(solver, diffrax.AbstractImplicitSolver) or not as_field(field).features_first:
         return jax.vmap(lambda start, held: integrate(field, start, held, dt, solver, substeps))(x0, u)
     columns, held = jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1)
     states = integrate(lambda x, held: _infer(field, x, held), columns, held, dt, solver, substeps)

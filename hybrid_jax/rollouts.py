@@ -9,12 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import kernels
-from hybrid_jax.dynamics.base import AbstractVectorField, features_first, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import batch_norms, over_samples, training_mode
 from hybrid_jax.integrate import RK4, Solver, integrate, rollout_batch
 
 # Traced once for all stages of a step, not once for each; the compiler inlines it again.
-_train, _evaluate = eqx.filter_jit(train_batch), eqx.filter_jit(lambda field, x, u: field(x, u))
+_train = eqx.filter_jit(lambda field, x, u: as_field(field).train_batch(x, u))
+_evaluate = eqx.filter_jit(lambda field, x, u: field(x, u))
 
 
 def rollout_minibatch(
@@ -27,7 +28,9 @@ def rollout_minibatch(
     if (states := kernels.trained(field, x0, u, dt, solver, substeps)) is not None:
         return states
     implicit = isinstance(solver, diffrax.AbstractImplicitSolver)
-    if batch_norms(field) if implicit else features_first(field):  # implicit and coupled: one system of equations
+    if (
+        batch_norms(field) if implicit else as_field(field).features_first
+    ):  # implicit and coupled: one system of equations
         return integrate(lambda x, held: _train(field, x, held), x0, u, dt, solver, substeps)
     alone = training_mode(field)
 

@@ -9,7 +9,7 @@ import pytest
 from choices import slow
 from pendulum import pendulum
 
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import RK4, SOLVERS, along, rollout, rollout_batch
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import rollout_minibatch

@@ -13,8 +13,7 @@ from benchmarks.__main__ import PEERS
 from benchmarks.peers import installed
 from benchmarks.subjects import make_flights, untrained
 from benchmarks.training_peers import BY_HAND, COMPILED, RIVALS, TORCHDIFFEQ, ThreeEighths
-from hybrid_jax.dynamics.base import Hybrid as OurHybrid
-from hybrid_jax.dynamics.base import train_batch
+from hybrid_jax.dynamics.composition import Hybrid as OurHybrid
 from hybrid_jax.integrate import RK4, rollout
 
 pytestmark = pytest.mark.slow
@@ -59,7 +58,7 @@ def test_the_field_of_the_rivals_is_ours():
     field = untrained("hybrid")
     assert isinstance(field, OurHybrid)
     x, u = (part.astype(np.float32) for part in make_flights(30, 1))
-    ours = train_batch(field, jnp.asarray(x.T), jnp.asarray(u[:, 0].T)).T
+    ours = field.train_batch(jnp.asarray(x.T), jnp.asarray(u[:, 0].T)).T
     theirs = Hybrid(field)(tensor(x), tensor(u[:, 0])).detach().numpy()
     np.testing.assert_allclose(theirs, ours, rtol=0, atol=1e-6 * np.abs(ours).max())
 

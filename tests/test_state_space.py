@@ -9,7 +9,8 @@ from pendulum import pendulum, whirling
 from systems import windows, wrap
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import Frozen, check_windows, state_space
+from hybrid_jax.dynamics.base import check_windows, state_space
+from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, rigid_body
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.state_space import Angle, Attitude, Quantity, StateSpace

@@ -19,7 +19,7 @@ from experiments.paper.lanes import Fit
 from experiments.runner.stages import Stages
 from hybrid_jax import rotation
 from hybrid_jax.adaptation import Method
-from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RigidBody, nominal, rigid_body
 from hybrid_jax.io import portable
 from hybrid_jax.io.datasets import Dataset
@@ -105,7 +105,7 @@ def model_set(domain: Domain, trained: dict[str, Trained], sizes: Sequence[int])
 
 def fused(fields: AbstractVectorField) -> AbstractVectorField:
     """Stacked fields in their inference layout, on the host."""
-    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(fuse_for_inference))(fields))
+    return jax.device_get(eqx.filter_jit(eqx.filter_vmap(lambda field: as_field(field).fuse_for_inference()))(fields))
 
 
 def as_stack(field: Any) -> Any:

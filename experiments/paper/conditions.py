@@ -15,7 +15,8 @@ from experiments.paper.config import HELD_BACK, Config, Encoding, Stopping, colu
 from experiments.runner.options import NotNegative
 from hybrid_jax import rotation
 from hybrid_jax.adaptation.expert_augmentation import expert_augmented
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import perturbed, perturbed_by
 from hybrid_jax.integrate import SOLVERS
 from hybrid_jax.io.datasets import Dataset

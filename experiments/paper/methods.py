@@ -18,7 +18,7 @@ from experiments.paper.study import adapted as trained
 from experiments.reporting import names
 from experiments.runner.stages import Stages
 from hybrid_jax.adaptation.expert_augmentation import prediction_mse
-from hybrid_jax.dynamics.base import Frozen, Hybrid, unfreeze
+from hybrid_jax.dynamics.composition import Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.rigid_body import RigidBody
 from hybrid_jax.estimation import covariance_of, intervals

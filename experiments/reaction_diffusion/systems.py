@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import linearize, parameter_columns
+from hybrid_jax.dynamics.base import as_field
 from hybrid_jax.networks.grids import GridNetwork
 
 A, B, K = 1e-3, 5e-3, 5e-3
@@ -123,11 +123,11 @@ class Conversion(hj.AbstractVectorField):
         return jnp.concatenate([-rate, rate])
 
     def linearize(self, x, u, dx, du):
-        rate, columns = linearize(self.rate, x, u, dx, du)
+        rate, columns = as_field(self.rate).linearize(x, u, dx, du)
         return self.both(rate), self.both(columns)
 
     def parameter_columns(self, x, u):
-        return self.both(parameter_columns(self.rate, x, u))
+        return self.both(as_field(self.rate).parameter_columns(x, u))
 
 
 def gray_scott(environments, reacts: bool) -> GrayScott:

@@ -8,8 +8,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, Kinematics
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, rigid_body, with_vehicle
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.io.archive import named_leaves

@@ -24,7 +24,8 @@ from experiments.reporting.claims import Claim, Part, Undecided, Verdict, evalua
 from experiments.reporting.results import Results
 from experiments.reporting.statistics import Interval, mean_interval
 from hybrid_jax.adaptation.ridge import fit_ridge, linear_residual
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals
 from hybrid_jax.flights.scores import FlightErrors, flight_errors

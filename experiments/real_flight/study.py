@@ -36,8 +36,9 @@ from experiments.real_flight.train import Experiment, TrainedModel, TrainingData
 from experiments.reporting import names
 from experiments.reporting.results import Results
 from hybrid_jax.cli import choice
-from hybrid_jax.dynamics.base import AbstractVectorField, Blend
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import HoldState
+from hybrid_jax.dynamics.composition import Blend
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.flights.scores import flight_errors
 from hybrid_jax.flights.windows import count_windows, cut_windows, require_length

@@ -17,7 +17,8 @@ from jaxtyping import Array, Float, Int, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation.methods import Solution
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, RunningStats
+from hybrid_jax.dynamics.base import AbstractVectorField, RunningStats
+from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.estimation.least_squares import Solver, Theta, ravel_parameters
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable

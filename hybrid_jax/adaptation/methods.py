@@ -13,7 +13,8 @@ from jaxtyping import Array, Int, PyTree
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen, Hybrid, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
+from hybrid_jax.dynamics.composition import Frozen, Hybrid
 from hybrid_jax.dynamics.disturbance import sized, with_disturbance
 from hybrid_jax.estimation.least_squares import Scale, check_determined, fit_least_squares, ravel_parameters
 from hybrid_jax.estimation.uncertainty import select_disturbance

@@ -13,7 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.least_squares import Solver
 from hybrid_jax.integrate import checked, integrate
 from hybrid_jax.networks.mlp import LinearResidual, ResidualNetwork

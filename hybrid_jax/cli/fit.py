@@ -16,8 +16,9 @@ from hybrid_jax.cli import errors, page
 from hybrid_jax.cli.choice import choose, expected
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, read_flights, windows_of
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.extrapolation import features_of

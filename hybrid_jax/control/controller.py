@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.control.cost import Scalar, Weights, deviations, input_rate_penalty, plan_cost, stage_factors
 from hybrid_jax.control.sensitivities import advance_lagged, condensed
-from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import like
 from hybrid_jax.matrices import solve
 from hybrid_jax.rotation import attitude_error, canonicalize_quaternion, normalise
@@ -183,7 +183,7 @@ class Controller:
             raise ValueError(f"plan must have variables of shape {shape}, got {plan.variables.shape}")
         x, reference, plan = checked_states("x", x, reference, plan, self.steps)
         x = x.at[QUATERNION].set(canonicalize_quaternion(normalise(x[QUATERNION])))
-        model = fuse_for_inference(model)
+        model = as_field(model).fuse_for_inference()
         start = x, (self.speeds(plan)[0] if speeds is None else speeds).astype(x.dtype)
         point = self._initial_guess(model, reference, start, plan)
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax.control.rotor_lag import lag_matrix, lagged_speeds, stage_shares, step_of
-from hybrid_jax.dynamics.base import AbstractVectorField, jvp_columns, linearize
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.rotation import normalise
 from hybrid_jax.state import QUATERNION, STATE_SIZE, Input, State
@@ -53,7 +53,7 @@ def advance_with_jacobian(
         inputs = [(command, jnp.concatenate([none, one], axis=1))] * 3
 
     def slopes(both, held):
-        value, columns = linearize(model, both[:, 0], held[0], both[:, 1:], held[1])
+        value, columns = as_field(model).linearize(both[:, 0], held[0], both[:, 1:], held[1])
         return jnp.concatenate([value[:, None], columns], axis=1)
 
     directions = jnp.eye(d, inputs[0][1].shape[1], dtype=x.dtype)

@@ -8,8 +8,9 @@ no sensor shows. `grids` has quantities on a periodic grid in space, and diffusi
 """
 
 from hybrid_jax.dynamics.actuators import Actuated, Actuator, actuated, rotor_speeds
-from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid, trainable, unfreeze
+from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid, unfreeze
 from hybrid_jax.dynamics.disturbance import ConstantDisturbance, disturbed, with_disturbance
 from hybrid_jax.dynamics.estimator import AbstractEstimator
 from hybrid_jax.dynamics.grids import Diffusion, Grid, check_grid, diffusion

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, apply_residual
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody
 from hybrid_jax.state import STATE_SIZE
 from hybrid_jax.state_space import Quantity
@@ -196,7 +196,7 @@ class Actuated(AbstractVectorField):
         return jnp.concatenate([moved, self.accelerations(x[STATE_SIZE:], u)]) if self.rotor_states else moved
 
     def apply_residual(self, x, residual):
-        changed = apply_residual(self.body, x[:STATE_SIZE], residual[:STATE_SIZE])
+        changed = as_field(self.body).apply_residual(x[:STATE_SIZE], residual[:STATE_SIZE])
         return jnp.concatenate([changed, residual[STATE_SIZE:]])
 
     def settled(self, u: Float[Array, "t m"], dt: float) -> Float[Array, " n"]:

@@ -1,19 +1,17 @@
 """Vector fields ẋ = f(x, u). Physics, a network, their sum and a user's own module are all vector fields.
 
 A field maps one state x (d,) and one input u (m,) to ẋ (d,). Any function or Equinox module of this signature will do.
-The functions below evaluate it on a batch, features first: x (d, b), u (m, b). They call the method of the same name
-of an `AbstractVectorField`, whose defaults serve code for one sample; a subclass overrides what it can do faster.
+The methods of an `AbstractVectorField` evaluate it on a batch, features first: x (d, b), u (m, b). Their defaults serve
+code for one sample; a subclass overrides what it can do faster, and `as_field` gives them to any function.
 """
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
-import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -22,7 +20,6 @@ from hybrid_jax.dynamics.batching import (
     Batch,
     RunningStats,
     batch_norms,
-    moments_of,
     over_samples,
     training_mode,
     with_moved_stats,
@@ -47,20 +44,20 @@ class AbstractVectorField(eqx.Module):
         """ẋ of one sample, in inference mode."""
 
     def train_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
-        """See the function `train_batch`, as for the methods that follow."""
-        direct = features_first(self) and not batch_norms(self)
+        """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
+        direct = self.features_first and not batch_norms(self)
         return self(x, u) if direct else over_samples(training_mode(self))(x, u)
 
     def infer_batch(self, x: Batch, u: Float[Array, "m b"]) -> Batch:
         """ẋ of many samples in inference mode, a column for each."""
-        return self(x, u) if features_first(self) else over_samples(self)(x, u)
+        return self(x, u) if self.features_first else over_samples(self)(x, u)
 
     def update_running_stats(self, x: Batch, u: Float[Array, "m b"]) -> Self:
         """The field after one training batch: running statistics move, learned parameters do not."""
         return with_moved_stats(self, x, u)
 
     def apply_residual(self, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]) -> Float[Array, " d *b"]:
-        """What a residual adds to ẋ of this physics.
+        """What a residual adds to ẋ of this physics: itself, unless its state shows forces elsewhere.
 
         Args:
             residual: what a network returned, in units of ẋ (d,).
@@ -84,6 +81,11 @@ class AbstractVectorField(eqx.Module):
     def fuse_for_inference(self) -> "AbstractVectorField":
         """The same map in inference mode, in a layout that is faster for few samples at a time."""
         return self
+
+    @property
+    def features_first(self) -> bool:
+        """Whether some part of it has a batched form, so that a batch is best kept on the last axis."""
+        return self.accepts_batch
 
     @property
     def state_space(self) -> StateSpace:
@@ -149,215 +151,34 @@ def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectorie
     return windows if x is windows.x else replace(windows, x=x)
 
 
-def _methods_of(field) -> type[AbstractVectorField]:
-    """The class whose methods evaluate a field: the defaults for what is no `AbstractVectorField`."""
-    return type(field) if isinstance(field, AbstractVectorField) else AbstractVectorField
+class _Function(AbstractVectorField):
+    """A function, or a module of another class, with the default methods of a field."""
+
+    function: Callable
+
+    def __call__(self, x, u):
+        return self.function(x, u)
+
+    @property
+    def features_first(self):
+        return getattr(self.function, "accepts_batch", False)
+
+    def update_running_stats(self, x, u):
+        return with_moved_stats(self.function, x, u)
+
+    def fuse_for_inference(self):
+        return self.function
 
 
-def train_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
-    """ẋ on a minibatch in training mode: batch normalisation uses the moments of this minibatch."""
-    return _methods_of(field).train_batch(field, x, u)
-
-
-def infer_batch(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> Batch:
-    """ẋ of many samples in inference mode."""
-    return _methods_of(field).infer_batch(field, x, u)
-
-
-def update_running_stats(field: AbstractVectorField, x: Batch, u: Float[Array, "m b"]) -> AbstractVectorField:
-    """The field after one training batch: running statistics move, learned parameters do not."""
-    return _methods_of(field).update_running_stats(field, x, u)
-
-
-def apply_residual(
-    field: AbstractVectorField, x: Float[Array, " d *b"], residual: Float[Array, " d *b"]
-) -> Float[Array, " d *b"]:
-    """Map a residual ẋ onto the state derivative of this physics: identity, unless its state shows forces elsewhere."""
-    return _methods_of(field).apply_residual(field, x, residual)
-
-
-def linearize(
-    field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"], dx: Columns, du: Columns
-) -> tuple[Float[Array, " d"], Columns]:
-    """ẋ of one sample in inference mode, and its derivative along each pair of columns of dx (d, c) and du (m, c)."""
-    return _methods_of(field).linearize(field, x, u, dx, du)
-
-
-def parameter_columns(field: AbstractVectorField, x: Float[Array, " d"], u: Float[Array, " m"]) -> Columns:
-    """The derivative of ẋ of one sample along each learned number (d, p), in the order of the leaves of the field."""
-    return _methods_of(field).parameter_columns(field, x, u)
-
-
-def fuse_for_inference(field: AbstractVectorField) -> AbstractVectorField:
-    """The same map in inference mode, in a layout that is faster for few samples at a time. Identity by default."""
-    return _methods_of(field).fuse_for_inference(field)
+def as_field(field: Callable) -> AbstractVectorField:
+    """The field itself, or a function of x and u with the methods of one."""
+    return field if isinstance(field, AbstractVectorField) else _Function(field)
 
 
 def jvp_columns(function, values: tuple, columns: tuple) -> tuple[Float[Array, " e"], Columns]:
     """`function(*values)` and its derivatives along the columns of `columns`: shapes (e,) and (e, c)."""
     value, slope = jax.linearize(function, *values)
     return value, jax.vmap(slope, in_axes=-1, out_axes=-1)(*columns)
-
-
-class Hybrid(AbstractVectorField):
-    """ẋ = f_p(x, u; θ_p) + f_d(x, u; θ_d): physics plus what physics leaves out (paper, Eq. 4).
-
-    Attributes:
-        physics: f_p.
-        residual: f_d, a network or any other field; physics maps what it returns, see `apply_residual`.
-    """
-
-    physics: AbstractVectorField
-    residual: AbstractVectorField
-
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        slope, added = self.physics(x, u), apply_residual(self.physics, x, self.residual(x, u))
-        if jnp.shape(added) != jnp.shape(slope):
-            raise ValueError(f"the residual must return {jnp.shape(slope)}, as physics does, got {jnp.shape(added)}")
-        return slope + added
-
-    def train_batch(self, x, u):
-        return train_batch(self.physics, x, u) + apply_residual(self.physics, x, train_batch(self.residual, x, u))
-
-    def infer_batch(self, x, u):
-        return infer_batch(self.physics, x, u) + apply_residual(self.physics, x, infer_batch(self.residual, x, u))
-
-    def update_running_stats(self, x, u):
-        return Hybrid(update_running_stats(self.physics, x, u), update_running_stats(self.residual, x, u))
-
-    def apply_residual(self, x, residual):
-        return apply_residual(self.physics, x, residual)
-
-    def linearize(self, x, u, dx, du):
-        physics, d_physics = linearize(self.physics, x, u, dx, du)
-        values, columns = zip((x, dx), linearize(self.residual, x, u, dx, du), strict=True)
-        added, d_added = jvp_columns(self.apply_residual, values, columns)
-        return physics + added, d_physics + d_added
-
-    def parameter_columns(self, x, u):
-        value, columns = self.residual(x, u), parameter_columns(self.residual, x, u)
-        moved = jvp_columns(lambda value: self.apply_residual(x, value), (value,), (columns,))[1]
-        theta, at = ravel_learned(self.physics)
-        mapped = jax.jacfwd(lambda theta: apply_residual(at(theta), x, value))(theta)
-        return jnp.concatenate([parameter_columns(self.physics, x, u) + mapped, moved], axis=1)
-
-    def fuse_for_inference(self):
-        return Hybrid(fuse_for_inference(self.physics), fuse_for_inference(self.residual))
-
-
-class Blend(AbstractVectorField):
-    """ẋ = the mean of several fields, such as models between which the data cannot decide.
-
-    Attributes:
-        fields: one or more, of the same state and input.
-    """
-
-    fields: tuple[AbstractVectorField, ...]
-
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self._mean(field(x, u) for field in self.fields)
-
-    def train_batch(self, x, u):
-        return self._mean(train_batch(field, x, u) for field in self.fields)
-
-    def infer_batch(self, x, u):
-        return self._mean(infer_batch(field, x, u) for field in self.fields)
-
-    def update_running_stats(self, x, u):
-        return Blend(tuple(update_running_stats(field, x, u) for field in self.fields))
-
-    def apply_residual(self, x, residual):
-        return self._mean(apply_residual(field, x, residual) for field in self.fields)
-
-    def linearize(self, x, u, dx, du):
-        values, columns = zip(*(linearize(field, x, u, dx, du) for field in self.fields), strict=True)
-        return self._mean(values), self._mean(columns)
-
-    def fuse_for_inference(self):
-        return Blend(tuple(fuse_for_inference(field) for field in self.fields))
-
-    def _mean(self, parts: Iterable[Array]) -> Array:
-        first, *others = parts
-        return sum(others, start=first) / len(self.fields)
-
-
-class AbstractWrapper(AbstractVectorField):
-    """ẋ = write(x, f(read(x), u)) for the field f inside.
-
-    Attributes:
-        field: the field inside.
-    """
-
-    accepts_batch: ClassVar[bool] = True
-
-    field: AbstractVectorField
-
-    def read(self, x: Float[Array, " d *b"]) -> Float[Array, " n *b"]:
-        """The features of the state that the field inside reads; by default all."""
-        return x
-
-    def write(self, x: Float[Array, " d *b"], inside: Float[Array, " n *b"]) -> Float[Array, " d *b"]:
-        """ẋ from what the field inside returned; by default the same.
-
-        Args:
-            inside: what the field inside returned (n).
-        """
-        return inside
-
-    def __call__(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> Float[Array, " d"]:
-        return self.write(x, self.field(self.read(x), u))
-
-    def train_batch(self, x, u):
-        return self.write(x, train_batch(self.field, self.read(x), u))
-
-    def infer_batch(self, x, u):
-        return self.write(x, infer_batch(self.field, self.read(x), u))
-
-    def update_running_stats(self, x, u):
-        return eqx.tree_at(lambda wrapper: wrapper.field, self, update_running_stats(self.field, self.read(x), u))
-
-    def apply_residual(self, x, residual):
-        return apply_residual(self.field, x, residual)
-
-    def linearize(self, x, u, dx, du):
-        features, d_features = jvp_columns(self.read, (x,), (dx,))
-        inside, d_inside = linearize(self.field, features, u, d_features, du)
-        return jvp_columns(self.write, (x, inside), (dx, d_inside))
-
-    def fuse_for_inference(self):
-        return eqx.tree_at(lambda wrapper: wrapper.field, self, fuse_for_inference(self.field))
-
-
-class Frozen(AbstractWrapper, AbstractInferenceOnly):
-    """A field in inference mode that training does not change: neither parameters nor running statistics move."""
-
-    def train_batch(self, x, u):
-        return infer_batch(self.field, x, u)
-
-    def update_running_stats(self, x, u):
-        return self
-
-
-def features_first(field: AbstractVectorField) -> bool:
-    """Whether some part of a sum has a batched form, so that the batch is best kept on the last axis."""
-    if isinstance(field, Hybrid):
-        return features_first(field.physics) or features_first(field.residual)
-    if isinstance(field, Blend):
-        return any(map(features_first, field.fields))
-    return features_first(field.field) if isinstance(field, Frozen) else getattr(field, "accepts_batch", False)
-
-
-def unfreeze(field: AbstractVectorField) -> AbstractVectorField:
-    """The field without its `Frozen` wrappers.
-
-    Args:
-        field: any field; parts of it may be frozen, or all.
-    """
-
-    def frozen(node) -> bool:
-        return isinstance(node, Frozen)
-
-    return jax.tree.map(lambda node: unfreeze(node.field) if frozen(node) else node, field, is_leaf=frozen)
 
 
 def trainable(field: Any) -> Any:
@@ -368,7 +189,7 @@ def trainable(field: Any) -> Any:
     """
 
     def fixed(node) -> bool:
-        return isinstance(node, RunningStats | Frozen)
+        return isinstance(node, RunningStats | AbstractInferenceOnly)
 
     return jax.tree.map(lambda node: not fixed(node) and eqx.is_inexact_array(node), field, is_leaf=fixed)
 
@@ -378,25 +199,3 @@ def ravel_learned(field: Any) -> tuple[Float[Array, " p"], Callable[[Float[Array
     learned, rest = eqx.partition(field, trainable(field))
     theta, unravel = ravel_pytree(learned)
     return theta, lambda theta: eqx.combine(unravel(theta), rest)
-
-
-def check_batch_norm(
-    field: AbstractVectorField, x: Float[Array | np.ndarray, "d b"], u: Float[Array | np.ndarray, "m b"]
-) -> None:
-    """Refuse a field whose batch normalisation would be trained, but whose running statistics could not be.
-
-    Raises:
-        ValueError: at any x and u it does not evaluate a `BatchNorm` that it holds, or hides it from differentiation.
-    """
-    if _is_wrapped(field) and not all(all(count.tolist()) for count, *_ in moments_of(field, x, u)):
-        raise ValueError(
-            f"field: {type(field).__name__} holds a BatchNorm whose minibatch statistics cannot be recorded, as under "
-            "stop_gradient or jax.grad; use norm='layer' or 'none', or wrap it in Frozen"
-        )
-
-
-def _is_wrapped(field) -> bool:
-    """Whether a module of which the library knows nothing stands around a batch normalisation."""
-    if getattr(type(field), "update_running_stats", None) in (None, AbstractVectorField.update_running_stats):
-        return bool(batch_norms(field))
-    return any(_is_wrapped(part) for part in vars(field).values() if isinstance(part, AbstractVectorField))

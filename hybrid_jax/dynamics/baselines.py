@@ -9,7 +9,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, AbstractWrapper
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import AbstractWrapper
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.state import BODY_RATES, QUATERNION, VELOCITY
 

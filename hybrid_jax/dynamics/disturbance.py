@@ -13,7 +13,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, state_space
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.composition import Hybrid
 
 
 class ConstantDisturbance(AbstractVectorField):

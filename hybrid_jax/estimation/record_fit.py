@@ -16,7 +16,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import Frozen, ravel_learned, trainable
+from hybrid_jax.dynamics.base import ravel_learned, trainable
+from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import record_search, shooting, uncertainty

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, infer_batch
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.integrate import Derivative, check_field, rk4_step
 from hybrid_jax.networks import smoothed
 from hybrid_jax.state import STATE_SIZE
@@ -32,7 +32,7 @@ def program_of(
     field = prepared(field, likes, smooth)
 
     def of_rows(x, u):
-        return jnp.moveaxis(infer_batch(field, jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
+        return jnp.moveaxis(as_field(field).infer_batch(jnp.moveaxis(x, 0, -1), jnp.moveaxis(u, 0, -1)), -1, 0)
 
     derivative = of_rows if batched else field
     whole = derivative if dt is None else partial(rk4_step, derivative, dt=dt)

@@ -12,7 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, apply_residual
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.equations import derivative
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.dynamics.terms import Terms
@@ -113,7 +114,7 @@ class KernelField(NamedTuple):
     def _output_layer(self, network: ResidualNetwork, x: Float[Array, "d b"]) -> list[Array]:
         """W₂ and b₂ with what scaling and physics do to the network's output, which are factors of its rows."""
         layer = [network.scaling.outputs(part) for part in (network.weight_out, network.bias_out)]
-        return layer if self.physics is None else [apply_residual(self.physics, x, part) for part in layer]
+        return layer if self.physics is None else [as_field(self.physics).apply_residual(x, part) for part in layer]
 
 
 def _input_scaling(network: ResidualNetwork, d: int) -> tuple[Float[Array, " m"], Float[Array, " m"]]:

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, parameter_columns, train_batch, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.grids import Grid
 from hybrid_jax.networks.mlp import ResidualNetwork, residual_network
 from hybrid_jax.networks.normalisation import AbstractScaling
@@ -51,7 +51,9 @@ class GridNetwork(AbstractVectorField):
         return self(x, u), columns.reshape(-1, dx.shape[1])
 
     def parameter_columns(self, x, u):
-        found = jax.vmap(lambda near, held: parameter_columns(self.network, near, held), 1, 1)(*self.points(x, u))
+        found = jax.vmap(lambda near, held: as_field(self.network).parameter_columns(near, held), 1, 1)(
+            *self.points(x, u)
+        )
         return found.reshape(-1, found.shape[-1])
 
     def points(self, x: Float[Array, " d *b"], u: Float[Array, " m *b"]) -> tuple[Array, Array]:
@@ -71,12 +73,12 @@ class GridNetwork(AbstractVectorField):
     def train_batch(self, x, u):
         @jax.checkpoint
         def evaluate(network, x, u):
-            return train_batch(network, *self.points(x, u)).reshape(x.shape)
+            return as_field(network).train_batch(*self.points(x, u)).reshape(x.shape)
 
         return evaluate(self.network, x, u)
 
     def update_running_stats(self, x, u):
-        moved = update_running_stats(self.network, *self.points(x, u))
+        moved = as_field(self.network).update_running_stats(*self.points(x, u))
         return eqx.tree_at(lambda field: field.network, self, moved)
 
 

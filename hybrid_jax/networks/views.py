@@ -12,7 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from hybrid_jax import checks, rotation
-from hybrid_jax.dynamics.base import AbstractVectorField, AbstractWrapper, fuse_for_inference, jvp_columns
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, jvp_columns
+from hybrid_jax.dynamics.composition import AbstractWrapper
 from hybrid_jax.dynamics.equations import dot
 from hybrid_jax.state import BODY_RATES, INPUT_SIZE, POSITION, QUATERNION, STATE_SIZE, VELOCITY
 from hybrid_jax.vehicle import Vehicle
@@ -143,7 +144,7 @@ class RotorThrust(AbstractVectorField):
         return self.write(x, u, self.share(self.read(x), u))
 
     def fuse_for_inference(self):
-        return RotorThrust(fuse_for_inference(self.field), self.vehicle)
+        return RotorThrust(as_field(self.field).fuse_for_inference(), self.vehicle)
 
     def linearize(self, x, u, dx, du):
         """Two derivatives of the network for each rotor, whatever the number of directions."""

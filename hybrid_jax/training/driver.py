@@ -15,7 +15,8 @@ import optax
 from jaxtyping import Array, Float, PRNGKeyArray, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, check_batch_norm, check_windows, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainable
+from hybrid_jax.dynamics.composition import check_batch_norm
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling

@@ -10,7 +10,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import Hybrid, train_batch
+from hybrid_jax.dynamics.base import as_field
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import RK4, along
 from hybrid_jax.rollouts import rollout_minibatch
 
@@ -70,7 +71,7 @@ REGULARISERS: dict[str, Regulariser] = {
 
 def _parts(field: Hybrid, batch: Minibatch, predicted: Float[Array, "t d b"]) -> list[Float[Array, "d s"]]:
     x, u = along(batch.x0, predicted, batch.u)
-    return [train_batch(part, x, u) for part in (field.physics, field.residual)]
+    return [as_field(part).train_batch(x, u) for part in (field.physics, field.residual)]
 
 
 def _unit(columns: Float[Array, "d b"]) -> Float[Array, "d b"]:

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks, kernels
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, update_running_stats
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.batching import batch_norms
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import RK4, along, check_solver
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.rollouts import rollout_minibatch
@@ -105,7 +106,7 @@ class TrajectoryLoss(Objective):
         return jnp.mean(jnp.mean(jnp.sum(jnp.square(difference), axis=1), axis=0))
 
     def observe(self, field: AbstractVectorField, batch: Minibatch, seen: Float[Array, "t d b"]) -> AbstractVectorField:
-        return update_running_stats(field, *along(batch.x0, seen, batch.u))
+        return as_field(field).update_running_stats(*along(batch.x0, seen, batch.u))
 
     def validate(self, field: AbstractVectorField, data: Trajectories, settings: "Settings") -> Float[Array, ""]:
         return rollout_mse(field, data, solver=settings.solver)

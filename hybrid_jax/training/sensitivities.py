@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, linearize, parameter_columns, ravel_learned
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field, ravel_learned
 from hybrid_jax.integrate import RK4, Solver, integrate
 
 Columns = Float[Array, "t d p"]  # of the states at the end of each interval, in the order of the leaves of the field
@@ -27,8 +27,8 @@ def with_sensitivities(
 
     def slopes(both: Float[Array, "d 1+p"], held):
         x, columns = both[:, 0], both[:, 1:]
-        value, moved = linearize(field, x, held, columns, jnp.zeros((len(held), theta.size), held.dtype))
-        return jnp.concatenate([value[:, None], moved + parameter_columns(field, x, held)], axis=1)
+        value, moved = as_field(field).linearize(x, held, columns, jnp.zeros((len(held), theta.size), held.dtype))
+        return jnp.concatenate([value[:, None], moved + as_field(field).parameter_columns(x, held)], axis=1)
 
     start = jnp.concatenate([x0[:, None], jnp.zeros((len(x0), theta.size), x0.dtype)], axis=1)
     both = integrate(slopes, start, u, dt, solver)

@@ -5,9 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluations import infer_batch, train_batch
 
 from hybrid_jax.dynamics import base
 from hybrid_jax.dynamics.batching import like
+from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid, check_batch_norm
 from hybrid_jax.integrate import RK4
 from hybrid_jax.networks.mlp import residual_network
 from hybrid_jax.rollouts import rollout_minibatch
@@ -65,7 +67,7 @@ def trained(field):
     def loss(field):
         return jnp.sum(jnp.square(rollout_minibatch(field, x, u, 0.1, RK4())))
 
-    return *eqx.filter_value_and_grad(loss)(field), base.update_running_stats(field, x, u[0])
+    return *eqx.filter_value_and_grad(loss)(field), base.as_field(field).update_running_stats(x, u[0])
 
 
 def assert_trained_alike(field, other):
@@ -76,39 +78,41 @@ def assert_trained_alike(field, other):
 
 @pytest.mark.parametrize("how", [how for how in CALLS if how not in HIDDEN_FROM_DERIVATIVES])
 def test_a_wrapped_network_is_trained_as_the_bare_one(how):
-    base.check_batch_norm(Gain(network(), how=how), *(part[..., :2] for part in (batch()[0], batch()[1][0])))
+    check_batch_norm(Gain(network(), how=how), *(part[..., :2] for part in (batch()[0], batch()[1][0])))
     assert_trained_alike(Gain(network(), how=how), network())
 
 
 def test_nested_wrappers_and_several_networks_are_trained_as_their_hybrid():
-    assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), base.Hybrid(network(1), network(2)))
+    assert_trained_alike(Sum([Gain(Gain(network(1))), network(2)]), Hybrid(network(1), network(2)))
 
 
 def test_a_blend_is_the_mean_of_its_fields():
-    (x, u), fields = batch(), (base.Hybrid(network(1), network(2)), Gain(network(3)))
-    blend = base.Blend(fields)
-    for evaluate in (base.train_batch, base.infer_batch):
+    (x, u), fields = batch(), (Hybrid(network(1), network(2)), Gain(network(3)))
+    blend = Blend(fields)
+    for evaluate in (train_batch, infer_batch):
         parts = [evaluate(field, x, u[0]) for field in fields]
         np.testing.assert_allclose(evaluate(blend, x, u[0]), np.mean(parts, axis=0), rtol=1e-11)
     at, ways = (x[:, 0], u[0, :, 0]), (jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
-    parts = zip(*(base.linearize(field, *at, *ways) for field in fields), strict=True)
-    for found, part in zip(base.linearize(blend, *at, *ways), parts, strict=True):
+    parts = zip(*(base.as_field(field).linearize(*at, *ways) for field in fields), strict=True)
+    for found, part in zip(base.as_field(blend).linearize(*at, *ways), parts, strict=True):
         np.testing.assert_allclose(found, np.mean(part, axis=0), rtol=1e-11)
-    assert_trained_alike(base.Blend((network(), network())), base.Blend((Gain(network()), network())))
+    assert_trained_alike(Blend((network(), network())), Blend((Gain(network()), network())))
 
 
 def test_a_frozen_network_in_a_wrapper_stays_in_inference_mode():
-    (x, u), field = batch(), Gain(base.Frozen(network()))
-    np.testing.assert_allclose(base.train_batch(field, x, u[0]), base.infer_batch(network(), x, u[0]), rtol=1e-12)
-    assert eqx.tree_equal(base.update_running_stats(field, x, u[0]), field)
+    (x, u), field = batch(), Gain(Frozen(network()))
+    np.testing.assert_allclose(
+        base.as_field(field).train_batch(x, u[0]), base.as_field(network()).infer_batch(x, u[0]), rtol=1e-12
+    )
+    assert eqx.tree_equal(base.as_field(field).update_running_stats(x, u[0]), field)
 
 
 @pytest.mark.parametrize("how", HIDDEN_FROM_DERIVATIVES)
 def test_statistics_that_cannot_be_recorded_are_refused(how):
     x, u = batch()
     with pytest.raises(ValueError, match="field: Gain holds a BatchNorm whose minibatch statistics cannot be recorded"):
-        base.check_batch_norm(Gain(network(), how=how), x, u[0])
-    base.check_batch_norm(Gain(base.Frozen(network()), how=how), x, u[0])
+        check_batch_norm(Gain(network(), how=how), x, u[0])
+    check_batch_norm(Gain(Frozen(network()), how=how), x, u[0])
 
 
 def test_a_function_is_a_field():
@@ -116,12 +120,12 @@ def test_a_function_is_a_field():
         return -x + u[0]
 
     x, u = batch()
-    for evaluate in (base.train_batch, base.infer_batch):
+    for evaluate in (train_batch, infer_batch):
         np.testing.assert_allclose(evaluate(field, x, u[0]), field(x, u[0]), rtol=1e-12)
-    value, slope = base.linearize(field, x[:, 0], u[0, :, 0], jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
+    value, slope = base.as_field(field).linearize(x[:, 0], u[0, :, 0], jnp.eye(STATES), jnp.zeros((INPUTS, STATES)))
     np.testing.assert_allclose(value, field(x[:, 0], u[0, :, 0]), rtol=1e-12)
     np.testing.assert_array_equal(slope, -np.eye(STATES))
-    assert base.update_running_stats(field, x, u[0]) is base.fuse_for_inference(field) is field
+    assert base.as_field(field).update_running_stats(x, u[0]) is base.as_field(field).fuse_for_inference() is field
 
 
 @pytest.mark.parametrize("start", [jnp.zeros(3), jnp.int32(2), jax.random.key(0)], ids=["zeros", "count", "key"])

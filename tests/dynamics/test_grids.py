@@ -11,7 +11,7 @@ import pytest
 
 import hybrid_jax as hj
 from hybrid_jax.adaptation import METHODS
-from hybrid_jax.dynamics.base import train_batch
+from hybrid_jax.dynamics.base import as_field
 from hybrid_jax.dynamics.disturbance import disturbance_of, with_disturbance
 from hybrid_jax.export import casadi_function, export_program, load_program
 from hybrid_jax.training.channels import scaled_loss
@@ -63,7 +63,7 @@ def test_a_network_on_a_grid_moves_with_the_state(kernel, input_size):
 
     @jax.jit
     def evaluated(x, u):
-        slopes = train_batch(network, x, u), train_batch(network, shifted(x), u)
+        slopes = as_field(network).train_batch(x, u), as_field(network).train_batch(shifted(x), u)
         return slopes, network(x[:, 1], u[:, 1]), jax.jacobian(network)(x[:, 0], u[:, 0])
 
     (slope, of_shifted), alone, effect = evaluated(x, u)

@@ -6,11 +6,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluations import infer_batch, train_batch
 from matrices import newton_euler
 from systems import ODD
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import HoldState
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import Terms
 from hybrid_jax.integrate import rollout

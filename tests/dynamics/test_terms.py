@@ -7,12 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluations import infer_batch, train_batch
 from jax.flatten_util import ravel_pytree
 from matrices import newton_euler
 
 from hybrid_jax import Hybrid, load, rotation, save
-from hybrid_jax.dynamics.base import Frozen, infer_batch, state_space, train_batch, trainable
+from hybrid_jax.dynamics.base import state_space, trainable
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE, RigidBody, rigid_body, with_vehicle
 from hybrid_jax.dynamics.terms import SHAPES, SIGNED, Terms

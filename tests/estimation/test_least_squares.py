@@ -8,7 +8,8 @@ import pytest
 from pendulum import LENGTH, Brake, log_lengths, pendulum, swings
 from pushes import Push, pushes
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_parameters
 from hybrid_jax.integrate import rollout_batch

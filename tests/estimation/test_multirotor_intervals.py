@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pushes import Push, pushes
 
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import with_disturbance
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares

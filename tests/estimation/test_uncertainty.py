@@ -14,7 +14,8 @@ from rich.console import Console
 
 from experiments.paper import known_body
 from experiments.paper.known_body import KnownBody, coverage, known_body_table
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.estimation.uncertainty import covariance_of, intervals

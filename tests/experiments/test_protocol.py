@@ -18,7 +18,7 @@ from experiments.paper.lanes import fit_of
 from experiments.paper.study import SOLVED, drawn_splits, placeholder, pretrained, target_splits
 from experiments.runner.cache import sweep_identity
 from experiments.runner.stages import stages_of
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.io.datasets import Dataset
 from hybrid_jax.sim.flight import SplitSpec
 from hybrid_jax.sweep.lanes import lane

@@ -10,8 +10,9 @@ import numpy as np
 from choices import PAIRS
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Blend, Frozen, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
+from hybrid_jax.dynamics.composition import Blend, Frozen, Hybrid
 from hybrid_jax.dynamics.rigid_body import RigidBody, perturbed, rigid_body
 from hybrid_jax.dynamics.terms import SHAPES, Terms
 from hybrid_jax.networks.factory import make_residual

@@ -9,7 +9,7 @@ from compiled import Library, needs_compiler
 from fields import FIELDS, KEY, body, double, field_of, samples
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.export import export_c
 from hybrid_jax.integrate import rk4_step
 from hybrid_jax.networks import make_residual, smoothed

@@ -5,9 +5,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluations import infer_batch, train_batch
 
 from hybrid_jax import Trajectories, rigid_body, rotation
-from hybrid_jax.dynamics.base import infer_batch, train_batch
 from hybrid_jax.dynamics.baselines import FrozenRates, HoldState
 from hybrid_jax.flights.scores import errors_between, flight_errors
 from hybrid_jax.integrate import rollout_batch

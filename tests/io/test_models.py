@@ -8,7 +8,7 @@ import surface
 from pendulum import pendulum
 
 from hybrid_jax import IRIS, Hybrid, load, residual_network, rollout_batch, save
-from hybrid_jax.dynamics.base import Blend
+from hybrid_jax.dynamics.composition import Blend
 from hybrid_jax.dynamics.rigid_body import perturbed
 from hybrid_jax.io import models
 from hybrid_jax.io.archive import save_archive, to_numpy

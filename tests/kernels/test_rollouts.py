@@ -12,7 +12,7 @@ from systems import ODD
 
 from benchmarks.subjects import DT, untrained
 from hybrid_jax import kernels, rollouts
-from hybrid_jax.dynamics.base import Hybrid
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.integrate import RK4, integrate, rollout_batch
 from hybrid_jax.kernels import library

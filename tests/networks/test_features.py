@@ -8,9 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from choices import PAIRS, mostly_slow, slow
+from evaluations import train_batch
 
 from hybrid_jax import Hybrid, load, residual_network, rigid_body, rotation, save
 from hybrid_jax.dynamics import base
+from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.networks import factory, views
 from hybrid_jax.networks.factory import make_residual
 from hybrid_jax.networks.mlp import InputScaling, zero_output
@@ -161,7 +163,7 @@ def test_a_silenced_network_says_nothing_and_can_learn(inputs, outputs):
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
     field, (x, u) = view(inputs, outputs, linear=True), samples()
-    assert (base.train_batch(field, x, u) == 0).all()
+    assert (field.train_batch(x, u) == 0).all()
     slope = eqx.filter_grad(lambda residual: jnp.sum(deployed(residual, x, u)))(field)
     path = network_of(slope)
     assert (path.weight != 0).any()
@@ -174,7 +176,7 @@ def test_a_linear_path_begins_silent_and_can_learn(inputs, outputs):
 @pytest.mark.parametrize("inputs", factory.INPUTS)
 def test_what_accelerations_do_not_write_is_left_to_physics(inputs, outputs, written):
     field, (x, u) = view(inputs, outputs), samples()
-    for evaluate in (deployed, base.train_batch):
+    for evaluate in (deployed, train_batch):
         derivative = evaluate(field, x, u)
         assert (derivative[:-written] == 0).all()
         assert (jnp.abs(derivative[-written:]).max(1) > 1e-3).all()
@@ -200,7 +202,7 @@ def test_isotropic_drag_is_the_same_seen_from_the_body():
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))
 def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     field, (x, u) = view(inputs, outputs), samples(20)
-    trained = base.train_batch(field, x, u)
+    trained = field.train_batch(x, u)
     assert jnp.abs(trained - deployed(field, x, u)).max() > 1e-2
 
     def seen(node, x):
@@ -211,7 +213,7 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
     here = base.RunningStats(hidden.mean(1), hidden.var(1))
     exact = eqx.tree_at(lambda field: network_of(field).norm.running, field, here)
     np.testing.assert_allclose(trained, deployed(exact, x, u), atol=1e-12)
-    running = network_of(base.update_running_stats(field, x, u)).norm.running
+    running = network_of(field.update_running_stats(x, u)).norm.running
     np.testing.assert_allclose(running.mean, 0.1 * here.mean, atol=1e-12)
     np.testing.assert_allclose(running.variance, 0.9 + 0.1 * here.variance, atol=1e-12)
 
@@ -221,8 +223,8 @@ def test_in_training_a_view_sees_the_minibatch(inputs, outputs):
 def test_deployed_on_columns_is_deployed_on_each(inputs, outputs, norm):
     x, u = samples()
     for field in (view(inputs, outputs, norm=norm), Hybrid(rigid_body(IRIS), view(inputs, outputs, norm=norm))):
-        for same in (field, base.Frozen(field)):
-            np.testing.assert_allclose(base.infer_batch(same, x, u), deployed(field, x, u), rtol=0, atol=1e-11)
+        for same in (field, Frozen(field)):
+            np.testing.assert_allclose(same.infer_batch(x, u), deployed(field, x, u), rtol=0, atol=1e-11)
 
 
 @pytest.mark.parametrize(("inputs", "outputs"), mostly_slow(VIEWS))

@@ -8,9 +8,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from evaluations import infer_batch, train_batch
 
 from hybrid_jax import load, save
 from hybrid_jax.dynamics import base
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.networks.activations import SmoothRelu
 from hybrid_jax.networks.mlp import (
     FusedNetwork,
@@ -76,8 +78,8 @@ def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(activation)
             return jax.jit(jax.grad(lambda p: jnp.sum(weights * formula(*eqx.combine(p, rest)))))(parameters)
 
         formula = partial(plain, activation=PLAIN[activation])
-        np.testing.assert_allclose(base.train_batch(field, x, u), formula(field, x, u), rtol=0, atol=1e-12)
-        found, expected = (jax.tree.leaves(gradients(one)) for one in (base.train_batch, formula))
+        np.testing.assert_allclose(field.train_batch(x, u), formula(field, x, u), rtol=0, atol=1e-12)
+        found, expected = (jax.tree.leaves(gradients(one)) for one in (train_batch, formula))
         assert len(found) == len(expected) == 9  # four weights, gain … running statistics (zero), x, u
         for one, other in zip(found, expected, strict=True):
             # Round-off of float64 on gradients of up to about 100.
@@ -89,10 +91,10 @@ def test_the_derivative_written_by_hand_is_that_of_the_plain_formula(activation)
 def test_what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is_its_file(activation, tmp_path):
     with jax.enable_x64(True):
         field, (x, u) = network(activation=activation), (part[:, 0] for part in batch())
-        fused = base.fuse_for_inference(field)
+        fused = field.fuse_for_inference()
         assert isinstance(fused, FusedNetwork)
         directions = jnp.eye(STATES + INPUTS)
-        value, slopes = base.linearize(fused, x, u, directions[:STATES], directions[STATES:])
+        value, slopes = fused.linearize(x, u, directions[:STATES], directions[STATES:])
         np.testing.assert_allclose(value, field(x, u), rtol=0, atol=1e-12)
         np.testing.assert_allclose(slopes, jnp.hstack(jax.jacfwd(field, (0, 1))(x, u)), rtol=0, atol=1e-12)
         save(tmp_path / "field.npz", fused)
@@ -102,7 +104,7 @@ def test_what_few_samples_use_is_the_same_network_with_the_same_slopes_and_so_is
 @pytest.mark.parametrize("beta", [3.0, 30.0])
 def test_a_smoothed_network_is_as_near_as_beta_says_and_only_relu_is_smoothed(beta, tmp_path):
     field, (x, u) = network(), batch()
-    smooth = smoothed(base.Hybrid(field, network(activation="tanh")), beta)
+    smooth = smoothed(Hybrid(field, network(activation="tanh")), beta)
     off = smooth.physics(x, u) - field(x, u)
     # Each hidden unit is between 0 and 1/(2β) above ReLU.
     assert (jnp.abs(off) <= jnp.abs(field.weight_out).sum(axis=1)[:, None] / (2 * beta) + 1e-5).all()
@@ -130,7 +132,7 @@ def test_in_training_hidden_units_have_mean_zero_and_variance_one():
             jnp.concatenate([inner, -inner]), both, jnp.hstack([jnp.eye(STATES), -jnp.eye(STATES)]), jnp.zeros(STATES)
         )
         x, u = batch(columns=50)
-        normalised = np.asarray(base.train_batch(field, x, u))
+        normalised = np.asarray(field.train_batch(x, u))
         variance = np.asarray(inner @ jnp.concatenate([x, u])).var(1)
         np.testing.assert_allclose(normalised.mean(1), 0, atol=1e-13)
         np.testing.assert_allclose(normalised.var(1), variance / (variance + 1e-5), rtol=1e-12)
@@ -143,7 +145,7 @@ def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
         target = base.RunningStats(hidden.mean(1), hidden.var(1))
         before, observed = field.norm.running, field
         for _ in range(20):
-            observed = base.update_running_stats(observed, x, u)
+            observed = observed.update_running_stats(x, u)
         for name in ("mean", "variance"):
             start, end, goal = (getattr(each, name) for each in (before, observed.norm.running, target))
             np.testing.assert_allclose(end - goal, 0.9**20 * (start - goal), rtol=0, atol=1e-12)
@@ -154,7 +156,7 @@ def test_running_statistics_approach_the_batch_by_a_tenth_each_time():
 def test_a_hidden_unit_that_never_varies_stays_finite_in_value_and_gradient():
     field = network()
     x, u = jnp.ones((STATES, COLUMNS)), jnp.ones((INPUTS, COLUMNS))
-    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(base.train_batch(field, x, u))))(x)
+    value, slope = jax.jit(jax.value_and_grad(lambda x: jnp.sum(field.train_batch(x, u))))(x)
     assert jnp.isfinite(value)
     assert jnp.isfinite(slope).all()
 
@@ -165,16 +167,14 @@ def test_a_linear_path_adds_its_map_in_training_and_in_deployment():
         weight = jax.random.normal(jax.random.key(3), (STATES, STATES + INPUTS))
         path = LinearSkip(weight, field)
         line = weight @ jnp.concatenate([x, (u - 2) / 3])
-        for evaluate in (base.train_batch, base.infer_batch):
+        for evaluate in (train_batch, infer_batch):
             np.testing.assert_allclose(evaluate(path, x, u), evaluate(field, x, u) + line, rtol=0, atol=1e-12)
-        assert eqx.tree_equal(
-            base.update_running_stats(path, x, u), LinearSkip(weight, base.update_running_stats(field, x, u))
-        )
+        assert eqx.tree_equal(path.update_running_stats(x, u), LinearSkip(weight, field.update_running_stats(x, u)))
         assert sum(jax.tree.leaves(base.trainable(path))) == 1 + sum(jax.tree.leaves(base.trainable(field)))
 
 
 def test_running_statistics_are_not_trainable_and_all_else_is():
-    marks = base.trainable(base.Hybrid(network(), network()))
+    marks = base.trainable(Hybrid(network(), network()))
     for part in (marks.physics, marks.residual):
         assert jax.tree.leaves(part.norm.running) == [False]
         assert jax.tree.leaves(eqx.tree_at(lambda part: part.norm.running, part, None)) == [True] * 5
@@ -212,10 +212,10 @@ def test_without_a_batch_s_statistics_training_is_deployment_and_both_the_plain_
         field, (x, u) = unbatched(norm), batch()
         expected = jnp.stack([plain_one(field, x[:, i], u[:, i]) for i in range(COLUMNS)], axis=1)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
-        np.testing.assert_allclose(base.train_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(field.train_batch(x, u), expected, rtol=0, atol=1e-12)
         # A sample's result does not depend on its neighbours, and nothing is remembered of them.
-        np.testing.assert_allclose(base.train_batch(field, x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
-        assert eqx.tree_equal(base.update_running_stats(field, x, u), field)
+        np.testing.assert_allclose(field.train_batch(x[:, :3], u[:, :3]), expected[:, :3], rtol=0, atol=1e-12)
+        assert eqx.tree_equal(field.update_running_stats(x, u), field)
 
 
 @pytest.mark.parametrize("norm", ["layer", "none"])
@@ -226,7 +226,7 @@ def test_the_gradient_of_a_minibatch_is_that_of_its_samples_one_by_one(norm):
         def one_by_one(field):
             return sum(jnp.sum(plain_one(field, x[:, i], u[:, i]) ** 2) for i in range(3))
 
-        found = jax.grad(lambda field: jnp.sum(base.train_batch(field, x[:, :3], u[:, :3]) ** 2))(field)
+        found = jax.grad(lambda field: jnp.sum(field.train_batch(x[:, :3], u[:, :3]) ** 2))(field)
         for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(jax.grad(one_by_one)(field)), strict=True):
             np.testing.assert_allclose(one, other, rtol=1e-10, atol=1e-10)  # round-off of float64
         assert all(jax.tree.leaves(base.trainable(field)))
@@ -251,7 +251,7 @@ def test_a_linear_residual_is_linear_for_one_sample_and_for_a_batch():
         rng = np.random.default_rng(0)
         field, (x, u) = LinearResidual(jnp.asarray(rng.normal(size=(5, 7))), jnp.asarray(rng.normal(size=5))), batch()
         expected = np.asarray(field.weight) @ np.concatenate([x, u]) + np.asarray(field.bias)[:, None]
-        np.testing.assert_allclose(base.train_batch(field, x, u), expected, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(field.train_batch(x, u), expected, rtol=0, atol=1e-12)
         np.testing.assert_allclose(jax.vmap(field, -1, -1)(x, u), expected, rtol=0, atol=1e-12)
 
 
@@ -267,8 +267,8 @@ def test_a_network_is_deployed_as_the_same_map(linear, norm, sizes, shape):
     field = LinearSkip(jnp.asarray(rng.normal(size=(3, sum(sizes)))), network) if linear else network
     field = jax.tree.map(lambda leaf: leaf + rng.uniform(0.1, 1.0, leaf.shape), field)
     x, u = (jnp.asarray(rng.normal(size=(size, *shape))) for size in sizes)
-    np.testing.assert_allclose(base.fuse_for_inference(field)(x, u), field(x, u), rtol=1e-5, atol=1e-5)
-    assert isinstance(base.fuse_for_inference(field), FusedNetwork) == (norm != "layer")
+    np.testing.assert_allclose(field.fuse_for_inference()(x, u), field(x, u), rtol=1e-5, atol=1e-5)
+    assert isinstance(field.fuse_for_inference(), FusedNetwork) == (norm != "layer")
 
 
 @pytest.mark.parametrize("shape", [(), (7,)], ids=["sample", "batch"])

@@ -6,9 +6,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from choices import mostly_slow
+from evaluations import infer_batch, train_batch
 
 from hybrid_jax import load, rotation, save
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid, infer_batch, train_batch
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.networks.factory import INPUTS, make_residual
 from hybrid_jax.networks.mlp import InputScaling, ResidualNetwork, residual_network
@@ -85,7 +87,7 @@ def test_beside_any_network_it_begins_silent_learns_and_survives_a_file(inputs, 
     (x, u), field = samples(), make_residual(KEY, outputs=outputs, **known)
     alone = make_residual(KEY, outputs="accelerations", **known)
     np.testing.assert_array_equal(deployed(field, x, u), deployed(alone, x, u))
-    slope = eqx.filter_grad(lambda residual: jnp.sum(train_batch(residual, x, u)))(field)
+    slope = eqx.filter_grad(lambda residual: jnp.sum(residual.train_batch(x, u)))(field)
     assert (slope.physics.field.weight_out != 0).any()
     moved = Hybrid(rigid_body(IRIS), jax.tree.map(lambda leaf: leaf + 0.1, field))
     save(tmp_path / "model.npz", moved)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from pendulum import pendulum
 
-from hybrid_jax.dynamics.base import AbstractVectorField, Hybrid
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.integrate import RK4, along, rollout_batch
 from hybrid_jax.networks.mlp import residual_network, zero_output
 from hybrid_jax.rollouts import rollout_minibatch

@@ -12,7 +12,7 @@ from pendulum import pendulum
 
 import hybrid_jax as hj
 from experiments.reaction_diffusion.systems import Conversion, gray_scott
-from hybrid_jax.dynamics.base import linearize, ravel_learned
+from hybrid_jax.dynamics.base import as_field, ravel_learned
 from hybrid_jax.integrate import RK4, integrate
 from hybrid_jax.networks.grids import GridNetwork
 from hybrid_jax.training.sensitivities import with_sensitivities
@@ -90,7 +90,7 @@ def test_columns_are_those_of_the_state_and_the_input(name):
     @jax.jit
     def both(x, u, dx, du):
         expected = jax.vmap(lambda dx, du: jax.jvp(field, (x, u), (dx, du))[1], -1, -1)(dx, du)
-        return linearize(field, x, u, dx, du), (field(x, u), expected)
+        return as_field(field).linearize(x, u, dx, du), (field(x, u), expected)
 
     for found, expected in zip(*both(x, u, dx, du), strict=True):
         assert difference(found, expected) < 1e-5

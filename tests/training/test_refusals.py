@@ -10,7 +10,8 @@ import pytest
 from pendulum import pendulum, swings
 
 from hybrid_jax import IRIS, Hybrid, Model, Settings, fit, residual_network
-from hybrid_jax.dynamics.base import AbstractVectorField, Frozen
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.rigid_body import rigid_body
 from hybrid_jax.sweep.lanes import stack
 from hybrid_jax.sweep.training import sweep

@@ -10,7 +10,6 @@ import pytest
 from systems import SYSTEMS, Gain
 
 import hybrid_jax as hj
-from hybrid_jax.dynamics.base import fuse_for_inference, infer_batch, linearize
 from hybrid_jax.networks.mlp import LinearSkip
 from hybrid_jax.networks.normalisation import ChannelScaling, InputScaling
 from hybrid_jax.networks.standardise import with_scaling
@@ -70,13 +69,13 @@ def test_every_way_to_evaluate_a_scaled_network_agrees(skip):
     field = LinearSkip(jax.random.normal(KEY, (6, 8)), field) if skip else field
     x, u = car().test.x0, car().test.u[:, 0]
     expected = jax.vmap(field)(x, u)
-    np.testing.assert_allclose(infer_batch(field, x.T, u.T).T, expected, rtol=1e-4, atol=1e-5)
-    fused = fuse_for_inference(field)
+    np.testing.assert_allclose(field.infer_batch(x.T, u.T).T, expected, rtol=1e-4, atol=1e-5)
+    fused = field.fuse_for_inference()
     assert type(fused) is not type(field)
     np.testing.assert_allclose(jax.vmap(fused)(x, u), expected, rtol=1e-4, atol=1e-5)
     dx, du = jnp.eye(6, 8), jnp.eye(2, 8, 6)
     for i in range(3):
-        for a, b in zip(linearize(fused, x[i], u[i], dx, du), linearize(field, x[i], u[i], dx, du), strict=True):
+        for a, b in zip(fused.linearize(x[i], u[i], dx, du), field.linearize(x[i], u[i], dx, du), strict=True):
             np.testing.assert_allclose(a, b, rtol=1e-4, atol=1e-5)
 
 

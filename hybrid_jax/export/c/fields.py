@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, fuse_for_inference, linearize
+from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.export.c.nodes import Entry, Statement
 from hybrid_jax.export.c.operations import CTranslation, column
 from hybrid_jax.export.c.printer import CPrinter
@@ -62,7 +62,7 @@ def export_c(
     # In double precision, so that constants are rounded once, when they are written.
     with jax.enable_x64(True):
         likes = [jax.ShapeDtypeStruct((size,), float) for size in (d, m)]
-        fused = fuse_for_inference(prepared(field, likes, smooth))
+        fused = as_field(prepared(field, likes, smooth)).fuse_for_inference()
         values = body_of(fused, likes, tables, ("xdot",))
         slopes = body_of(lambda x, u: _with_slopes(fused, x, u), likes, tables, ("xdot", "jacobian"))
     parts = printer.shared(tables, values, slopes) | {
@@ -94,7 +94,7 @@ def written(folder: str | Path, name: str, header: str, source: str, parts: Mapp
 def _with_slopes(field: AbstractVectorField, x, u):
     """ẋ, and its Jacobian in x and u (d × (d + m))."""
     directions = jnp.eye(len(x) + len(u))
-    return linearize(field, x, u, directions[: len(x)], directions[len(x) :])
+    return as_field(field).linearize(x, u, directions[: len(x)], directions[len(x) :])
 
 
 def body_of(
