@@ -1,50 +1,20 @@
-"""Twins of every format, written here byte by byte, are read as the flight they hold; damaged ones never end badly."""
+"""Twins of every format, written here byte by byte, are read as the flight they hold."""
 
 import gzip
 import os
-import resource
-import struct
-import time
-import zlib
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
-from surface import outcome, refusal
+from surface import refusal
+from writers import MOTORS, STATES, bag, blackbox, crazyflie, usd
 
 from hybrid_jax.flights import load_logs
-from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import COLUMNS
 from hybrid_jax.vehicle import IRIS
-
-STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
-STATES += ["stateEstimate.vz", *(f"stateEstimate.q{axis}" for axis in "wxyz"), "gyro.x", "gyro.y", "gyro.z"]
-MOTORS = [f"motor.m{i}" for i in range(1, 5)]
-
-
-def usd(columns, ticks, kinds=None):
-    """Bytes of a µSD log of one event type: name → values, and times in µs."""
-    names, kinds = list(columns), kinds or {}
-    head = struct.pack("<BHHH", 0xBC, 2, 1, 7) + b"fixedFrequency\0" + struct.pack("<H", len(names))
-    head += b"".join(f"{name}({kinds.get(name, 'f')})\0".encode() for name in names)
-    form = "<HQ" + "".join(kinds.get(name, "f") for name in names)
-    rows = zip(ticks.tolist(), *(np.asarray(columns[name]).tolist() for name in names), strict=True)
-    body = head + b"".join(struct.pack(form, 7, *row) for row in rows)
-    return body + struct.pack("<I", zlib.crc32(body))
-
-
-def crazyflie(flight, **changes):
-    x = flight.x.copy()
-    x[:, 10:] *= 180 / np.pi
-    columns = dict(zip(STATES, x[:, [0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 10, 11, 12]].T, strict=True))
-    motors = np.round(60 * flight.u).astype(int)
-    columns |= dict(zip(MOTORS, motors.T, strict=True)) | {"pm.vbatMV": 3700 + 0 * flight.t} | changes
-    return usd(columns, 10**9 + np.round(flight.t * 1e6).astype(int), dict.fromkeys(MOTORS, "H"))
 
 
 @pytest.fixture
@@ -130,37 +100,6 @@ def test_a_voltage_that_is_no_number_is_left_out_and_said(flight, written):
     refusal(lambda: read_recording(path), path, "gyro.x", "is nan at 5.01 s")
 
 
-def bag(folder, flight, plugin, second=None):
-    """A bag of ROS 2 with odometry, IMU, battery and rotors in rpm."""
-    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
-    store = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE)
-    kinds, zeros = {name.split("/")[-1]: kind for name, kind in store.types.items()}, np.zeros(36)
-    point, wxyz = kinds["Vector3"], lambda q: kinds["Quaternion"](*q[1:], q[0])
-    layout = kinds["MultiArrayLayout"](dim=[], data_offset=0)
-    with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin]) as writer:
-        named = {"/odom": "nav_msgs/msg/Odometry", "/imu": "sensor_msgs/msg/Imu"}
-        named |= {"/rotors": "std_msgs/msg/Float64MultiArray"} | ({second: "nav_msgs/msg/Odometry"} if second else {})
-        lines = {topic: writer.add_connection(topic, kind, typestore=store) for topic, kind in named.items()}
-
-        def write(topic, at, message):
-            writer.write(lines[topic], at, store.serialize_cdr(message, lines[topic].msgtype))
-
-        attitudes = flight.x[:, 3:7]
-        velocities = Rotation.from_quat(attitudes[:, [1, 2, 3, 0]]).inv().apply(flight.x[:, 7:10])
-        for t, x, q, turned, u in zip(flight.t, flight.x, attitudes, velocities, flight.u, strict=True):
-            at = 10**18 + round(t * 1e9)
-            stamp = kinds["Time"](sec=at // 10**9, nanosec=at % 10**9)
-            header = kinds["Header"](stamp=stamp, frame_id="")
-            pose = kinds["PoseWithCovariance"](kinds["Pose"](kinds["Point"](*x[:3]), wxyz(q)), zeros)
-            twist = kinds["TwistWithCovariance"](kinds["Twist"](point(*turned), point(*x[10:])), zeros)
-            for topic in ("/odom", *([second] if second else [])):
-                write(topic, at, kinds["Odometry"](header, "", pose, twist))
-            imu = (wxyz(q), zeros[:9], point(*x[10:]), zeros[:9], point(0.0, 0.0, 9.81), zeros[:9])
-            write("/imu", at, kinds["Imu"](header, *imu))
-            write("/rotors", at, kinds["Float64MultiArray"](layout, u * 30 / np.pi))
-    return folder
-
-
 @pytest.mark.parametrize("plugin", ["SQLITE3", "MCAP"])
 def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
     path = bag(tmp_path / "run", flight, plugin)
@@ -180,108 +119,45 @@ def test_a_bag_is_the_flight_it_holds(flight, tmp_path, plugin):
 
 
 def test_of_two_topics_one_is_chosen(flight, tmp_path):
-    path = bag(tmp_path / "run", flight[:20], "SQLITE3", second="/truth")
+    path = bag(tmp_path / "run", flight[:20], "SQLITE3", ("odom", "truth"))
     refusal(lambda: read_recording(path), path, "/odom and /truth hold odometry", 'topics={"odometry": "/odom"}')
     assert "position" in read_recording(path, topics={"odometry": "/truth"}).signals
 
 
-def test_messages_of_every_type_are_read(flight, tmp_path):
+ROTORS = {"motors": "/rotors:data:rpm"}
+PAIRS = [("pose", "twist"), ("covered", "velocity_local"), ("bare", "twist"), ("vicon", "velocity_local")]
+BAGS = [((*pair, "rotors"), ROTORS) for pair in PAIRS]
+BAGS += [(("pose", "speed", "rotors"), ROTORS | {"velocity": "/speed"})]
+BAGS += [(("world", "rotors"), ROTORS | {"velocity": "/world"}), (("local", "attitude", "gyro", "rotors"), ROTORS)]
+BAGS += [(("odom", "imu", "battery", "motors"), {})]
+
+
+@pytest.mark.parametrize(("names", "topics"), BAGS, ids=lambda each: "_".join(each))
+def test_messages_of_every_type_are_read(flight, tmp_path, names, topics):
     """What mavros, Vicon, Gazebo and PX4's own bridge record, each type beside rotors."""
-    rosbag2, typesys = pytest.importorskip("rosbags.rosbag2"), pytest.importorskip("rosbags.typesys")
-    store, few = typesys.get_typestore(typesys.Stores.ROS2_HUMBLE), flight[:150]
-    arrays = "uint64 timestamp\nfloat32[4] q\n", "uint64 timestamp\nfloat32[3] xyz\n"
-    for name, text in zip(("VehicleAttitude", "VehicleAngularVelocity"), arrays, strict=True):
-        store.register(typesys.get_types_from_msg(text, f"px4_msgs/msg/{name}"))
-    text = "uint64 timestamp\nfloat32 x\nfloat32 y\nfloat32 z\nfloat32 vx\nfloat32 vy\nfloat32 vz\n"
-    store.register(typesys.get_types_from_msg(text, "px4_msgs/msg/VehicleLocalPosition"))
-    kinds = {name.split("/")[-1]: kind for name, kind in store.types.items()}
-    body, world, zeros = BODIES["FRD"], WORLDS["NED"], np.zeros(36)
-    turns = Rotation.from_quat(np.roll(few.x[:, 3:7], -1, axis=1))
-    turned = np.roll(Rotation.from_matrix(world @ turns.as_matrix() @ body).as_quat(), 1, axis=1).astype(np.float32)
-    rolled = turns.apply(few.x[:, 10:])
-
-    def messages(i):
-        at = round(few.t[i] * 1e9) + 10**18
-        header = kinds["Header"](kinds["Time"](sec=at // 10**9, nanosec=at % 10**9), "map")
-        p, q, v, w = few.x[i, :3], few.x[i, 3:7], few.x[i, 7:10], few.x[i, 10:]
-        pose = kinds["Pose"](kinds["Point"](*p), kinds["Quaternion"](*q[1:], q[0]))
-        covered = kinds["PoseWithCovariance"](pose, zeros)
-        vector = kinds["Vector3"]
-        twist = kinds["Twist"](vector(*v), vector(*w))
-        moved = kinds["Twist"](vector(*v), vector(*rolled[i]))
-        transform = kinds["Transform"](vector(*p), pose.orientation)
-        ned, frd, us = (p @ world).astype(np.float32), (w @ body).astype(np.float32), at // 1000
-        vned = (v @ world).astype(np.float32)
-        yield at, "pose", kinds["PoseStamped"](header, pose)
-        yield at, "covered", kinds["PoseWithCovarianceStamped"](header, covered)
-        yield at, "vicon", kinds["TransformStamped"](header, "body", transform)
-        yield at, "velocity_local", kinds["TwistStamped"](header, twist)
-        yield at, "twist", kinds["TwistWithCovarianceStamped"](header, kinds["TwistWithCovariance"](twist, zeros))
-        yield at, "world", kinds["Odometry"](header, "", covered, kinds["TwistWithCovariance"](moved, zeros))
-        yield at, "local", kinds["VehicleLocalPosition"](us, *map(float, ned), *map(float, vned))
-        yield at, "attitude", kinds["VehicleAttitude"](us, turned[i].copy())
-        yield at, "gyro", kinds["VehicleAngularVelocity"](us, frd)
-        yield (
-            at,
-            "rotors",
-            kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), few.u[i].copy()),
-        )
-        channels = np.concatenate([1000 + few.u[i], np.zeros(12)])
-        yield at, "rc", kinds["Float64MultiArray"](kinds["MultiArrayLayout"](dim=[], data_offset=0), channels)
-
-    def written_bag(*names):
-        folder = tmp_path / "_".join(names)
-        with rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin.MCAP) as writer:
-            lines = {}
-            for i in range(len(few)):
-                for at, name, message in messages(i):
-                    if name in names:
-                        if name not in lines:
-                            lines[name] = writer.add_connection(f"/{name}", message.__msgtype__, typestore=store)
-                        writer.write(lines[name], at, store.serialize_cdr(message, message.__msgtype__))
-        return folder
-
-    motors = {"motors": "/rotors:data:rad/s"}
-    cases = [((pose, speed), motors) for pose in ("pose", "covered", "vicon") for speed in ("velocity_local", "twist")]
-    cases += [(("world",), motors | {"velocity": "/world"}), (("local", "attitude", "gyro"), motors)]
-    for names, topics in cases:
-        signals = read_recording(written_bag(*names, "rotors"), topics=topics).signals
-        for name, part in (("position", slice(3)), ("attitude", slice(3, 7)), ("velocity", slice(7, 10))):
-            size = np.abs(signals[name].values - few.x[:, part])
-            assert min(size.max(), np.abs(signals[name].values + few.x[:, part]).max()) < 1e-5, names
-        if "rates" in signals:
-            np.testing.assert_allclose(signals["rates"].values, few.x[:, 10:], atol=1e-5)
-    path = written_bag("pose", "rc")
-    sixteen = read_recording(path, topics={"motors": "/rc:data:pwm"}, motor_order=(0, 1, 2, 3))
-    np.testing.assert_allclose(sixteen.signals["command"].values, few.u / 1000, atol=1e-9)
-    for topics, words in (({"odometry": "/pose"}, ("odometry must be of type Odometry", "PoseStamped", "pose")),):
-        refusal(lambda topics=topics: read_recording(path, topics=topics), *words)
+    few = flight[:150]
+    for plugin in ("ROS1", "MCAP"):
+        recording = read_recording(bag(tmp_path / plugin, few, plugin, names), topics=topics)
+        signals = recording.signals
+        turned = Rotation.from_quat(np.roll(few.x[:, 3:7], -1, axis=1)).inv().apply(few.x[:, 7:10])
+        truth = {"position": few.x[:, :3], "velocity": few.x[:, 7:10], "rates": few.x[:, 10:], "body_velocity": turned}
+        truth |= {"rotor_speed": few.u, "voltage": np.full((150, 1), 16.5), "specific_force": 0 * turned + [0, 0, 9.81]}
+        for name, values in truth.items():
+            if name in signals:
+                np.testing.assert_allclose(signals[name].values, values, atol=2e-3 if name == "rotor_speed" else 1e-5)
+        assert np.abs((signals["attitude"].values * few.x[:, 3:7]).sum(axis=1)).min() > 1 - 1e-7
+        assert {"velocity", "body_velocity"} & signals.keys()
+        assert {"rates", "voltage", "specific_force"} <= signals.keys() or "imu" not in names
 
 
-def varint(value):
-    value, found = (value << 1) ^ (value >> 31), b""
-    while value > 127:
-        found, value = found + bytes([value & 127 | 128]), value >> 7
-    return found + bytes([value])
-
-
-def blackbox(flight, ended=True, events=b"", headers=()):
-    """Bytes of a blackbox log of intra frames alone, of signed numbers."""
-    names = ["loopIteration", "time", *(f"gyroADC[{i}]" for i in range(3)), *(f"accSmooth[{i}]" for i in range(3))]
-    names += ["vbatLatest", *(f"motor[{i}]" for i in range(4)), *(f"eRPM[{i}]" for i in range(4))]
-    zeros = ",".join("0" * len(names))
-    head = ["Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2", "I interval:1"]
-    head += ["P interval:1", "Firmware type:Cleanflight", "Firmware revision:Betaflight 4.4.0", "minthrottle:1070"]
-    head += [f"Field I name:{','.join(names)}", f"Field I signed:{zeros}", f"Field I predictor:{zeros}"]
-    head += [f"Field I encoding:{zeros}", f"Field P predictor:{zeros}", f"Field P encoding:{zeros}"]
-    head += ["gyro_scale:0x3f800000", "acc_1G:2048", "vbatref:1600", "vbatcellvoltage:330,350,430"]
-    head += ["motorOutput:48,2047", "motor_poles:14"]
-    content = b"".join(f"H {line}\n".encode() for line in [*head, *headers])
-    for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
-        row = [i, 10**6 + round(t * 1e6), *(x[10:] * 180 / np.pi), 0, 0, 2048, 1650]
-        row += [*(48 + u), *(u * 30 / np.pi * 7 / 100)]
-        content += b"I" + b"".join(varint(round(value)) for value in row)
-    return content + events + (b"E\xffEnd of log\0" if ended else b"")
+def test_channels_of_motors_are_chosen_and_other_types_named(flight, tmp_path):
+    path = bag(tmp_path / "run", flight[:20], "MCAP", ("pose", "rc"))
+    sixteen = read_recording(path, topics={"motors": "/rc:channels:pwm"}, motor_order=(0, 1, 2, 3))
+    np.testing.assert_allclose(sixteen.signals["command"].values, flight.u[:20] / 1000, atol=1e-3)
+    refusal(
+        lambda: read_recording(path, topics={"odometry": "/pose"}), "odometry must be of type Odometry", "PoseStamped"
+    )
+    assert not failures(check_recording(sixteen, IRIS), "log")[1:]  # no velocity and no rates
 
 
 def test_a_blackbox_log_is_the_flight_it_holds(flight, written):
@@ -441,62 +317,3 @@ def test_semicolons_and_decimal_commas_are_said_and_read(flight, tmp_path):
     np.testing.assert_allclose(
         signals["command"].values, np.where(flight.u < 800, flight.u - 1000, 0) / 1000, atol=1e-8
     )
-
-
-WHOLES = ("flight.log", "flight.gz", "flight.bbl", "flight.db3", "flight.mcap")
-
-
-@pytest.fixture(scope="module")
-def wholes(flight, tmp_path_factory):
-    """Name → bytes of a small file of each format, as a function, for short messages of hypothesis."""
-    folder, few = tmp_path_factory.mktemp("bags"), flight[:30]
-    made = {"flight.log": crazyflie(few), "flight.gz": gzip.compress(crazyflie(few)), "flight.bbl": blackbox(few)}
-    for plugin, suffix in (("SQLITE3", "db3"), ("MCAP", "mcap")):
-        (path,) = bag(folder / suffix, few, plugin).glob(f"*.{suffix}")
-        made[f"flight.{suffix}"] = path.read_bytes()
-    return made.__getitem__
-
-
-def mutated(content, rng):
-    """A few bytes changed, cut out or doubled, and perhaps the end lost."""
-    content = bytearray(content)
-    for _ in range(rng.integers(1, 6)):
-        at, size = int(rng.integers(len(content))), int(rng.integers(1, 40))
-        kind = rng.integers(3)
-        content[at : at + (size if kind == 0 else 0)] = b"" if kind == 0 else content[at : at + size]
-        if kind == 2:
-            content[at] ^= int(rng.integers(1, 256))
-    return bytes(content[: int(rng.integers(1, len(content)))] if rng.random() < 0.2 else content)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("name", WHOLES)
-def test_a_thousand_mutations_end_in_a_log_or_a_line(written, wholes, name):
-    """Without another exception, a hang over ten seconds, or a gigabyte more of memory."""
-    rng, most = np.random.default_rng(0), 0.0
-    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    for _ in range(1000):
-        path, began = written(mutated(wholes(name), rng), name), time.monotonic()
-        recording = outcome(read_recording, path, topics={"motors": "/rotors:data:rpm"})
-        if recording is not None:
-            check_recording(recording, IRIS, 0.01)
-            outcome(to_flight, recording, naming=str(path))
-        most = max(most, time.monotonic() - began)
-    assert most < 10
-    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 1 << 20
-
-
-@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_damaged_files_are_read_or_refused_in_one_line(written, wholes, data):
-    name = data.draw(st.sampled_from(WHOLES))
-    content = bytearray(wholes(name))
-    for at in data.draw(st.lists(st.integers(0, len(content) - 1), max_size=4)):
-        content[at] ^= data.draw(st.integers(1, 255))
-    end = data.draw(st.one_of(st.none(), st.integers(0, len(content))))
-    path = written(bytes(content[:end]), name)
-    recording = outcome(read_recording, path, topics={"motors": "/rotors:data:rpm"})
-    if recording is not None:
-        assert all(np.isfinite(signal.values).all() for signal in recording.signals.values())
-        assert all("\n" not in line for line in failures(check_recording(recording, IRIS, 0.01), "log"))
-        outcome(to_flight, recording, naming=str(path))

@@ -8,95 +8,18 @@ import struct
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from scipy.interpolate import CubicSpline
-from scipy.spatial.transform import Rotation
-from surface import outcome, refusal
+from surface import refusal
+from writers import OUTPUTS, PX4_STATES, START, commands, escs, outputs, stamped, ulog
 
-from hybrid_jax.flights.attitude import BODIES, WORLDS
+from hybrid_jax.flights.attitude import BODIES
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import px4_topics, to_flight
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.load import reordered
-from hybrid_jax.state import QUATERNION
 from hybrid_jax.vehicle import IRIS
 
 pytest.importorskip("pyulog", reason="reading ULog needs the extra `logs`")
-
-FORMATS = {
-    "vehicle_local_position": "uint64_t timestamp;uint64_t timestamp_sample;"
-    "float x;float y;float z;float vx;float vy;float vz;",
-    "vehicle_attitude": "uint64_t timestamp;uint64_t timestamp_sample;float[4] q;",
-    "vehicle_angular_velocity": "uint64_t timestamp;uint64_t timestamp_sample;float[3] xyz;",
-    "actuator_motors": "uint64_t timestamp;uint64_t timestamp_sample;float[12] control;",
-    "esc_status": "uint64_t timestamp;esc_report[8] esc;",
-    "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
-}
-STATES = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity")
-START = 12_000_000  # µs since boot
-
-
-def message(kind, payload):
-    return struct.pack("<HB", len(payload), ord(kind)) + payload
-
-
-def ulog(topics, formats=None, parameters=None, ordered=True, hardware=""):
-    """Bytes of a log: topic, or topic and instance, → packed samples, each of which begins with its time."""
-    parts = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", START), message("B", bytes(40))]
-    parts += [message("F", f"{name}:{fields}".encode()) for name, fields in (FORMATS | (formats or {})).items()]
-    for name, value in (parameters or {}).items():
-        key = f"int32_t {name}".encode()
-        parts.append(message("P", bytes([len(key)]) + key + struct.pack("<i", value)))
-    key = f"char[{len(hardware)}] ver_hw".encode()
-    parts += [message("I", bytes([len(key)]) + key + hardware.encode())] * bool(hardware)
-    named = [(name, 0) if isinstance(name, str) else name for name in topics]
-    parts += [message("A", struct.pack("<BH", number, at) + name.encode()) for at, (name, number) in enumerate(named)]
-    data = [(sample[:8], at, sample) for at, samples in enumerate(topics.values()) for sample in samples]
-    for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0]) if ordered else 0):
-        parts.append(message("D", struct.pack("<H", at) + sample))
-    return b"".join(parts)
-
-
-def stamped(times, values, delay=0):
-    """Samples of floats whose message came `delay` µs after what was measured."""
-    stamps = (START + np.round(times * 1e6)).astype(int).tolist()
-    return [
-        struct.pack(f"<QQ{len(row)}f", stamp + delay, stamp, *row) for stamp, row in zip(stamps, values, strict=True)
-    ]
-
-
-@pytest.fixture(scope="module")
-def topics(flight):
-    """The constructed flight as PX4 logs it: NED and FRD, position at 50 Hz, attitude at 125, gyro at 200."""
-    t = flight.t - flight.t[0]
-    body, world = BODIES["FRD"], WORLDS["NED"]
-
-    def at(rate, columns):
-        times = np.arange(0.003, t[-1], 1 / rate)
-        return times, CubicSpline(t, flight.x[:, columns])(times)
-
-    times, moving = at(50, [0, 1, 2, 7, 8, 9])
-    local = stamped(times, np.concatenate([moving[:, :3] @ world, moving[:, 3:] @ world], axis=1), delay=4000)
-    times, q = at(125, QUATERNION)
-    turned = Rotation.from_matrix(world.T @ Rotation.from_quat(np.roll(q, -1, axis=1)).as_matrix() @ body)
-    attitude = stamped(times, np.roll(turned.as_quat(), 1, axis=1), delay=2000)
-    times, omega = at(200, slice(10, 13))
-    return dict(zip(STATES, (local, attitude, stamped(times, omega @ body)), strict=True))
-
-
-def escs(t, u):
-    rpm = np.round(np.concatenate([u, 0 * u], axis=1) * 30 / np.pi).astype(int)
-    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
-    return [
-        struct.pack("<Q", stamp) + b"".join(struct.pack("<Qi", stamp, speed) for speed in row)
-        for stamp, row in zip(stamps, rpm.tolist(), strict=True)
-    ]
-
-
-def commands(t, u):
-    rest = np.full((len(u), 8), np.nan)
-    return stamped(t, np.concatenate([(u - 100) / 1000, rest], axis=1))
 
 
 @pytest.fixture
@@ -158,15 +81,6 @@ def test_old_logs_hold_pwm_and_the_rates_beside_the_attitude(flight, topics, wri
     np.testing.assert_allclose(recording.signals["rates"].values, flight.x[:, 10:], atol=1e-5)
     np.testing.assert_allclose(recording.signals["command"].values, flight.u / 1000, atol=1e-6)
     refusal(lambda: to_flight(recording, polynomial=(0, 1000.0)), "no position and no velocity", "logger_topics.txt")
-
-
-OUTPUTS = {"actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;"}
-
-
-def outputs(t, values):
-    rows = np.concatenate([values, np.zeros((len(t), 16 - values.shape[1]))], axis=1)
-    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
-    return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps, rows.tolist(), strict=True)]
 
 
 @pytest.mark.parametrize(
@@ -233,11 +147,11 @@ def test_advice_for_the_next_flight_is_complete_for_its_version(version):
     assert "actuator_outputs" in listed
 
 
-@pytest.mark.parametrize("missing", STATES)
+@pytest.mark.parametrize("missing", PX4_STATES)
 def test_a_missing_topic_is_named(flight, topics, written, missing):
     motors = {"esc_status": escs(flight.t - flight.t[0], flight.u)}
     path = written({name: samples for name, samples in (topics | motors).items() if name != missing})
-    quantity = dict(zip(STATES, ("position", "attitude", "rates"), strict=True))[missing]
+    quantity = dict(zip(PX4_STATES, ("position", "attitude", "rates"), strict=True))[missing]
     refusal(lambda: to_flight(read_ulog(path)), path, f"no {quantity}", "logger_topics.txt", f"{missing} ")
 
 
@@ -285,19 +199,3 @@ def test_a_clock_that_jumps_is_refused_or_a_gap(flight, topics, written):
     back = rates[:1000] + stamped(np.arange(0.0, 1, 0.005), np.ones((200, 3)))
     content = ulog({"vehicle_angular_velocity": back}, ordered=False)
     refusal(lambda: read_ulog(written(content)), "flight.ulg", "vehicle_angular_velocity", "time goes back from")
-
-
-@pytest.fixture(scope="module")
-def short(flight, topics):
-    few = {name: samples[:60] for name, samples in topics.items()}
-    return ulog(few | {"esc_status": escs(flight.t[:60] - flight.t[0], flight.u[:60])})
-
-
-@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(st.data())
-def test_damaged_logs_are_read_or_refused_in_one_line(written, short, capfd, data):
-    at = data.draw(st.integers(0, len(short)))
-    content = short[:at] + data.draw(st.binary(max_size=20)) + short[at + data.draw(st.integers(0, 100)) :]
-    path = written(content)
-    outcome(read_ulog, path, naming=str(path))
-    assert capfd.readouterr().out == ""

@@ -146,6 +146,11 @@ def _release(info) -> str:
     return f"{version} on {info.get('ver_hw', 'unknown hardware')}"
 
 
+def _has(tables, topic: str, fields) -> bool:
+    """Whether a topic has its time and these fields, as far as the log is not damaged."""
+    return {"timestamp", *fields} <= {*tables.get(topic, ())}
+
+
 def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple[np.ndarray, np.ndarray]:
     """Ticks [µs] and fields of a topic."""
     table = tables[topic]
@@ -159,10 +164,9 @@ def _table(tables, topic: str, fields, clock: str = "timestamp_sample") -> tuple
 def states(tables, notes: list[str]) -> Iterator[tuple[str, Samples]]:
     """The quantities of `SOURCES` in tables of topics: field → array."""
     for quantity, places in SOURCES.items():
-        found = [(topic, fields) for topic, fields in places if topic in tables and {*fields} <= {*tables[topic]}]
-        if not found:
+        topic, fields = next((place for place in places if _has(tables, *place)), ("", ()))
+        if not topic:
             continue
-        topic, fields = found[0]
         ticks, values = _table(tables, topic, fields)
         if quantity in VALID:
             ticks, values = _valid(tables[topic], quantity, ticks, values, notes)
@@ -194,7 +198,7 @@ def motors(tables, parameters, expected: int, notes: list[str], simulated: bool 
     expected, found = _whole(parameters, "CA_ROTOR_COUNT") or expected, {}
     for topic, field in MOTORS.items():
         quantity = "rotor_speed" if topic == "esc_status" else "command"
-        fields = [field.format(i) for i in range(MOST) if topic in tables and field.format(i) in tables[topic]]
+        fields = [name for name in map(field.format, range(MOST)) if _has(tables, topic, (name,))]
         if not fields or quantity in found:
             continue
         ticks, values = _table(tables, topic, fields, "timestamp")

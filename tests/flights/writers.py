@@ -1,0 +1,206 @@
+"""Files of every format, written byte by byte, that hold the constructed flight."""
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from hybrid_jax.flights.attitude import BODIES, WORLDS
+
+STATES = ["stateEstimate.x", "stateEstimate.y", "stateEstimate.z", "stateEstimate.vx", "stateEstimate.vy"]
+STATES += ["stateEstimate.vz", *(f"stateEstimate.q{axis}" for axis in "wxyz"), "gyro.x", "gyro.y", "gyro.z"]
+MOTORS = [f"motor.m{i}" for i in range(1, 5)]
+
+
+def usd(columns, ticks, kinds=None):
+    """Bytes of a µSD log of one event type: name → values, and times in µs."""
+    names, kinds = list(columns), kinds or {}
+    head = struct.pack("<BHHH", 0xBC, 2, 1, 7) + b"fixedFrequency\0" + struct.pack("<H", len(names))
+    head += b"".join(f"{name}({kinds.get(name, 'f')})\0".encode() for name in names)
+    form = "<HQ" + "".join(kinds.get(name, "f") for name in names)
+    rows = zip(ticks.tolist(), *(np.asarray(columns[name]).tolist() for name in names), strict=True)
+    body = head + b"".join(struct.pack(form, 7, *row) for row in rows)
+    return body + struct.pack("<I", zlib.crc32(body))
+
+
+def crazyflie(flight, **changes):
+    x = flight.x.copy()
+    x[:, 10:] *= 180 / np.pi
+    columns = dict(zip(STATES, x[:, [0, 1, 2, 7, 8, 9, 3, 4, 5, 6, 10, 11, 12]].T, strict=True))
+    motors = np.round(60 * flight.u).astype(int)
+    columns |= dict(zip(MOTORS, motors.T, strict=True)) | {"pm.vbatMV": 3700 + 0 * flight.t} | changes
+    return usd(columns, 10**9 + np.round(flight.t * 1e6).astype(int), dict.fromkeys(MOTORS, "H"))
+
+
+HEADER = "std_msgs/Header header\n"
+MESSAGES = {  # of packages that no store of types has
+    "px4_msgs/msg/VehicleAttitude": "uint64 timestamp\nfloat32[4] q\n",
+    "px4_msgs/msg/VehicleAngularVelocity": "uint64 timestamp\nfloat32[3] xyz\n",
+    "px4_msgs/msg/VehicleLocalPosition": "uint64 timestamp\n"
+    + "".join(f"float32 {name}\n" for name in ("x", "y", "z", "vx", "vy", "vz")),
+    "mav_msgs/msg/Actuators": HEADER + "float64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n",
+    "mavros_msgs/msg/RCOut": HEADER + "uint16[] channels\n",
+}
+
+
+def messages(store, flight):
+    """Topic → message for each sample: what mavros, Vicon, Gazebo, PX4's own bridge and others record."""
+    kinds, zeros = {name.split("/")[-1]: kind for name, kind in store.types.items()}, np.zeros(36)
+    kinds["Time"] = store.types["builtin_interfaces/msg/Time"]
+    vector, layout = kinds["Vector3"], kinds["MultiArrayLayout"](dim=[], data_offset=0)
+    turns = Rotation.from_quat(np.roll(flight.x[:, 3:7], -1, axis=1))
+    back, rolled = turns.inv().apply(flight.x[:, 7:10]), turns.apply(flight.x[:, 10:])
+    body, world = BODIES["FRD"], WORLDS["NED"]
+    turned = np.roll(Rotation.from_matrix(world @ turns.as_matrix() @ body).as_quat(), 1, axis=1).astype(np.float32)
+    for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
+        at = 10**18 + round(t * 1e9)
+        stamp = kinds["Time"](sec=at // 10**9, nanosec=at % 10**9)
+        header = kinds["Header"](*([i] if "seq" in kinds["Header"].__dataclass_fields__ else []), stamp, "map")
+        p, q, v, w = x[:3], x[3:7], x[7:10], x[10:]
+        pose = kinds["Pose"](kinds["Point"](*p), kinds["Quaternion"](*q[1:], q[0]))
+        covered = kinds["PoseWithCovariance"](pose, zeros)
+
+        def twist(linear, angular):
+            return kinds["TwistWithCovariance"](kinds["Twist"](vector(*linear), vector(*angular)), zeros)
+
+        (ned, vned), us = np.stack([p @ world, v @ world]).astype(np.float32).tolist(), at // 1000
+        imu = (pose.orientation, zeros[:9], vector(*w), zeros[:9], vector(0.0, 0.0, 9.81), zeros[:9])
+        channels = np.concatenate([np.round(1000 + u), np.zeros(12)]).astype(np.uint16)
+        odometry = kinds["Odometry"](header, "", covered, twist(back[i], w))
+        yield (
+            at,
+            {
+                "odom": odometry,
+                "truth": odometry,
+                "world": kinds["Odometry"](header, "", covered, twist(v, rolled[i])),
+                "imu": kinds["Imu"](header, *imu),
+                "pose": kinds["PoseStamped"](header, pose),
+                "covered": kinds["PoseWithCovarianceStamped"](header, covered),
+                "bare": pose,
+                "vicon": kinds["TransformStamped"](header, "body", kinds["Transform"](vector(*p), pose.orientation)),
+                "velocity_local": kinds["TwistStamped"](header, twist(v, w).twist),
+                "twist": kinds["TwistWithCovarianceStamped"](header, twist(v, w)),
+                "speed": kinds["Vector3Stamped"](header, vector(*v)),
+                "battery": kinds["BatteryState"](
+                    header, 16.5, *(6 * [0.0]), 0, 0, 0, True, zeros[:0], zeros[:0], "", ""
+                ),
+                "local": kinds["VehicleLocalPosition"](us, *ned, *vned),
+                "attitude": kinds["VehicleAttitude"](us, turned[i].copy()),
+                "gyro": kinds["VehicleAngularVelocity"](us, (w @ body).astype(np.float32)),
+                "motors": kinds["Actuators"](header, np.zeros(0), u.copy(), np.zeros(0)),
+                "rc": kinds["RCOut"](header, channels),
+                "rotors": kinds["Float64MultiArray"](layout, u * 30 / np.pi),
+            },
+        )
+
+
+def bag(folder, flight, plugin, names=("odom", "imu", "rotors")):
+    """A bag of ROS 2, or with the plugin ROS1 of ROS 1, with these topics of `messages`; rotors are in rpm."""
+    rosbag1, rosbag2 = pytest.importorskip("rosbags.rosbag1"), pytest.importorskip("rosbags.rosbag2")
+    typesys, first = pytest.importorskip("rosbags.typesys"), plugin == "ROS1"
+    store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
+    for name, text in MESSAGES.items():
+        store.register(typesys.get_types_from_msg(text, name))
+    if first:
+        folder, writer = folder.with_suffix(".bag"), rosbag1.Writer(folder.with_suffix(".bag"))
+    else:
+        writer = rosbag2.Writer(folder, version=9, storage_plugin=rosbag2.StoragePlugin[plugin])
+    lines, pack = {}, store.serialize_ros1 if first else store.serialize_cdr
+    with writer:
+        for at, found in messages(store, flight):
+            for name in names:
+                kind = found[name].__msgtype__
+                lines[name] = lines.get(name) or writer.add_connection(f"/{name}", kind, typestore=store)
+                writer.write(lines[name], at, pack(found[name], kind))
+    return folder
+
+
+def varint(value):
+    value, found = (value << 1) ^ (value >> 31), b""
+    while value > 127:
+        found, value = found + bytes([value & 127 | 128]), value >> 7
+    return found + bytes([value])
+
+
+def blackbox(flight, ended=True, events=b"", headers=()):
+    """Bytes of a blackbox log of intra frames alone, of signed numbers."""
+    names = ["loopIteration", "time", *(f"gyroADC[{i}]" for i in range(3)), *(f"accSmooth[{i}]" for i in range(3))]
+    names += ["vbatLatest", *(f"motor[{i}]" for i in range(4)), *(f"eRPM[{i}]" for i in range(4))]
+    zeros = ",".join("0" * len(names))
+    head = ["Product:Blackbox flight data recorder by Nicholas Sherlock", "Data version:2", "I interval:1"]
+    head += ["P interval:1", "Firmware type:Cleanflight", "Firmware revision:Betaflight 4.4.0", "minthrottle:1070"]
+    head += [f"Field I name:{','.join(names)}", f"Field I signed:{zeros}", f"Field I predictor:{zeros}"]
+    head += [f"Field I encoding:{zeros}", f"Field P predictor:{zeros}", f"Field P encoding:{zeros}"]
+    head += ["gyro_scale:0x3f800000", "acc_1G:2048", "vbatref:1600", "vbatcellvoltage:330,350,430"]
+    head += ["motorOutput:48,2047", "motor_poles:14"]
+    content = b"".join(f"H {line}\n".encode() for line in [*head, *headers])
+    for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
+        row = [i, 10**6 + round(t * 1e6), *(x[10:] * 180 / np.pi), 0, 0, 2048, 1650]
+        row += [*(48 + u), *(u * 30 / np.pi * 7 / 100)]
+        content += b"I" + b"".join(varint(round(value)) for value in row)
+    return content + events + (b"E\xffEnd of log\0" if ended else b"")
+
+
+FORMATS = {
+    "vehicle_local_position": "uint64_t timestamp;uint64_t timestamp_sample;"
+    "float x;float y;float z;float vx;float vy;float vz;",
+    "vehicle_attitude": "uint64_t timestamp;uint64_t timestamp_sample;float[4] q;",
+    "vehicle_angular_velocity": "uint64_t timestamp;uint64_t timestamp_sample;float[3] xyz;",
+    "actuator_motors": "uint64_t timestamp;uint64_t timestamp_sample;float[12] control;",
+    "esc_status": "uint64_t timestamp;esc_report[8] esc;",
+    "esc_report": "uint64_t timestamp;int32_t esc_rpm;",
+}
+PX4_STATES = ("vehicle_local_position", "vehicle_attitude", "vehicle_angular_velocity")
+OUTPUTS = {"actuator_outputs": "uint64_t timestamp;uint32_t noutputs;float[16] output;"}
+START = 12_000_000  # µs since boot
+
+
+def message(kind, payload):
+    return struct.pack("<HB", len(payload), ord(kind)) + payload
+
+
+def ulog(topics, formats=None, parameters=None, ordered=True, hardware=""):
+    """Bytes of a log: topic, or topic and instance, → packed samples, each of which begins with its time."""
+    parts = [b"ULog\x01\x12\x35\x01", struct.pack("<Q", START), message("B", bytes(40))]
+    parts += [message("F", f"{name}:{fields}".encode()) for name, fields in (FORMATS | (formats or {})).items()]
+    for name, value in (parameters or {}).items():
+        key = f"int32_t {name}".encode()
+        parts.append(message("P", bytes([len(key)]) + key + struct.pack("<i", value)))
+    key = f"char[{len(hardware)}] ver_hw".encode()
+    parts += [message("I", bytes([len(key)]) + key + hardware.encode())] * bool(hardware)
+    named = [(name, 0) if isinstance(name, str) else name for name in topics]
+    parts += [message("A", struct.pack("<BH", number, at) + name.encode()) for at, (name, number) in enumerate(named)]
+    data = [(sample[:8], at, sample) for at, samples in enumerate(topics.values()) for sample in samples]
+    for _, at, sample in sorted(data, key=lambda item: struct.unpack("<Q", item[0]) if ordered else 0):
+        parts.append(message("D", struct.pack("<H", at) + sample))
+    return b"".join(parts)
+
+
+def stamped(times, values, delay=0):
+    """Samples of floats whose message came `delay` µs after what was measured."""
+    stamps = (START + np.round(times * 1e6)).astype(int).tolist()
+    return [
+        struct.pack(f"<QQ{len(row)}f", stamp + delay, stamp, *row) for stamp, row in zip(stamps, values, strict=True)
+    ]
+
+
+def escs(t, u):
+    rpm = np.round(np.concatenate([u, 0 * u], axis=1) * 30 / np.pi).astype(int)
+    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
+    return [
+        struct.pack("<Q", stamp) + b"".join(struct.pack("<Qi", stamp, speed) for speed in row)
+        for stamp, row in zip(stamps, rpm.tolist(), strict=True)
+    ]
+
+
+def commands(t, u):
+    rest = np.full((len(u), 8), np.nan)
+    return stamped(t, np.concatenate([(u - 100) / 1000, rest], axis=1))
+
+
+def outputs(t, values):
+    rows = np.concatenate([values, np.zeros((len(t), 16 - values.shape[1]))], axis=1)
+    stamps = (START + np.round(t * 1e6)).astype(int).tolist()
+    return [struct.pack("<QI16f", at, 16, *row) for at, row in zip(stamps, rows.tolist(), strict=True)]
