@@ -2,22 +2,28 @@
 
 Prints the table of docs/howto/logs.md. Each mistake is made in every simulated flight, with the noise of sensors; it is
 found if a check fails or warns, or reading refuses the log, and says the words that name it.
+
+With folders as arguments, it counts instead the checks that fail on the sound logs in them, each at the rate of its
+slowest signal and while it flies, against the nearest vehicle.toml above the log, and by the nearest map.toml, if any.
 """
 
 import sys
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import jax
 import numpy as np
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_of
-from hybrid_jax.flights.checks.consistency import FAILS, WARNS, check_log
+from hybrid_jax.flights.checks.cleaning import in_flight
+from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, WARNS, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.load import recording_of
+from hybrid_jax.flights.load import find_logs, read_log, recording_of
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import DT, gone_wrong, random_flights
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, load_vehicle
 
 FLIGHTS, SECONDS = 20, 20.0
 NOISE = np.repeat([1e-3, 1e-3, 0.02, 0.02], [3, 4, 3, 3])  # m, 1, m/s, rad/s
@@ -142,7 +148,70 @@ def said(log: Parts) -> list[tuple[str, str]]:
     return [(check.verdict, f"{check.name}: {check.suggestion}") for check in found if check.verdict in (FAILS, WARNS)]
 
 
+# Checks whose failure says what a log holds: nothing that flew, too little, or not the whole of it.
+CONTENT = ("whole file", "airframe", "motors turn", "quantities", "repeated samples", "time on the ground")
+
+
+def checks_of(path: Path, top: Path) -> tuple[list[Check], str]:
+    """All checks of a log, and why there are none that compare its signals; empty if there are."""
+    above = [each for each in path.parents if each.is_relative_to(top)]
+    vehicle, columns = (
+        next((each / name for each in above if (each / name).is_file()), None) for name in ("vehicle.toml", "map.toml")
+    )
+    vehicle = None if vehicle is None else load_vehicle(vehicle)
+    try:
+        raw = read_log(path, columns=columns)
+    except ValueError as error:
+        return [], str(error)
+    slowest = max((each.interval for name, each in raw.recording.signals.items() if name != "voltage"), default=1.0)
+    found = raw.checks(vehicle, slowest)
+    try:
+        log, _ = in_flight(raw.flight(slowest, (0.0, 1.0)))
+        return [*found, *check_log(log, vehicle)], ""
+    except ValueError as error:
+        return found, str(error)
+
+
+def logs_below(folder: Path) -> Iterator[Path]:
+    logs, left = find_logs(folder)
+    yield from logs
+    for each in (path for path in left if path.is_dir()):
+        yield from logs_below(each)
+
+
+def count_alarms(folder: Path) -> int:
+    """Print how many checks fail on the sound logs of a folder, and which; return their number."""
+    run, warning, lines, alone = 0, Counter(), [], Counter()
+    paths = [*logs_below(folder)]
+    for path in paths:
+        checks, why = checks_of(path, folder)
+        judged = [check for check in checks if check.name not in CONTENT and check.verdict != UNKNOWN]
+        run += len(judged)
+        warning.update(check.name for check in judged if check.verdict == WARNS)
+        lines += [f"  {path.name}: {c.name} {c.value:.3g}: {c.suggestion}" for c in judged if c.verdict == FAILS]
+        alone.update([why.removeprefix(f"{path}: ").split(";")[0]] if why else [])
+    alarms = len(lines)
+    print(
+        f"{folder}: {len(paths)} logs, {run} checks, {alarms} fail ({100 * alarms / max(run, 1):.2f} %)",
+        *lines,
+        sep="\n",
+    )
+    print(
+        f"  warnings: {dict(warning)}",
+        *(f"  {n} not compared: {why}" for why, n in alone.items()),
+        sep="\n",
+        flush=True,
+    )
+    return alarms
+
+
 def main() -> int:
+    if folders := [Path(each) for each in sys.argv[1:]]:
+        return int(sum(map(count_alarms, folders)) > 0)
+    return matrix()
+
+
+def matrix() -> int:
     sound = {
         domain.name: sound_logs(domain, seed) for seed, domain in enumerate((SOURCE, PARAMETER_SHIFT, EXTERNAL_FORCE))
     }

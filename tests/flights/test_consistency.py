@@ -184,12 +184,14 @@ def test_gaps_and_repeats_hide_no_other_mistake(flight):
     assert verdicts == [FAILS, FAILS, OK, OK, OK]
 
 
-def test_vehicle_at_rest_decides_nothing(flight):
-    x = np.tile(flight.x[:1], (300, 1))
+@pytest.mark.parametrize("noise", [False, True])
+def test_vehicle_at_rest_decides_nothing(flight, noise):
+    """Nor does the noise of its sensors, of which a longer mean leaves nothing."""
+    x = np.tile(flight.x[:1], (900, 1))
     x[:, 3:] = [1.0, *np.zeros(9)]
-    x[:, 0] += np.random.default_rng(0).normal(size=300) * 1e-4
-    log = FlightLog(np.arange(300) * 0.01, x, np.full((300, 4), IRIS.hover_speed))
-    found = table(log)
+    x[:, 0] += np.random.default_rng(0).normal(size=900) * 1e-4
+    log = FlightLog(np.arange(900) * 0.01, x, np.full((900, 4), IRIS.hover_speed))
+    found = table(noisy(log, np.random.default_rng(1)) if noise else log)
     assert {found[name].verdict for name in (VELOCITY, RATES, THRUST, ORDER, YAW, LAG)} == {UNKNOWN}
     assert found[RATIO].verdict == OK
 

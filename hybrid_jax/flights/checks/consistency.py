@@ -36,7 +36,8 @@ KINEMATICS_LIMIT = 0.5
 THRUST_LIMIT = 0.6
 AXIS_LIMIT = 0.8  # of a single axis, where noise is a larger share
 FEWEST = 20  # intervals to compare
-SPAN = 0.05  # s of moving average on both sides of an equation
+# s of moving average on both sides of an equation; a longer one if nothing explains what noise alone may do
+SPANS = (0.05, 0.2, 0.8)
 GAIN_LIMIT = 1.25  # of one record regressed on the other
 THRUST_RATIO_LIMIT = 1.25
 ORDER_LIMIT = 0.4  # correlation
@@ -198,9 +199,17 @@ def _spin(log: FlightLog, vehicle: Vehicle, yaw: float) -> Check:
 
 
 def _compare(log: FlightLog, name: str, pairs: Pairs, least: float) -> Check:
-    """Compare two records in flight with each mistake undone; kinematics hold on each axis, v̇ has wind and drag."""
+    """Compare two records in flight; what no mistake explains in any span is the result of the shortest."""
+    check = shortest = _compare_means(log, name, pairs, least, SPANS[0])
+    for span in SPANS[1:]:
+        check = _compare_means(log, name, pairs, least, span) if UNUSUAL in check.suggestion else check
+    return shortest if UNUSUAL in check.suggestion else check
+
+
+def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: float) -> Check:
+    """Compare two records with each mistake undone; kinematics hold on each axis, v̇ has wind and drag."""
     sound, limit = flying_intervals(log), THRUST_LIMIT if name == THRUST else KINEMATICS_LIMIT
-    width = min(max(1, round(SPAN / log.dt)), len(sound))
+    width = min(max(1, round(span / log.dt)), len(sound))
     whole = moving_mean(sound[:, None].astype(float), width)[:, 0] > 1 - 1e-9
     pairs = {name: (moving_mean(a, width)[whole], moving_mean(b, width)[whole]) for name, (a, b) in pairs.items()}
     a, b = pairs[NOTHING]
