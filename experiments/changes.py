@@ -128,7 +128,9 @@ def experiment(config: ChangesConfig, console: Console) -> None:
 
 def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
     """The figures and their captions, by name."""
-    errors = "Mean test error by change; pale lines reach from the least to the most of all cases"
+    errors = (
+        "Prediction error by change, % of that without adaptation; bands reach from the least to the most of all cases"
+    )
     regret = "Test error over that of the best candidate"
     return {"errors": (error_figure(rows), errors), "regret": (regret_figure(rows), regret)}
 

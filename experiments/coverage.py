@@ -6,16 +6,20 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import matplotlib as mpl
 import numpy as np
+from matplotlib.figure import Figure
 from rich.console import Console
 
 from experiments.paper.conditions import settings
 from experiments.paper.config import ONE_FLIGHT, QUICK, SMOKE, Change, OneFlight, preset_like
 from experiments.paper.known_body import KnownBody, coverage, known_body_table
+from experiments.paper.regret import CHANGES as CHANGES_SHOWN
 from experiments.paper.study import flown, pretrained, source_splits, target_splits, windows_of
 from experiments.reporting.claims import Claim, Part, all_of, verdict_table
 from experiments.reporting.claims import evaluate as evaluate_claims
 from experiments.reporting.names import HYBRID
+from experiments.reporting.plots import METHODS, PAGE, STYLE, legend_below, name_lines, note, save_figures, subplots
 from experiments.reporting.report import Report, write_report
 from experiments.reporting.results import Results, Row
 from experiments.reporting.tables import EMPTY, Table, tabulate
@@ -112,6 +116,7 @@ def experiment(config: CoverageConfig, console: Console) -> None:
         environment=environment(stages.seconds),
         rows=rows,
         claims=verdicts,
+        figures=save_figures(config.out / NAME, draw(rows), config.paper),
         notes=stages.notes(),
         head=HEAD.strip(),
         conclusion=conclusion(rows),
@@ -193,6 +198,36 @@ def pooled_table(rows: Results) -> Table:
     }
     title = f"Do pooled 95 % intervals of {SOURCES} sources or more contain the truth?"
     return tabulate(title, rows.group("domain", "noise", "parameter"), columns, ("change", "noise", "θ_p"))
+
+
+def draw(rows: Results) -> dict[str, tuple[Figure, str]]:
+    """The figure and its caption, by name."""
+    return {"coverage": (coverage_figure(rows), "Share of flights whose 95 % interval contains the true value")}
+
+
+@mpl.rc_context(STYLE)
+def coverage_figure(rows: Results) -> Figure:
+    """A panel for each noise: the share of pooled intervals, and of those of one source, that contain the truth."""
+    fitted = rows.where(lambda row: row["inside"] is not None)
+    noises, changes = fitted.unique("noise"), fitted.unique("domain")
+    figure, (panels,) = subplots((PAGE, 1.5 + 0.42 * len(changes)), 1, len(noises), sharey=True)
+    kinds = {
+        "alone": ("one source", METHODS["fine-tuned"], "s"),
+        "inside": ("three sources, pooled", METHODS["adapted"], "o"),
+    }
+    for axes, noise in zip(panels, noises, strict=True):
+        axes.axvline(100 * LEVEL, color="0.4", linestyle=":", label="nominal 95 %")
+        for (domain, parameter), own in fitted.where(noise=noise).group("domain", "parameter").items():
+            y = changes.index(domain) + 0.22 * (LEARNED.index(parameter) - 1)
+            shares = {column: 100 * float(np.mean(own[column])) for column in kinds}
+            axes.plot([*shares.values()], [y, y], color="0.8", zorder=1)
+            for column, (label, colour, marker) in kinds.items():
+                axes.plot(shares[column], y, marker, ms=4, color=colour, label=label, clip_on=False)
+            note(axes, parameter, (min(shares.values()), y), (-6, 0), va="center", ha="right", color="0.4")
+        axes.set(title="without noise" if noise == "none" else "with sensor noise", xlim=(60, 100.5))
+        axes.set_xlabel("intervals that contain the true value [%]")
+        name_lines(axes, [CHANGES_SHOWN.get(name, name.replace("_", " ")) for name in changes])
+    return legend_below(figure, "Do 95 % intervals contain the true value?")
 
 
 def conclusion(rows: Results) -> list[str]:

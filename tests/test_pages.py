@@ -6,10 +6,11 @@ from importlib import util
 
 import pytest
 from smoke import ROOT
+from test_layers import ORDER
 
 DOCS = ROOT / "docs"
 PACKAGES = sorted(f"hybrid_jax.{path.parent.name}" for path in (ROOT / "hybrid_jax").glob("*/__init__.py"))
-WIDEST = 120  # characters of a line, and of a cell without the targets of its links
+WIDEST = 120  # characters of a line or a cell, without the targets of its links
 TARGET = re.compile(r"\]\([^)]*\)|\]\[[^\]]*\]")
 
 
@@ -39,6 +40,12 @@ def test_the_examples_of_a_page_run(page, tmp_path, monkeypatch):
     spec.loader.exec_module(module)
 
 
+def test_the_picture_of_layers_is_that_of_the_imports():
+    text = (DOCS / "architecture.md").read_text()
+    layers = [re.findall(r"`(\w+)`", line.split("|")[1]) for line in text.splitlines() if line.startswith("| `")]
+    assert [name for layer in layers for name in layer] == [*reversed(ORDER)]
+
+
 def test_every_package_has_a_page():
     for package in PACKAGES:
         page = DOCS / "api" / f"{package.partition('.')[2]}.md"
@@ -50,5 +57,5 @@ def test_lines_and_cells_are_short(page):
     prose = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE).splitlines()
     rows = [line for line in prose if line.lstrip().startswith("|")]
     cells = [cell.strip() for row in rows for cell in TARGET.sub("]", row).split("|")]
-    others = [line for line in prose if line not in rows and not line.startswith(("![", "    "))]
+    others = [TARGET.sub("]", line) for line in prose if line not in rows and not line.startswith(("![", "    "))]
     assert [text for text in cells + others if len(text) > WIDEST] == []

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from experiments.reporting.claims import Claim, Part, Undecided
 from experiments.reporting.names import EXTERNAL_FORCE, PARAMETER_SHIFT
-from experiments.reporting.plots import STYLE, legend_below, name_lines, subplots
+from experiments.reporting.plots import METHODS, STYLE, legend_below, name_lines, note, subplots, tick_errors
 from experiments.reporting.results import Results
 from experiments.reporting.tables import Table
 
@@ -18,18 +18,18 @@ WORSE = 1.02  # times the source's error
 MEAN_RHO, WORST_RHO = 0.93, 0.85
 HELD = 0.7, 0.9  # share of errors in their 80 % interval
 AUTO = "auto"  # the candidate that was taken
-SHOWN = {AUTO: "#0072B2", "theta": "#D55E00", "fine_tune": "0.5"}
-OUTLINE = {
-    AUTO: ("#0072B2", "hj.adapt", "o"),
-    "source": ("0.45", "not adapted", "s"),
-    "fine_tune": ("#D55E00", "fine-tuned", "^"),
+SHOWN = {  # method → label, colour and marker, the same in all figures
+    AUTO: ("hj.adapt", METHODS["adapted"], "o"),
+    "theta": ("least squares on $\\theta_p$", METHODS["physics"], "D"),
+    "fine_tune": ("fine-tuned (Adam)", METHODS["fine-tuned"], "^"),
 }
 CHANGES: dict[str, str] = {
     PARAMETER_SHIFT: "other inertia",
     EXTERNAL_FORCE: "side wind",
     "doubled_drag": "twice the drag",
 }
-CHANGES |= {"weak_rotor": "weak rotor", "off_centre_load": "load off centre", "gusty_wind": "gusty wind"}
+CHANGES |= {"weak_rotor": "one rotor 15 % weaker", "off_centre_load": "load off centre"}
+CHANGES |= {"gusty_wind": "gusty wind", "load_and_wind": "load and wind"}
 
 
 def of_each_case(rows: Results, name: str) -> np.ndarray:
@@ -155,18 +155,26 @@ def error_table(rows: Results) -> Table:
 
 @mpl.rc_context(STYLE)
 def error_figure(rows: Results) -> Figure:
-    """The mean test error of each change: not adapted, fine-tuned, `adapt`; lines reach from the least to the most."""
+    """The error of each change as a percentage of that without adaptation; lines reach from the least to the most."""
     groups = rows.group("domain")
     figure, ((axes,),) = subplots((6.4, 1.4 + 0.36 * len(groups)), 1, 1)
+    axes.axvline(100, color=METHODS["not adapted"], label="not adapted")
     for y, own in enumerate(groups.values()):
-        for name, (colour, label, marker) in OUTLINE.items():
+        before = of_each_case(own, "source")
+        for name in (AUTO, "fine_tune"):
             if name in (AUTO, *own.unique("candidate")):
+                label, colour, marker = SHOWN[name]
                 errors = of_each_case(own, name)
-                axes.plot([errors.min(), errors.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
-                axes.plot(errors.mean(), y, marker, color=colour, ls="", label="" if y else label)
-    axes.set(xscale="log", xlabel="test error over 1 s of other flights, $L^T_{MSE}$ (log scale)")
+                each, mean = 100 * np.sqrt(errors / before), 100 * np.sqrt(errors.mean() / before.mean())
+                axes.plot([each.min(), each.max()], [y, y], color=colour, lw=4, alpha=0.25, solid_capstyle="round")
+                axes.plot(mean, y, marker, ms=6, color=colour, ls="", label="" if y else label)
+                note(axes, f"{mean:.0f} %", (mean, y), (0, 6), ha="center", color=colour)
+    axes.set(
+        xscale="log", xlabel="RMS prediction error over 1 s, % of that without adaptation (log scale; lower is better)"
+    )
+    tick_errors(axes.xaxis, *axes.get_xlim(), room=3.0)
     name_lines(axes, [CHANGES.get(name, name.replace("_", " ")) for name in map(str, groups)])
-    return legend_below(figure, "What ten seconds of one noisy flight are worth")
+    return legend_below(figure, "After a change: ten seconds of one noisy flight (band: all cases)")
 
 
 @mpl.rc_context(STYLE)
@@ -178,12 +186,13 @@ def regret_figure(rows: Results) -> Figure:
     for y, own in enumerate(groups.values()):
         best = best_of_each_case(own)
         for i, name in enumerate(shown):
+            label, colour, marker = SHOWN[name]
             ratio = of_each_case(own, name) / best
             place = np.full(len(ratio), y + 0.22 * (i - (len(shown) - 1) / 2))
-            label = name.replace("_", "-") if y == 0 else ""
-            axes.plot(ratio, place, "o", ms=4, alpha=0.5, color=SHOWN[name], label=label)
-    axes.set(xscale="log", xlabel="test error over that of the best candidate in hindsight (log scale)")
+            axes.plot(ratio, place, marker, ms=4, alpha=0.5, color=colour, label="" if y else label)
+    axes.set(xscale="log", xlabel="test error / test error of the best candidate in hindsight (log scale; 1 is best)")
     axes.set_yticks(range(len(groups)), [CHANGES.get(name, name.replace("_", " ")) for name in map(str, groups)])
     axes.invert_yaxis()
+    tick_errors(axes.xaxis, *axes.get_xlim())
     axes.axvline(NEAR, color="0.4", linestyle=":", label=f"{NEAR - 1:.0%} more")
-    return legend_below(figure, "Adaptation to one flight of ten seconds", columns=4)
+    return legend_below(figure, "After a change: was the right candidate chosen?", columns=4)

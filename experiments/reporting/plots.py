@@ -30,6 +30,13 @@ COLOURS = {
     names.PHYSICS_ONLY: "#009E73",
     names.CONSTANT_DISTURBANCE: "#CC79A7",
 }
+# The same colours by what was done to a model, where a figure compares that.
+METHODS = {
+    "adapted": COLOURS[names.CONSTANT_DISTURBANCE],
+    "fine-tuned": COLOURS[names.HYBRID],
+    "physics": COLOURS[names.PHYSICS_ONLY],
+    "not adapted": "0.45",
+}
 OTHERS = "0.4"  # the colour of models that no figure of the paper shows
 DRAWABLE = 1e30  # a number beyond it overflows inside matplotlib and is drawn like one that is not finite
 LARGEST_RATIO = 100.0  # an axis of errors ends at this many times the smallest mean; errors beyond are marked there

@@ -1,0 +1,104 @@
+"""The numbers of the results and the guides are those of the committed reports."""
+
+import json
+
+import numpy as np
+import pytest
+from committed import committed, lines
+from smoke import ROOT
+
+from experiments.paper.regret import AUTO, CHANGES, of_each_case, over, regret
+from experiments.reporting.tables import measured
+
+PAPER = {"inertia": "param_shift", "wind": "external_force"}
+METHODS = (("hybrid", "fine_tuned"), ("hybrid", "target_only"), ("no_physics", "fine_tuned"))
+METHODS += (("constant_disturbance", "fine_tuned"),)
+# Of the table of ten methods: the report of each column, and the model of each line.
+PROTOCOLS = ("random-1000-noise0", "contiguous-own-noise1")
+COMPARED = {
+    "source, not adapted": ("hybrid", "source_only"),
+    "hybrid": ("hybrid", "fine_tuned"),
+    "no-physics": ("no_physics", "fine_tuned"),
+    "physics-only": ("physics_only", "fine_tuned"),
+    "last layer (ridge)": ("last_layer", "fine_tuned"),
+    "source + linear residual": ("linear_residual", "fine_tuned"),
+    "hj.adapt (θ_p + disturbance)": ("constant_disturbance", "fine_tuned"),
+}
+
+
+def test_seven_changes():
+    shown = lines("docs/results/index.md")
+    for domain, own in committed("changes").group("domain").items():
+        rho = 1 - over(own, "source")
+        errors = [f"{of_each_case(own, name).mean():.3g}" for name in ("source", "fine_tune", AUTO)]
+        names = {"off_centre_load": "a load off centre", "gusty_wind": "slanted, gusty wind"}
+        name = names.get(domain, CHANGES[domain])
+        assert shown[name] == [*errors, f"{rho.mean():.3g}, {rho.min():.3g}"], domain
+    ratios = regret(committed("changes"))
+    assert (f"{np.mean(ratios <= 1.1):.0%}", f"{ratios.max():.2f}") == ("93%", "1.34")
+
+
+@pytest.mark.parametrize("change", PAPER)
+@pytest.mark.parametrize("n", [100, 1000])
+def test_the_paper(change, n):
+    rows = committed(PAPER[change])
+    found = [rows.where(model=model, mode=mode, n_train=n).spread("test_mse") for model, mode in METHODS]
+    assert lines("docs/results/paper.md")[f"{change}, {n}"] == [measured(each.mean, each.std) for each in found]
+
+
+def test_the_verdicts():
+    shown = {name.split()[0]: verdicts for name, verdicts in lines("docs/results/paper.md").items()}
+    words = {True: "holds", False: "fails", None: "undecided"}
+    for column, name in enumerate(PAPER.values()):
+        report = json.loads((ROOT / "docs/reference" / name / "report.json").read_text())
+        for claim in report["claims"]:
+            assert shown[claim["id"]][column] == words[claim["holds"]], (name, claim["id"])
+
+
+@pytest.mark.parametrize("line", COMPARED)
+def test_ten_methods(line):
+    model, mode = COMPARED[line]
+    for i, (domain, name) in enumerate((d, p) for d in ("parameter_shift", "external_force") for p in PROTOCOLS):
+        rows = committed("comparison" if name == PROTOCOLS[0] else f"comparison/{name}").where(domain=domain)
+        mean = 1000 * rows.where(model=model, mode=mode).spread("test_mse").mean
+        assert float(lines("docs/results/paper.md")[line][i].strip("✗* ")) == pytest.approx(mean, rel=0.05)
+
+
+def test_intervals():
+    fitted = committed("coverage").where(lambda row: row["inside"] is not None)
+    kinds = ("inside", np.mean, 100, ".0f"), ("alone", np.mean, 100, ".0f"), ("half_width", np.median, 1, ".1f")
+    for domain in fitted.unique("domain"):
+        groups = fitted.where(domain=domain).group("noise", "parameter").values()
+        cells = []
+        for column, statistic, factor, form in kinds:
+            values = [factor * statistic(own[column]) for own in groups]
+            cells.append(f"{min(values):{form}} to {max(values):{form}}")
+        assert lines("docs/results/intervals.md")[CHANGES[domain]] == cells
+    shares = len(fitted), f"{np.mean(fitted['inside']):.0%}", f"{np.mean(fitted['alone']):.0%}"
+    assert shares == (2756, "98%", "92%")
+
+
+def test_flying():
+    rows = committed("closed_loop").where(domain="external_force", observer=False, distance=0.0)
+    for line, reference in {"hover": "hover", "figure-8, 3.5 m/s": "figure_eight", "low pass": "low_pass"}.items():
+        models = {"model": "invariant", "n_train": 0}, {"model": "least_squares", "n_train": 100}
+        before, after = (rows.where(reference=reference, **own).spread("position_rmse").mean for own in models)
+        expected = [f"{100 * before:.2f} cm", f"{100 * after:.2f} cm", f"{before / after:.2f}"]
+        assert lines("docs/results/control.md")[line] == expected
+
+
+def test_the_most_informative_flight():
+    shown = lines("docs/howto/excitation.md")
+    names = {
+        "hover": "hover",
+        "figure-8": "figure-8 at 3.5 m/s",
+        "random": "random, as in the paper",
+        "designed": "designed",
+    }
+    for flight, own in committed("excitation").group("flight").items():
+        for name, cell in zip(("Ix", "Iy", "k"), shown[names.get(flight, flight)], strict=True):
+            width = own.where(parameter=name).spread("half_width").mean
+            if cell == "no bound":
+                assert width > 100
+            else:
+                assert float(cell.strip("±* %")) == pytest.approx(width, rel=0.05), (flight, name)
