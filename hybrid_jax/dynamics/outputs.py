@@ -6,7 +6,8 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.state_space import StateSpace
 
 Output = Callable[[Float[Array, " d"], Float[Array, " m"]], Float[Array, "*k"]]
 
@@ -27,9 +28,9 @@ class StateSpaceModel(eqx.Module):
         outputs: h by name: each a function of the state (d,) and the input (m,) that returns a scalar or (k,).
         start: the initial state that is expected (d,).
         spread: the standard deviation of the initial state about `start` (d,): 0 if it is known, infinite if nothing
-            is known of it.
-        process: the standard deviation of what acts on each state at random, per square root of a second (d,); by
-            default 0. A state of which nothing but this noise acts is a random walk.
+            is known of it. Where the field's state space has an attitude, this has three numbers, its rotation [rad].
+        process: the standard deviation of what acts on each state at random, per square root of a second, one number
+            for each of `spread`; by default 0. A state of which nothing but this noise acts is a random walk.
 
     Raises:
         ValueError: sizes that do not agree, or a negative deviation.
@@ -45,9 +46,10 @@ class StateSpaceModel(eqx.Module):
     def __check_init__(self):
         if not self.outputs:
             raise ValueError("outputs: at least one is needed, such as {'angle': lambda x, u: x[0]}")
+        expected = self.space.tangent_size
         for name, numbers in (("spread", self.spread), ("process", self.process)):
-            if len(numbers) not in ((0, self.size) if name == "process" else (self.size,)):
-                raise ValueError(f"{name} must have {self.size} numbers, as start has, got {len(numbers)}")
+            if len(numbers) not in ((0, expected) if name == "process" else (expected,)):
+                raise ValueError(f"{name} must have {expected} numbers, as a change of start has, got {len(numbers)}")
             for number in numbers:
                 if not number >= 0:
                     raise ValueError(f"{name} must not be negative, got {number}")
@@ -56,6 +58,11 @@ class StateSpaceModel(eqx.Module):
     def size(self) -> int:
         """The number of states d."""
         return len(self.start)
+
+    @property
+    def space(self) -> StateSpace:
+        """What a state is to the field; of states of which it says nothing, each is a quantity of its own."""
+        return state_space(self.field, self.size)
 
     def measure(self, x: Float[Array, " d"], u: Float[Array, " m"]) -> dict[str, Float[Array, " k"]]:
         """What is measured in a state, by name.

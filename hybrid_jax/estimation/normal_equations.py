@@ -95,6 +95,7 @@ class Inverse(NamedTuple):
 def inverse(gram: Float[Array, "p p"]) -> Inverse:
     """The inverse, of a matrix that is scaled to a unit diagonal first: parameters differ in their effect."""
     scale = jnp.sqrt(jnp.diagonal(gram))
+    scale = jnp.where(scale > 0, scale, 1)
     scales = scale[:, None] * scale
     scaled, epsilon = gram / scales, jnp.finfo(gram.dtype).eps
     values, vectors = jnp.linalg.eigh(jax.lax.stop_gradient(scaled))

@@ -20,9 +20,9 @@ from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation import record_search, shooting, uncertainty
+from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
+from hybrid_jax.estimation.elimination import End, descend
 from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
-from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
@@ -39,7 +39,7 @@ class RecordFit(eqx.Module):
     Attributes:
         model: with the fitted numbers; the start state is that of the first record.
         starts: the state at the start of each record (r, d).
-        starts_error: its standard error (r, d).
+        starts_error: its standard error (r, d); of an attitude three numbers, its rotation [rad].
         ends: the state at the end of each record (r, d).
         times: the first and last time of each record that was compared [s] (r, 2).
         intervals: confidence interval of each physical parameter, number by number. It is infinite for one that the
@@ -53,7 +53,7 @@ class RecordFit(eqx.Module):
 
     model: StateSpaceModel
     starts: Float[np.ndarray, "r d"]
-    starts_error: Float[np.ndarray, "r d"]
+    starts_error: Float[np.ndarray, "r e"]
     ends: Float[np.ndarray, "r d"]
     times: Float[np.ndarray, "r 2"]
     intervals: dict[str, Interval]
@@ -130,21 +130,24 @@ def fit_records(
         steps = record_search.steps_of(segment, gridded, dt)
         theta = np.asarray(ravel_learned(model)[0])
         near = record_search.deviations_of(model, prior or {})
-        search = record_search.Search(problem, gridded, near, theta, shooting.cut(gridded, steps))
-        z, total = record_search.approached(search, segment), 0
+        segments = shooting.cut(gridded, steps)
+        nodes = len(gridded), 1 if segment is None else segments.valid.shape[1], 1
+        search = record_search.Search(problem, jnp.tile(jnp.array(model.start), nodes), near, theta, segments)
+        (search, theta, own), total = record_search.approached(search, segment), 0
         if any(model.process):
             noise = np.array(model.process) * np.sqrt(steps * dt)
-            search = search._replace(off=np.maximum(noise, CONTINUOUS * record_search.sizes_of(search, z)))
+            search = search._replace(off=np.maximum(noise, CONTINUOUS * record_search.sizes_of(search, theta, own)))
         else:
-            z = np.concatenate([z[: len(theta)], search.nodes(z)[:, 0].ravel()])
+            own = own[:, : model.space.tangent_size]
+            search = search._replace(centres=search.centres[:, :1], off=None)
         for i in range(rounds):
-            end = record_search.descend(search.system, z, max_steps=max_steps)
-            z, total = end.z, total + end.steps
-            errors = search.errors(z)
+            end = descend(search.equations, theta, own, max_steps=max_steps)
+            theta, own, total = end.theta, end.own, total + end.steps
+            errors = search.errors(theta, own)
             if i < rounds - 1:
                 sizes = {name: jnp.asarray(_size(each, robust)) for name, each in errors.items()}
                 search = search._replace(problem=Problem(model, sizes, robust, dt, problem.solver, substeps))
-        return _result(search, end._replace(steps=total), errors, robust, level)
+        return _result(search, end._replace(steps=total), gridded, errors, robust, level)
 
 
 def simulate(
@@ -227,40 +230,33 @@ def _size(errors: Float[np.ndarray, "n k"], robust: float) -> Float[np.ndarray, 
     return np.maximum(found, TINY)
 
 
-def _result(search: record_search.Search, end: record_search.End, errors, robust: float, level: float) -> RecordFit:
-    model, p, d = search.model(end.z), len(search.theta), search.problem.model.size
-    covariance = _covariance(search, end)
-    nodes = search.nodes(end.z)
-    starts = np.concatenate([record_search.place(p, nodes, i, 0) for i in range(len(nodes))])
-    deviation = np.sqrt(np.diagonal(covariance)[starts]).reshape(-1, d)
+def _result(search: record_search.Search, end: End, gridded, errors, robust: float, level: float) -> RecordFit:
+    model, start = search.model(end.theta), np.asarray(search.nodes(end.own)[0])[:, 0]
+    covariance, variances = _covariance(search, end)
+    deviation = np.sqrt(variances[:, : model.space.tangent_size])
     found, physics = {}, physics_of(model.field)
     if jax.tree.leaves(eqx.filter(physics, trainable(physics))):
-        picked = np.asarray(jax.jacfwd(lambda theta: ravel_parameters(search.model(theta).field)[0])(end.z[:p]))
+        picked = np.asarray(jax.jacfwd(lambda theta: ravel_parameters(search.model(theta).field)[0])(end.theta))
         rows = picked.argmax(axis=1)
         found = uncertainty.intervals(model.field, jnp.asarray(covariance[np.ix_(rows, rows)]), level)
+        found = jax.tree.map(np.asarray, found)
     limits = {name: robust * _size(each, robust) for name, each in errors.items()}
     aside = {name: int((np.abs(each) > limits[name]).any(axis=1).sum()) for name, each in errors.items()}
     rms = {name: np.sqrt(np.mean(each**2, axis=0)) for name, each in errors.items()}
-    model = dataclasses.replace(model, start=nodes[0, 0])
-    ends = np.asarray(search.predicted(end.z)[1])[:, -1, -1]
-    times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in search.gridded])
-    start = nodes[:, 0]
-    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance[:p, :p], end.steps, end.status)
+    model = dataclasses.replace(model, start=start[0])
+    ends = np.asarray(search.predicted(end.theta, end.own)[1])[:, -1, -1]
+    times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in gridded])
+    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status)
 
 
-def _covariance(search: record_search.Search, end: record_search.End) -> Float[np.ndarray, "z z"]:
-    """Of all unknowns; infinite for those along which no output changes.
+def _covariance(search: record_search.Search, end: End) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "r s"]]:
+    """Of θ, and the variances of the nodes; infinite for those along which no output changes.
 
     In a simulation the errors of a model last, so the scores of each piece are one observation (a sandwich; White
     1980). With process noise errors are independent, and the inverse of the normal equations is the covariance.
     """
-    back = inverse(jnp.asarray(end.gram))
-    found, told = np.asarray(back.matrix), np.asarray(back.told)
+    meat = None
     if search.off is None:
-        local, nodes, p = search.local(end.z), search.nodes(end.z), len(search.theta)
-        meat = end.gram.copy()  # what was expected counts as it is
-        for i in range(len(search.gridded)):
-            rows = np.ix_(*2 * (np.r_[:p, record_search.place(p, nodes, i, 0)],))
-            meat[rows] += local.score[i].T @ local.score[i] - local.gram[i].sum(axis=0)
-        found = found @ meat @ found
-    return found + np.diag(np.where(told, 0.0, np.inf))
+        gram, score, _ = search.local(end.theta, end.own).equations
+        meat = np.asarray(end.equations.gram + jnp.einsum("rsp,rsq->rpq", score, score) - jnp.sum(gram, axis=1))
+    return elimination.covariance(end.equations, len(end.theta), meat)  # what was expected counts as it is

@@ -1,116 +1,141 @@
-"""The search for the parameters and initial states of records, see `record_fit`."""
+"""The search for the parameters and the states at the nodes of records, see `record_fit`."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
 from hybrid_jax.dynamics.base import ravel_learned, trainable
 from hybrid_jax.dynamics.outputs import StateSpaceModel
-from hybrid_jax.estimation import levenberg_marquardt, shooting
+from hybrid_jax.estimation import shooting
+from hybrid_jax.estimation.elimination import Equations, descend
 from hybrid_jax.estimation.shooting import Local, Problem, Segments
 from hybrid_jax.records import Gridded
-from hybrid_jax.status import Status
+from hybrid_jax.state_space import StateSpace
 
 APPROACH = (1.0, 0.1, 0.01)  # what a segment's end may be off, over the size of a state, in turn
 MOST = 3000  # unknowns
-ENOUGH = 1e-6  # stop at a step that lowers the cost by less than this share
 CLUSTERS = 20  # of a simulation's errors, each taken as one observation
 TINY, SMALL = 1e-12, 1e-3
 
 
-class System(NamedTuple):
-    """Normal equations in all unknowns: θ, then the states at the nodes."""
+class Sums(NamedTuple):
+    """`Equations` to which errors are added."""
 
-    gram: Float[np.ndarray, "z z"]
-    score: Float[np.ndarray, " z"]
-    cost: float
+    gram: Float[np.ndarray, "r q q"]
+    score: Float[np.ndarray, "r q"]
+    cost: Float[np.ndarray, " r"]
 
-    def plus(self, rows, jacobian, errors, deviations) -> "System":
-        """With more errors, of known standard deviations; an infinite one counts nothing."""
+    def add(self, rows, jacobian, errors, deviations) -> None:
+        """More errors, of known standard deviations; an infinite one counts nothing."""
         weight = 1 / np.maximum(deviations, TINY)
         jacobian, errors = jacobian * weight[:, None], errors * weight
-        self.gram[np.ix_(rows, rows)] += jacobian.T @ jacobian
-        self.score[rows] += jacobian.T @ errors
-        return self._replace(cost=self.cost + float(errors @ errors))
+        self.gram[:, rows[:, None], rows] += jacobian.swapaxes(1, 2) @ jacobian
+        self.score[:, rows] += np.einsum("rkq,rk->rq", jacobian, errors)
+        self.cost[:] += np.square(errors).sum(axis=1)
 
 
 class Search(NamedTuple):
-    """The unknowns z = (θ, nodes) of a model and records, and how they are judged.
+    """The unknowns of a model and records, and how they are judged.
+
+    The states at the nodes are unknown: each is `centres` after a change, a tangent vector of the field's state space.
 
     Attributes:
         problem: what is compared.
-        gridded: the records.
+        centres: the states about which those at the nodes are sought, the expected start of each record first.
         deviations: of θ from its start that are expected (p); infinite where nothing is.
         theta: its start (p).
         segments: the records cut; one node each, or one for a record in a simulation.
-        off: what the end of a segment may be off the next node (d); None in a simulation.
+        off: what the end of a segment may be off the next node (e); None in a simulation.
     """
 
     problem: Problem
-    gridded: list[Gridded]
+    centres: Float[Array, "r s d"]
     deviations: Float[np.ndarray, " p"]
     theta: Float[np.ndarray, " p"]
     segments: Segments
-    off: Float[np.ndarray, " d"] | None = None
+    off: Float[np.ndarray, " e"] | None = None
 
-    def model(self, z) -> StateSpaceModel:
-        return ravel_learned(self.problem.model)[1](jnp.asarray(z[: len(self.theta)]))
+    @property
+    def still(self) -> Float[Array, "r q"]:
+        """No change of any node."""
+        return jnp.zeros((len(self.centres), self.centres.shape[1] * self.problem.model.space.tangent_size))
 
-    def nodes(self, z) -> Float[np.ndarray, "r s d"]:
-        return z[len(self.theta) :].reshape(len(self.gridded), -1, self.problem.model.size)
+    def model(self, theta) -> StateSpaceModel:
+        return ravel_learned(self.problem.model)[1](jnp.asarray(theta))
 
-    def local(self, z) -> Local:
-        theta, nodes = jnp.asarray(z[: len(self.theta)]), jnp.asarray(self.nodes(z))
+    def nodes(self, own: Float[Array, "r q"]) -> tuple[Float[Array, "r s d"], Float[Array, "r s d e"]]:
+        """The states at the nodes, and their derivatives along the changes."""
+        return _nodes(self.problem.model, self.centres, own.reshape(*self.centres.shape[:2], -1))
+
+    def local(self, theta, own) -> Local:
+        nodes, charts = self.nodes(own)
         if self.off is None:
-            found = shooting.simulation(self.problem, theta, nodes[:, 0], self.segments)
-        else:
-            found = shooting.shooting(self.problem, theta, nodes, self.segments)
-        return jax.tree.map(np.asarray, found)
+            return shooting.simulation(self.problem, theta, nodes[:, 0], charts[:, 0], self.segments)
+        return shooting.shooting(self.problem, theta, nodes, charts, self.segments)
 
-    def system(self, z) -> System:
-        """The normal equations in all unknowns, with what is expected of θ and of the starts."""
-        found, nodes, model, p = self.local(z), self.nodes(z), self.problem.model, len(self.theta)
-        total = System(np.zeros((len(z), len(z))), np.zeros(len(z)), float(found.cost.sum()))
-        for i, own in enumerate(nodes):
-            places = [np.r_[:p, place(p, nodes, i, j)] for j in range(len(own))]
-            for j, (gram, score) in enumerate(zip(found.gram[i], found.score[i], strict=True)):
-                rows = places[j if self.off is not None else 0]
-                total.gram[np.ix_(rows, rows)] += gram
-                total.score[rows] += score
-            for j in range(len(own) - 1 if self.off is not None else 0):
-                rows = np.r_[places[j], places[j + 1][p:]]
-                slope = np.concatenate([found.slope[i, j], -np.eye(model.size)], axis=1)
-                total = total.plus(rows, slope, found.end[i, j] - own[j + 1], self.off)
-            rows = places[0][p:]
-            total = total.plus(rows, np.eye(model.size), own[0] - np.array(model.start), np.array(model.spread))
-        return total.plus(np.arange(p), np.eye(p), z[:p] - self.theta, self.deviations)
+    def equations(self, theta, own) -> Equations:
+        """The normal equations of each record in θ and its nodes, with what is expected of θ and of the starts."""
+        local, (nodes, charts), model = self.local(theta, own), self.nodes(own), self.problem.model
+        found, p, e = jax.tree.map(np.asarray, local.equations), len(self.theta), model.space.tangent_size
+        (r, s, _), zero = nodes.shape, self.still.shape[1] + p
+        total = Sums(np.zeros((r, zero, zero)), np.zeros((r, zero)), found.cost.sum(axis=1))
+        rows = [np.r_[:p, p + j * e : p + (j + 1) * e] for j in range(s)]
+        for j in range(found.cost.shape[1]):
+            at = rows[min(j, s - 1)]
+            total.gram[:, at[:, None], at] += found.gram[:, j]
+            total.score[:, at] += found.score[:, j]
+        if self.off is not None and s > 1:
+            ends = local.end[:, :-1], local.slope[:, :-1]
+            missing, slopes = map(np.asarray, _missing(model, *ends, nodes[:, 1:], charts[:, 1:]))
+            for j in range(s - 1):
+                total.add(np.r_[rows[j], rows[j + 1][p:]], slopes[:, j], missing[:, j], self.off)
+        one = np.broadcast_to(np.eye(e), (r, e, e))
+        total.add(rows[0][p:], one, np.asarray(own)[:, :e], np.array(model.spread))
+        known = np.zeros((r, p, p))
+        known[0] = np.eye(p)  # what is expected of θ stands with the first record
+        total.add(np.arange(p), known, known @ (np.asarray(theta) - self.theta), self.deviations)
+        return Equations(*map(jnp.asarray, total))
 
-    def predicted(self, z):
+    def predicted(self, theta, own):
         """The outputs and states of a simulation of each record, or of each segment from its node."""
-        nodes = jnp.asarray(self.nodes(z))
-        model = self.model(z)
+        model, nodes = self.model(theta), self.nodes(own)[0]
         if self.off is None:
             return shooting.simulated(self.problem, model, nodes[:, 0], self.segments)
         alone = jax.tree.map(lambda leaf: leaf.reshape(-1, 1, *leaf.shape[2:]), self.segments)
         found = shooting.simulated(self.problem, model, nodes.reshape(-1, nodes.shape[-1]), alone)
         return jax.tree.map(lambda leaf: leaf.reshape(*nodes.shape[:2], *leaf.shape[2:]), found)
 
-    def errors(self, z) -> dict[str, Float[np.ndarray, "n k"]]:
+    def errors(self, theta, own) -> dict[str, Float[np.ndarray, "n k"]]:
         """ŷ − y of all samples."""
-        y, segments = self.predicted(z)[0], self.segments
+        y, segments = self.predicted(theta, own)[0], self.segments
         return {name: (np.asarray(y[name]) - segments.y[name])[segments.there[name]] for name in y}
 
 
-def place(p: int, nodes: Float[np.ndarray, "r s d"], i: int, j: int) -> np.ndarray:
-    """Where node j of record i is among the unknowns."""
-    _, s, d = nodes.shape
-    first = p + (i * s + j) * d
-    return np.arange(first, first + d)
+@eqx.filter_jit
+def _nodes(model: StateSpaceModel, centres, changes):
+    space = model.space
+
+    def one(centre, change):
+        return space.retract(centre, change), jax.jacfwd(partial(space.retract, centre))(change)
+
+    return jax.vmap(jax.vmap(one))(centres, changes)
+
+
+@eqx.filter_jit
+def _missing(model: StateSpaceModel, ends, slopes, nodes, charts):
+    """What leads from each next node to the end of a segment, and its derivative along (θ, node, next node)."""
+
+    def one(end, slope, node, chart):
+        of_end, of_node = jax.jacfwd(model.space.difference, (0, 1))(end, node)
+        return model.space.difference(end, node), jnp.concatenate([of_end @ slope, of_node @ chart], axis=1)
+
+    return jax.vmap(jax.vmap(one))(ends, slopes, nodes, charts)
 
 
 def deviations_of(model: StateSpaceModel, prior: Mapping[str, float]) -> Float[np.ndarray, " p"]:
@@ -132,61 +157,37 @@ def steps_of(segment: float | None, gridded: list[Gridded], dt: float) -> int:
     return max(1, round(segment / dt)) if segment is not None else -(-longest // max(1, min(CLUSTERS, longest // 10)))
 
 
-def approached(search: Search, segment: float | None) -> Float[np.ndarray, " z"]:
-    """The unknowns from which the search begins: through multiple shooting, whose segments drift less and less."""
-    model, p = search.problem.model, len(search.theta)
-    start = np.array(model.start)
+def approached(search: Search, segment: float | None) -> tuple[Search, Float[Array, " p"], Float[Array, "r q"]]:
+    """Where the search begins: after multiple shooting, whose segments drift less and less."""
+    space, theta, own = search.problem.model.space, jnp.asarray(search.theta), search.still
     if segment is None:
-        return np.concatenate([search.theta, np.tile(start, len(search.gridded))])
-    r, s = search.segments.valid.shape[:2]
-    if p + r * s * len(start) > MOST:
-        raise ValueError(f"segment: {r * s} segments of {len(start)} states are too many; {segment * 2:.3g} s or more")
-    z = np.concatenate([search.theta, np.tile(start, r * s)])
-    size = sizes_of(search, z)
-    free = np.ones(len(z), bool)
-    free[:p] = False
+        return search, theta, own
+    if len(theta) + own.size > MOST:
+        raise ValueError(f"segment: {own.size} numbers at the nodes are too many; {segment * 2:.3g} s or more")
+    size = sizes_of(search, theta, own)
+    none = np.zeros(len(theta), bool)
     for i, share in enumerate((APPROACH[0], *APPROACH)):
-        z = descend(search._replace(off=share * size).system, z, np.ones(len(z), bool) if i else free).z
-        size = np.maximum(np.std(search.nodes(z), axis=(0, 1)), SMALL * size) if not i else size
-    return z
+        search = search._replace(off=share * size)
+        found = descend(search.equations, theta, own, free=None if i else none)
+        theta, nodes = found.theta, search.nodes(found.own)[0]
+        if not i:
+            moved = np.asarray(_changes(space, nodes, search.centres[:1, :1]))
+            size = np.maximum(np.std(moved, axis=(0, 1)), SMALL * size)
+        own = found.own.at[:, space.tangent_size :].set(0.0)
+        search = search._replace(centres=nodes.at[:, 0].set(search.centres[:, 0]))
+    return search, theta, own
 
 
-def sizes_of(search: Search, z) -> Float[np.ndarray, " d"]:
+def sizes_of(search: Search, theta, own) -> Float[np.ndarray, " e"]:
     """The size of each state: as it moves in a simulation, where that is finite."""
-    p, start = len(search.theta), np.array(search.problem.model.start)
-    spread = np.array(search.problem.model.spread)
-    alone = search._replace(off=None)
-    states = np.asarray(alone.predicted(z)[1]) if len(z) else np.zeros((0, p))
-    moved = np.abs(states - start).reshape(-1, len(start)).max(axis=0)
-    guess = np.where(np.isfinite(spread) & (spread > 0), spread, np.maximum(np.abs(start), 1.0))
+    model = search.problem.model
+    start, spread = np.array(model.start), np.array(model.spread)
+    states = search._replace(off=None).predicted(theta, own)[1]
+    moved = np.abs(np.asarray(_changes(model.space, states.reshape(1, -1, len(start)), start))).max(axis=(0, 1))
+    far = np.maximum(np.abs(start), 1.0) if len(spread) == len(start) else np.ones(len(spread))
+    guess = np.where(np.isfinite(spread) & (spread > 0), spread, far)
     return np.where(np.isfinite(moved) & (moved > 0) & (moved < 1e3 * guess), moved, guess)
 
 
-class End(NamedTuple):
-    """Where a search ended."""
-
-    z: Float[np.ndarray, " z"]
-    gram: Float[np.ndarray, "z z"]
-    score: Float[np.ndarray, " z"]
-    steps: int
-    status: Status
-
-
-def descend(system, z, free=None, max_steps: int = 50) -> End:
-    """The unknowns at the least cost; those that are not free stay as they are."""
-    free = np.ones(len(z), bool) if free is None else free
-
-    def evaluate(z, state):
-        found = system(np.asarray(z))
-        gram, score = np.where(free[:, None] & free, found.gram, 0.0), np.where(free, found.score, 0.0)
-        return jnp.asarray(found.cost), (z, jnp.asarray(gram), jnp.asarray(score))
-
-    def aim(best, damping):
-        move, expected = levenberg_marquardt.move_of_equations(best[1], best[2], damping)
-        return best[0] + move, expected, 0.0
-
-    n, z = len(z), jnp.asarray(z)
-    begin = levenberg_marquardt.begin(z, (z, jnp.zeros((n, n)), jnp.zeros(n)))
-    end = levenberg_marquardt.minimise(evaluate, aim, begin, max_steps, ENOUGH, levenberg_marquardt.in_python)
-    z, gram, score = map(np.asarray, end.best)
-    return End(z, gram, score, int(end.steps), Status(int(end.status)))
+def _changes(space: StateSpace, y: Float[Array, "r s d"], x) -> Float[Array, "r s e"]:
+    return jnp.vectorize(space.difference, signature="(d),(d)->(e)")(y, jnp.asarray(x))

@@ -18,10 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from hybrid_jax.dynamics.base import ravel_learned
 from hybrid_jax.dynamics.outputs import StateSpaceModel
+from hybrid_jax.estimation.elimination import Equations
 from hybrid_jax.integrate import Solver, integrate
 from hybrid_jax.records import Gridded
-
-FLAT = 1e-12  # of a gradient's norm
 
 
 class Segments(NamedTuple):
@@ -140,17 +139,15 @@ def errors_of(problem: Problem, model: StateSpaceModel, x0, segment: Segments):
 
 
 class Local(NamedTuple):
-    """The normal equations of segments in (θ, state at the start), and how the end depends on both."""
+    """The normal equations of segments in (θ, what their start depends on), and how the end depends on both."""
 
-    gram: Float[Array, "*s q q"]
-    score: Float[Array, "*s q"]
-    cost: Float[Array, "*s"]
+    equations: Equations
     slope: Float[Array, "*s d q"]
     end: Float[Array, "*s d"]
 
 
-def local(problem: Problem, theta, x0, segment: Segments) -> Local:
-    """The normal equations of one segment."""
+def local(problem: Problem, theta, x0, through: Float[Array, "d q"], segment: Segments) -> Local:
+    """The normal equations of one segment, where `through` is the derivative of its start."""
     p, unravel = len(theta), ravel_learned(problem.model)[1]
 
     def errors(z):
@@ -158,37 +155,30 @@ def local(problem: Problem, theta, x0, segment: Segments) -> Local:
         return found, found
 
     (jacobian, slope), (r, end) = jax.jacfwd(errors, has_aux=True)(jnp.concatenate([theta, x0]))
-    size = jnp.maximum(jnp.abs(r), FLAT)
-    weight = jnp.minimum(1.0, problem.robust / size)
-    cost = jnp.where(size <= problem.robust, r**2, 2 * problem.robust * size - problem.robust**2)
-    weighted = jacobian * weight[:, None]
-    return Local(weighted.T @ jacobian, weighted.T @ r, jnp.sum(cost), slope, end)
+    both = jnp.concatenate([jnp.eye(p, through.shape[1]), through])
+    return Local(Equations.of_errors(jacobian @ both, r, problem.robust), slope @ both, end)
 
 
 @eqx.filter_jit
-def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], segments: Segments) -> Local:
-    """The normal equations of every segment, each from its own initial state."""
-    each = jax.vmap(jax.vmap(partial(local, problem, theta)))
-    return each(nodes, segments)
+def shooting(problem: Problem, theta, nodes: Float[Array, "r s d"], charts: Float[Array, "r s d e"], segments) -> Local:
+    """The normal equations of every segment in (θ, change of its own initial state)."""
+    slopes = jnp.concatenate([jnp.zeros((*nodes.shape, len(theta))), charts], axis=-1)
+    return jax.vmap(jax.vmap(partial(local, problem, theta)))(nodes, slopes, segments)
 
 
 @eqx.filter_jit
-def simulation(problem: Problem, theta, starts: Float[Array, "r d"], segments: Segments) -> Local:
-    """The normal equations of every segment in (θ, state at the start of the record), one after the other."""
-    p, d = len(theta), starts.shape[-1]
+def simulation(problem: Problem, theta, starts: Float[Array, "r d"], charts: Float[Array, "r d e"], segments) -> Local:
+    """The normal equations of every segment in (θ, change of the record's initial state), one after the other."""
 
-    def record(x0, own):
+    def record(x0, chart, own):
         def step(carry, segment):
-            x, slope = carry
-            found = local(problem, theta, x, segment)
-            through = jnp.concatenate([jnp.eye(p, p + d), slope])
-            slope = found.slope @ through
-            gram, score = through.T @ found.gram @ through, through.T @ found.score
-            return (found.end, slope), Local(gram, score, found.cost, slope, found.end)
+            found = local(problem, theta, carry[0], carry[1], segment)
+            return (found.end, found.slope), found
 
-        return jax.lax.scan(step, (x0, jnp.eye(d, p + d, p)), own)[1]
+        slope = jnp.concatenate([jnp.zeros((len(x0), len(theta))), chart], axis=1)
+        return jax.lax.scan(step, (x0, slope), own)[1]
 
-    return jax.vmap(record)(starts, segments)
+    return jax.vmap(record)(starts, charts, segments)
 
 
 @eqx.filter_jit

@@ -52,9 +52,9 @@ class Interval(NamedTuple):
         high: the upper end.
     """
 
-    value: Float[Array, "*runs"]
-    low: Float[Array, "*runs"]
-    high: Float[Array, "*runs"]
+    value: Float[Array | np.ndarray, "*runs"]
+    low: Float[Array | np.ndarray, "*runs"]
+    high: Float[Array | np.ndarray, "*runs"]
 
 
 def covariance_of(

@@ -11,6 +11,7 @@ Bayes by expectation maximisation; Dempster, Laird and Rubin 1977).
 
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -24,9 +25,9 @@ from hybrid_jax.dynamics.actuators import Actuated
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation import uncertainty
+from hybrid_jax.estimation.elimination import descend, reduced
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
-from hybrid_jax.estimation.normal_equations import NormalEquations, masked
+from hybrid_jax.estimation.normal_equations import NormalEquations, inverses, masked
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
@@ -130,18 +131,20 @@ def identify(
         theta, unravel = ravel_parameters(field)
         spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
         problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
-        changes, status = jnp.zeros_like(spread), Status.RUNNING
+        changes, status, errors = jnp.zeros_like(spread), Status.RUNNING, {}
         for _ in range(rounds):
-            theta, changes, status = _fit(field, theta, changes, problem, layout, max_steps, moves & measurable)
+            linearised = partial(normal_equations, field, problem, layout)
+            options = {"free": moves & measurable, "least": NO_EFFECT, "max_steps": max_steps, "tolerance": TOLERANCE}
+            theta, changes, equations, _, status = descend(linearised, theta, changes, **options)
             errors = {name: np.asarray(size) for name, size in rms(field, theta, changes, problem, layout).items()}
-            variance = normal_equations(field, theta, changes, problem, layout)[3]
+            variance = jnp.diagonal(inverses(equations.gram[:, len(theta) :, len(theta) :]).matrix, axis1=1, axis2=2)
             size = jnp.sqrt(jnp.mean((changes**2 + variance)[:, TANGENT:], axis=0))
             spread = spread.at[:, TANGENT:].set(jnp.where(spread[:, TANGENT:] > 0, size, 0.0))
             scale = {name: jnp.maximum(errors[name], 1e-9) for name in columns}
             problem = problem._replace(scale=scale, spread=spread)
             if windows.between.shape[1]:
                 problem = _weighted(field, theta, changes, problem, layout)
-        equations = normal_equations(field, theta, changes, problem, layout)[0]
+        equations = reduced(normal_equations(field, problem, layout, theta, changes), len(theta)).equations
         cluster = max(1, min(round(CLUSTER / (layout.dt * layout.steps)), len(windows.start) // FEWEST_CLUSTERS))
         covariance = _covariance(equations, cluster, moves, known, measurable)
         degrees = max(1, -(-len(windows.start) // cluster) - 1)
@@ -237,12 +240,9 @@ def _widened(name: str, interval: Interval, shares) -> Interval:
     Noise in the one that explains shrinks a coefficient, to R² of the other at most (Frisch 1934; Klepper and Leamer
     1984). Which of the two is right a log does not say, as commands follow from what was measured.
     """
-    axis = AXES_OF.get(name)
-    if axis is None:
-        return interval
-    value, low, high = (float(each) for each in interval)
-    share = float(shares[axis])
-    return Interval(*map(jnp.asarray, (value, low * share, high / share if share > 0 else np.inf)))
+    value, low, high = map(np.asarray, interval)
+    share = np.asarray(shares[AXES_OF[name]]) if name in AXES_OF else np.ones(())
+    return Interval(value, low * share, np.divide(high, share, out=np.full((), np.inf), where=share > 0))
 
 
 def _first_scale(windows: Windows, name: str) -> Array:
@@ -251,31 +251,6 @@ def _first_scale(windows: Windows, name: str) -> Array:
         return jnp.full(3, 0.1)
     spread = np.nanstd(np.where(windows.there[name][..., None], windows.y[name], np.nan), axis=(0, 1))
     return jnp.asarray(np.maximum(spread, 1e-9))
-
-
-def _fit(field, theta, changes, problem: Problem, layout: Layout, max_steps: int, moves):
-    """θ, the changes of the initial states, and the status.
-
-    Optimistix would take a dense Jacobian of all errors with the 18 unknowns of each window, more than a gigabyte for
-    300 windows; here only the parameters are left of the normal equations.
-    """
-
-    def evaluate(point, _):
-        equations, offset, slope, _ = normal_equations(field, point[0], point[1], problem, layout)
-        gram, score = jnp.sum(equations.gram, axis=0), jnp.sum(equations.score, axis=0)
-        return jnp.sum(equations.square), (point, gram, score, (offset, slope))
-
-    def aim(best, damping):
-        (theta, changes), gram, score, (offset, slope) = best
-        seen = (jnp.diagonal(gram) > NO_EFFECT) & moves
-        step, expected = move_of_equations(jnp.where(seen[:, None] & seen, gram, 0), jnp.where(seen, score, 0), damping)
-        return (theta + step, changes - offset - jnp.einsum("nsp,p->ns", slope, step)), expected, 0.0
-
-    point = theta, changes
-    shapes = jax.eval_shape(lambda: evaluate(point, None)[1])
-    nothing = jax.tree.map(lambda one: jnp.zeros(one.shape, one.dtype), shapes)
-    end = minimise(evaluate, aim, begin(point, nothing), max_steps, TOLERANCE, in_python)
-    return *end.best[0], Status(int(end.status))
 
 
 def _names(field) -> list[str]:

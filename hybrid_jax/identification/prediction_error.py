@@ -1,7 +1,4 @@
-"""Predictions of windows of measurements, their errors, and the normal equations of the parameters.
-
-Each window's initial state and constant disturbance are eliminated from the equations; see `fitting`.
-"""
+"""Predictions of windows of measurements, their errors, and their normal equations; see `fitting`."""
 
 from functools import partial
 from typing import NamedTuple
@@ -18,12 +15,11 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.measurement import difference, measure
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.estimation.elimination import Equations
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.normal_equations import NormalEquations
 from hybrid_jax.identification import slow_commands
 from hybrid_jax.identification.recordings import Inputs, Layout, Windows
 from hybrid_jax.integrate import RK4, integrate
-from hybrid_jax.matrices import solve
 from hybrid_jax.state import STATE_SIZE, VELOCITY
 
 CHUNK = 64  # windows at a time
@@ -117,34 +113,25 @@ def rms(field, theta, changes, problem: Problem, layout: Layout) -> dict[str, Ar
 
 
 @eqx.filter_jit
-def normal_equations(field, theta, changes, problem: Problem, layout: Layout):
-    """The normal equations of θ with each initial state eliminated, and what gives its step: −(a + B Δθ); the cost."""
+def normal_equations(field, problem: Problem, layout: Layout, theta, changes) -> Equations:
+    """The normal equations of each window in θ and in the change of its initial state and its disturbance."""
 
-    def one(each) -> tuple[NormalEquations, Array, Array, Array]:
+    def one(each) -> Equations:
         (window, spread, whitening), change = each
-        p = theta.size
-        free = spread > 0
-        unit = jnp.where(free, spread, 1.0)
+        p, free = theta.size, spread > 0
 
         def residual(both):
-            found = errors_of(field, both[:p], both[p:] * unit, window, problem.inputs, problem.columns, layout)
+            found = errors_of(field, both[:p], both[p:], window, problem.inputs, problem.columns, layout)
             r = jnp.concatenate([jnp.ravel(part / problem.scale[name]) for name, part in found.items()])
             r = r if whitening is None else whitening @ r
             return r, r
 
         # A prior of one standard deviation on each initial state; those that are exact do not move.
-        jacobian, r = jax.jacfwd(residual, has_aux=True)(jnp.concatenate([theta, change / unit]))
-        of_theta, of_start = jacobian[:, :p], jnp.where(free, jacobian[:, p:], 0.0)
-        start = change / unit
-        inner = of_start.T @ of_start + jnp.eye(len(unit))
-        score = of_start.T @ r + start
-        right = jnp.concatenate([score[:, None], of_start.T @ of_theta, jnp.eye(len(unit))], axis=1)
-        step, by_theta, inverse = jnp.split(solve(inner, right), [1, 1 + p], axis=1)
-        gram = of_theta.T @ of_theta - (of_theta.T @ of_start) @ by_theta
-        reduced = of_theta.T @ r - (of_theta.T @ of_start) @ step[:, 0]
-        cost = r @ r + start @ start
-        known = jnp.diagonal(inverse) * unit**2
-        return NormalEquations(gram, reduced, cost), step[:, 0] * unit, by_theta * unit[:, None], known
+        jacobian, r = jax.jacfwd(residual, has_aux=True)(jnp.concatenate([theta, change]))
+        gram, score, cost = Equations.of_errors(jacobian.at[:, p:].multiply(free), r)
+        known = 1 / jnp.square(jnp.where(free, spread, 1.0))
+        gram, score = gram.at[p:, p:].add(jnp.diag(known)), score.at[p:].add(known * change)
+        return Equations(gram, score, cost + jnp.sum(known * change**2))
 
     every = problem.windows, problem.spread, problem.whitening
     return in_chunks(jax.vmap(one), (every, changes), CHUNK)

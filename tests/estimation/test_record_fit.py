@@ -225,3 +225,43 @@ def test_signals_that_share_no_time_are_refused():
     apart = Record.of("r", torque=([0.0, 1.0], [0, 1]), angle=([5.0, 6.0], [0, 1]))
     with pytest.raises(ValueError, match="r: torque, angle share less than dt"):
         fit_records(model_of(pendulum()), [apart], dt=0.02)
+
+
+def test_the_start_of_a_body_is_corrected_in_the_tangent_space_of_its_attitude():
+    """Gyro and position: the tilt of the start follows from where the thrust leads, and its quaternion keeps norm 1."""
+    level, hover = np.eye(13)[3], hj.IRIS.hover_speed
+    tilt = np.r_[np.zeros(3), 0.3, -0.2, np.zeros(8)]
+    t, random = np.arange(0.0, 1.0, 0.02), np.random.default_rng(0)
+    u = hover * (1.05 + 0.02 * random.normal(size=(len(t), 4)))
+    outputs = {"position": lambda x, u: x[:3], "rates": lambda x, u: x[10:]}
+
+    def model(k, start, tilted, attitude):
+        body = eqx.tree_at(lambda body: body.deviations["k"], hj.rigid_body(hj.IRIS, ("k",)), jnp.array(k))
+        start = np.asarray(body.state_space.retract(jnp.array(start), jnp.array(tilted[:12])))
+        spread = np.r_[np.zeros(3), attitude, np.zeros(6)]
+        return StateSpaceModel(body, ("speeds",), outputs, start, spread)
+
+    known = model(0.1, level, tilt, np.zeros(3))
+    wanted = Record.of("r", speeds=(t, u), position=(t, np.zeros((len(t), 3))), rates=(t, np.zeros((len(t), 3))))
+    y = simulate(known, wanted, dt=0.02)[0]
+    made = {name: (t, each + 1e-3 * random.normal(size=each.shape)) for name, each in y.items()}
+    start = model(0.0, level, np.zeros(12), (1.0, 1.0, 0.0))
+    fit = fit_records(start, [Record.of("r", speeds=(t, u), **made)], dt=0.02)
+    assert np.linalg.norm(fit.starts[0, 3:7]) == pytest.approx(1)
+    np.testing.assert_allclose(fit.starts[0, 3:7], known.start[3:7], atol=5e-3)
+    assert fit.starts_error.shape == (1, 12)
+    assert (fit.starts_error[0, 3:5] > 0).all()
+    assert float(fit.model.field.deviations["k"]) == pytest.approx(0.1, abs=5e-3)
+
+
+class Blind(Pendulum):
+    """With a number that nothing depends on."""
+
+    unused: jax.Array
+
+
+def test_a_number_without_any_effect_is_named_and_the_others_keep_their_intervals(records):
+    field = Blind(jnp.log(jnp.array(0.8)), jnp.array(0.3), jnp.array(1.0))
+    fit = fit_records(model_of(field), records[:1], dt=0.02)
+    assert fit.undetermined == ("unused",)
+    assert float(fit.intervals["unused"].value) == 1.0

@@ -1,0 +1,169 @@
+"""Least squares in parameters θ that all pieces of the data share, and unknowns that each piece has of its own.
+
+A piece is a window or a record. Its own unknowns, such as its initial state, are eliminated from the normal equations
+piece by piece (a Schur complement, as in multiple shooting; Bock 1983), so no matrix grows with the number of pieces.
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from hybrid_jax.estimation.levenberg_marquardt import begin, in_python, minimise, move_of_equations
+from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses
+from hybrid_jax.matrices import solve
+from hybrid_jax.status import Status
+
+FLAT = 1e-12  # of a gradient's norm
+
+
+class Equations(NamedTuple):
+    """Normal equations of n pieces in θ and then in what each has of its own, of q numbers together.
+
+    Attributes:
+        gram: JᵀJ.
+        score: Jᵀr.
+        cost: of the errors r, by default rᵀr.
+    """
+
+    gram: Float[Array, "*n q q"]
+    score: Float[Array, "*n q"]
+    cost: Float[Array, "*n"]
+
+    @staticmethod
+    def of_errors(jacobian: Float[Array, "s q"], r: Float[Array, " s"], robust: float = np.inf) -> "Equations":
+        """Of one piece; an error of more than `robust` counts linearly, not as a square (Huber 1964)."""
+        size = jnp.maximum(jnp.abs(r), FLAT)
+        weighted = jacobian * jnp.minimum(1.0, robust / size)[:, None]
+        cost = r**2 if np.isinf(robust) else jnp.where(size <= robust, r**2, 2 * robust * size - robust**2)
+        return Equations(weighted.T @ jacobian, weighted.T @ r, jnp.sum(cost))
+
+
+class Reduced(NamedTuple):
+    """What is left for θ (p), and what a step of θ means for the rest: it moves by −(offset + slope Δθ)."""
+
+    equations: NormalEquations
+    offset: Float[Array, "n s"]
+    slope: Float[Array, "n s p"]
+
+
+@partial(jax.jit, static_argnums=1)
+def reduced(equations: Equations, p: int, damping: Float[Array, ""] | float = 0.0) -> Reduced:
+    """Eliminate what pieces have of their own; `damping` is relative to the diagonal of its normal equations."""
+    gram, score, cost = equations
+    size = jnp.sqrt(jnp.diagonal(gram[:, p:, p:], axis1=1, axis2=2))
+    unit = jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 0)[..., None]
+    held = gram[:, p:, p:] * unit * unit.swapaxes(1, 2) + jax.vmap(jnp.diag)(jnp.where(size > 0, damping, 1.0))
+    right = jnp.concatenate([score[:, p:, None], gram[:, p:, :p]], axis=2)
+    found = unit * jax.vmap(solve)(held, unit * right)
+    across = jnp.einsum("nps,nsq->npq", gram[:, :p, p:], found)
+    left = NormalEquations(gram[:, :p, :p] - across[..., 1:], score[:, :p] - across[..., 0], cost)
+    return Reduced(left, found[..., 0], found[..., 1:])
+
+
+@partial(jax.jit, static_argnums=1)
+def move(equations: Equations, p: int, damping: Float[Array, ""], free: Bool[Array, " p"], least: float):
+    """A step of θ, those of the rest (n, s), and by how much they should lower the cost."""
+    (gram, score, _), offset, slope = reduced(equations, p, damping)
+    gram, score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
+    seen = free & (jnp.diagonal(gram) > least)
+    step, expected = jnp.zeros(p), jnp.zeros(())
+    if p:
+        both = jnp.where(seen[:, None] & seen, gram, 0)
+        step, expected = move_of_equations(both, jnp.where(seen, score, 0), damping)
+    own = -offset - jnp.einsum("nsp,p->ns", slope, step)
+    weight = jnp.diagonal(equations.gram[:, p:, p:], axis1=1, axis2=2)
+    return step, own, expected + jnp.sum(equations.score[:, p:] * offset) + damping * jnp.sum(weight * own**2)
+
+
+class End(NamedTuple):
+    """Where a search ended.
+
+    Attributes:
+        theta: the parameters (p).
+        own: what each piece has of its own.
+        equations: there.
+        steps: of Levenberg–Marquardt.
+        status: how it ended.
+    """
+
+    theta: Float[Array, " p"]
+    own: Float[Array, "n s"]
+    equations: Equations
+    steps: int
+    status: Status
+
+
+def descend(
+    equations: Callable[[Any, Any], Equations],
+    theta: Float[Array, " p"],
+    own: Float[Array, "n s"],
+    *,
+    free: Bool[Array | np.ndarray, " p"] | None = None,
+    least: float = 0.0,
+    max_steps: int = 50,
+    tolerance: float = 1e-6,
+) -> End:
+    """The parameters and unknowns of least cost.
+
+    Args:
+        equations: of θ and what pieces have of their own.
+        theta: the start.
+        own: the start of what pieces have of their own.
+        free: the parameters that move, by default all.
+        least: information of a parameter, after elimination, up to which it stays.
+        max_steps: of Levenberg–Marquardt.
+        tolerance: a step that lowers the cost by a smaller share is slow.
+    """
+    moves = jnp.ones(len(theta), bool) if free is None else jnp.asarray(free)
+
+    def evaluate(point, _):
+        found = equations(*point)
+        return jnp.sum(found.cost), (point, found)
+
+    def aim(best, damping):
+        (theta, own), found = best
+        step, change, expected = move(found, len(theta), damping, moves, least)
+        return (theta + step, own + change), expected, 0.0
+
+    point, nothing = (theta, own), Equations(*3 * (jnp.zeros(()),))
+    end = minimise(evaluate, aim, begin(point, (point, nothing)), max_steps, tolerance, in_python)
+    (theta, own), found = end.best
+    return End(theta, own, found, int(end.steps), Status(int(end.status)))
+
+
+def covariance(
+    equations: Equations, p: int, meat: Float[np.ndarray, "n q q"] | None = None
+) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "n s"]]:
+    """The covariance of θ, and the variances of what pieces have of their own; infinite where no error tells them.
+
+    Args:
+        equations: at the minimum.
+        p: the number of parameters.
+        meat: the covariance of the score of each piece (a sandwich; White 1980), by default its Gram matrix.
+    """
+    gram = np.asarray(equations.gram)
+    meat = gram if meat is None else meat
+    own = inverses(jnp.asarray(gram[:, p:, p:]))
+    back, own_told = np.asarray(own.matrix), np.asarray(own.told)
+    slope = back @ gram[:, p:, :p]
+    theta, told = np.zeros((p, p)), np.ones(p, bool)
+    if p:
+        found = inverse(jnp.asarray((gram[:, :p, :p] - gram[:, :p, p:] @ slope).sum(axis=0)))
+        theta, told = np.asarray(found.matrix), np.asarray(found.told)
+    through = np.concatenate([np.broadcast_to(np.eye(p), (len(gram), p, p)), -slope], axis=1)
+    half = theta @ through.swapaxes(1, 2) @ meat  # (n, p, q)
+    cov = (half @ through).sum(axis=0) @ theta
+    variance = np.einsum("nsp,pq,nsq->ns", slope, cov, slope) - 2 * np.einsum(
+        "nsp,npt,nts->ns", slope, half[..., p:], back
+    )
+    variance += np.einsum("nst,ntu,nus->ns", back, meat[:, p:, p:], back)
+    size = np.sqrt(np.maximum(np.diagonal(gram, axis1=1, axis2=2), 0.0))
+    total = np.sqrt((size[:, :p] ** 2).sum(axis=0))
+    leak = np.abs(slope[..., ~told]) * size[:, p:, None] / np.where(total > 0, total, 1.0)[~told]
+    lost = ~own_told | (leak > np.sqrt(np.finfo(float).eps)).any(axis=2)
+    return cov + np.diag(np.where(told, 0.0, np.inf)), np.where(lost, np.inf, np.maximum(variance, 0.0))
