@@ -19,8 +19,10 @@ from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_of, rotation_
 from hybrid_jax.flights.checks.cleaning import in_flight
 from hybrid_jax.flights.checks.consistency import FAILS, UNKNOWN, WARNS, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording
-from hybrid_jax.flights.load import find_logs, read_log, recording_of
+from hybrid_jax.flights.formats.raw import WXYZ, XYZ, Samples, record
+from hybrid_jax.flights.load import find_logs, read_log
 from hybrid_jax.flights.log import FlightLog
+from hybrid_jax.flights.recording import Recording
 from hybrid_jax.sim.domain import EXTERNAL_FORCE, PARAMETER_SHIFT, SOURCE, Domain
 from hybrid_jax.sim.flight import DT, gone_wrong, random_flights
 from hybrid_jax.vehicle import IRIS, load_vehicle
@@ -138,11 +140,20 @@ def sound_logs(domain: Domain, seed: int) -> list[FlightLog]:
     return logs
 
 
+def recording_of(log: Parts) -> Recording:
+    """What a reader of CSV makes of such columns."""
+    names = {"p": ("position", XYZ), "q": ("attitude", WXYZ), "v": ("velocity", XYZ), "w": ("rates", XYZ)}
+    names["u"] = "rotor_speed", tuple(map(str, range(log["u"].shape[1])))
+    samples = {name: Samples(log["t"], log[key], axes, f"columns of {name}") for key, (name, axes) in names.items()}
+    return record("flight", samples, facts={"format": "CSV"})
+
+
 def said(log: Parts) -> list[tuple[str, str]]:
     """Verdict and suggestion of every check that does not pass; or why the log is refused."""
     try:
+        recording = recording_of(log)
         whole = FlightLog(log["t"], np.concatenate([log[name] for name in "pqvw"], axis=1), log["u"])
-        found = [*check_recording(recording_of(whole), IRIS, DT), *check_log(whole, IRIS)]
+        found = [*check_recording(recording, IRIS, DT), *check_log(whole, IRIS)]
     except ValueError as error:
         return [(FAILS, str(error))]
     return [(check.verdict, f"{check.name}: {check.suggestion}") for check in found if check.verdict in (FAILS, WARNS)]

@@ -13,7 +13,7 @@ from hybrid_jax.control import Controller
 from hybrid_jax.export.program import sizes_of
 from hybrid_jax.flights.checks.consistency import OK, check_log
 from hybrid_jax.flights.checks.motor_response import respond
-from hybrid_jax.flights.formats.csv import read_csv
+from hybrid_jax.flights.load import load_log
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.sim.domain import Domain
 from hybrid_jax.sim.flight import random_flights
@@ -69,7 +69,7 @@ def test_logs_of_six_rotors_are_read_and_motors_in_another_order_found(flown, tm
     header = ",".join(["t", *STATE_NAMES, *input_names(6)])
     path = tmp_path / "hexa.csv"
     np.savetxt(path, np.column_stack([log.t, log.x, log.u[:, order]]), "%.9g", ",", header=header, comments="")
-    read = read_csv(path)
+    read = load_log(path)
     np.testing.assert_allclose(read.u, log.u[:, order], rtol=1e-8)
     for each, right in ((log, True), (read, False)):
         found = respond(each, HEXA)

@@ -21,7 +21,7 @@ from hybrid_jax.cli.logs import LISTS, look, raw_logs
 from hybrid_jax.cli.vehicle_text import vehicle_text
 from hybrid_jax.dynamics.vehicle_file import load_vehicle_model
 from hybrid_jax.flights.checks.consistency import FAILS, NEED_VEHICLE, UNKNOWN, WARNS, Check
-from hybrid_jax.flights.load import RawLog, read_log, read_recording
+from hybrid_jax.flights.load import read_log
 from hybrid_jax.flights.recording import AXES, ROTOR_UNITS, Recording, Signal
 from hybrid_jax.io.files import write_atomic
 from hybrid_jax.vehicle import Vehicle
@@ -129,7 +129,7 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Options) -> Inspecte
     """Read and check one log; what refuses it is part of the result."""
     name = printable(path.name)
     try:
-        raw = _read(path, options)
+        raw = read_log(path, **options.reading)
     except ValueError as error:
         why = str(error).removeprefix(f"{path}: ")
         return Inspected(name, None, refusal=printable(in_flags("inspect", why)))
@@ -138,13 +138,6 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Options) -> Inspecte
     return Inspected(
         name, raw.recording, told, in_flags("inspect", found.refusal), (*raw.recording.notes, *found.notes)
     )
-
-
-def _read(path: Path, options: Options) -> RawLog:
-    """The log, also where it is a CSV file without all that a flight needs."""
-    if options.columns is not None and path.name.lower().endswith((".csv", ".csv.gz")):
-        return RawLog(read_recording(path, **options.reading))
-    return read_log(path, **options.reading)
 
 
 def trusted(logs: Sequence[Inspected]) -> list[Recording]:

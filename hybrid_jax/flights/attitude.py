@@ -57,14 +57,6 @@ def from_euler(angles: Vectors) -> Quaternions:
     return quaternion_of(scipy.spatial.transform.Rotation.from_euler("ZYX", angles[:, ::-1]))
 
 
-def to_library(p: Vectors, q: Quaternions, v: Vectors, omega: Vectors, frames: Frames) -> Float[np.ndarray, "n 13"]:
-    """States in the library's frames from position, attitude body → world, velocity and body rates in `frames`."""
-    world, body = WORLDS[frames.world], BODIES[frames.body]
-    attitude = scipy.spatial.transform.Rotation.from_matrix(world @ rotation_of(q).as_matrix() @ body.T)
-    velocity = attitude.apply(v @ body.T) if frames.velocity == "body" else v @ world.T
-    return np.concatenate([p @ world.T, quaternion_of(attitude), velocity, omega @ body.T], axis=1)
-
-
 def rates_between(t: Float[np.ndarray, " n"], q: Quaternions) -> Float[np.ndarray, "n-1 3"]:
     """Mean body rates [rad/s] that turn each attitude into the next."""
     attitude = rotation_of(q)

@@ -7,25 +7,25 @@ import warnings
 import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from functools import reduce
 from pathlib import Path
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 
+from hybrid_jax.flights.attitude import rotation_of
 from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.checks.consistency import FAILS, WARNS, Check
 from hybrid_jax.flights.checks.suitability import check_recording
 from hybrid_jax.flights.conversion import DT, to_flight
 from hybrid_jax.flights.formats.blackbox import read_blackbox
-from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped, record_mapped
+from hybrid_jax.flights.formats.column_map import ColumnMap, load_column_map, read_mapped
 from hybrid_jax.flights.formats.crazyflie import is_crazyflie, read_crazyflie
-from hybrid_jax.flights.formats.csv import notes_on_end, read_csv
-from hybrid_jax.flights.formats.raw import WXYZ, XYZ, Samples, is_packed, opened, record
+from hybrid_jax.flights.formats.raw import is_packed, opened
 from hybrid_jax.flights.formats.rosbag import read_rosbag
 from hybrid_jax.flights.formats.ulog import read_ulog
 from hybrid_jax.flights.log import FlightLog, unevenness
 from hybrid_jax.flights.recording import ROTOR_UNITS, Recording
-from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 from hybrid_jax.vehicle import Vehicle
 
 CSV, ULOG, CRAZYFLIE, ROSBAG, BLACKBOX = "CSV", "PX4 ULog", "Crazyflie µSD", "rosbag", "Betaflight blackbox"
@@ -43,6 +43,8 @@ UNREAD = {".px4log": PX4LOG, b"\xa3\x95\x80": CONVERT, b"PK\x03\x04": "a zip arc
 UNREAD |= {".tlog": "MAVLink telemetry, not read: it is too slow; give the log of the vehicle's own card"}
 OTHER = "no format that is read"
 BAG = "metadata.yaml"  # makes a folder one recording of ROS 2
+PARTS = ("position", "attitude", "velocity", "rates", "rotor_speed")
+WHOLE = 0.9  # share of the rows of a CSV file that must hold all of them, for a flight at their times
 Failed = Literal["refuse", "warn"]
 
 
@@ -159,7 +161,7 @@ def read_folder(
     """
     paths, left = find_logs(folder)
     if not paths:
-        others = "; ".join(f"{path.name}: {why}" for path, why in [*left.items()][:5])
+        others = "; ".join(f"{path.name}: {why.replace('FILE', path.name)}" for path, why in [*left.items()][:5])
         found = f"; it holds {others}" if left else ""
         raise ValueError(f"{folder}: holds no flights ({', '.join(SUFFIXES)}){found}")
     columns = _column_map(columns)
@@ -174,16 +176,23 @@ def read_log(
     motor_order: Sequence[int] = (),
 ) -> RawLog:
     """Read one log of any format of `read_recording`; arguments and errors as of it."""
-    if format_of(path) != CSV:
-        return RawLog(read_recording(path, columns, topics, motor_order))
-    column_map = _column_map(columns)
-    log = read_csv(path) if column_map is None else read_mapped(path, column_map)
-    if len(log) < 2:
-        raise ValueError(f"{path}: row 2, field t: a flight needs at least two samples; leave the file out")
-    if len(motor_order):
-        log = replace(log, u=log.u[:, require_order(path, motor_order, log.u.shape[1])])
-    recording = recording_of(log)
-    return RawLog(replace(recording, notes=(*recording.notes, *notes_on_end(path))), log)
+    recording = read_recording(path, columns, topics, motor_order)
+    return RawLog(recording, _of_rows(recording) if recording.facts.get("format") == CSV else None)
+
+
+def _of_rows(recording: Recording) -> FlightLog | None:
+    """The flight at the times of the rows of a file, if most of them hold all that a flight needs; else None."""
+    names = {"velocity" if "velocity" in recording.signals else "body_velocity", "rotor_speed"}
+    names |= {"position", "attitude", "rates"}
+    found = {name.removeprefix("body_"): each for name, each in recording.signals.items() if name in names}
+    if len(found) < len(names):
+        return None
+    t = reduce(np.intersect1d, (each.t for each in found.values()))
+    if len(t) < max(2, WHOLE * max(map(len, found.values()))):
+        return None
+    p, q, v, omega, u = (found[name].values[np.isin(found[name].t, t)] for name in PARTS)
+    v = rotation_of(q).apply(v) if "body_velocity" in names else v
+    return FlightLog(t, np.concatenate([p, q, v, omega], axis=1), u, recording.name)
 
 
 def _column_map(columns: ColumnMap | str | Path | None) -> ColumnMap | None:
@@ -271,9 +280,7 @@ def read_recording(
     if not Path(path).exists():
         raise ValueError(f"{path}: no such file")
     if kind == CSV:
-        column_map = _column_map(columns)
-        found = recording_of(read_csv(path)) if column_map is None else record_mapped(path, column_map)
-        found = replace(found, notes=(*found.notes, *notes_on_end(path)))
+        found = read_mapped(path, _column_map(columns))
     elif kind == ROSBAG and Path(path).is_file() and is_packed(path):
         raise ValueError(f"{path}: a {kind} is not read from gzip; unpack it first: gunzip {Path(path).name}")
     elif kind == ROSBAG:
@@ -285,17 +292,6 @@ def read_recording(
         why = f"is none of {', '.join(dict.fromkeys(SUFFIXES.values()))}, {CRAZYFLIE}" if why == OTHER else why
         raise ValueError(f"{path}: {why.replace('FILE', Path(path).name)}")
     return reordered(found, motor_order) if len(motor_order) else found
-
-
-def recording_of(log: FlightLog) -> Recording:
-    """A flight as a recording of its columns."""
-    states = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "rates": BODY_RATES}
-    parts = {
-        name: Samples(log.t, log.x[:, part], WXYZ if name == "attitude" else XYZ, f"columns of {name}")
-        for name, part in states.items()
-    }
-    parts["rotor_speed"] = Samples(log.t, log.u, tuple(map(str, range(log.u.shape[1]))), "columns of the motors")
-    return record(log.name, parts, facts={"format": CSV})
 
 
 def reordered(recording: Recording, motor_order: Sequence[int]) -> Recording:

@@ -12,11 +12,6 @@ from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
 GAP = 1.5  # intervals longer than this many times the median are gaps
-SHARED = 0.1  # share of samples with the time of the one before, from which on that is no double
-ORDER = "sort the samples, drop doubles, split restarted clocks"
-FEW_DIGITS = "it has too few digits, as of %g: write it with nine after the point, or as whole µs"
-# Counters that may begin anew: what they are called, and the seconds that they count to.
-WRAPS = {f"{bits} bits of {unit}": 2**bits * tick for bits in (16, 32) for unit, tick in (("µs", 1e-6), ("ms", 1e-3))}
 JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
 
 
@@ -45,7 +40,10 @@ class FlightLog:
         if t.ndim != 1 or x.shape != (len(t), STATE_SIZE) or u.shape != (len(t), rotors):
             shapes = f"(n,), (n, 13), (n, {FEWEST_ROTORS} … {MOST_ROTORS})"
             raise ValueError(f"{self.name}: t, x, u must be {shapes}, got {t.shape}, {x.shape}, {u.shape}")
-        require_possible(t, x, u, self.name)
+        if len(t) == 0:
+            raise ValueError(f"{self.name}: has no samples; record or export the flight again")
+        for sample, name, complaint in _problems(t, x, u):
+            raise ValueError(f"{self.name}: sample {sample}, field {name}: {complaint}")
         x[:, QUATERNION] = _canonical(x[:, QUATERNION])
         for name, array in (("t", t), ("x", x), ("u", u)):
             object.__setattr__(self, name, array)
@@ -69,18 +67,6 @@ class FlightLog:
         return round(float(np.median(np.diff(self.t))), 9)
 
 
-def require_possible(t, x, u, origin, unit: str = "sample", first: int = 0) -> None:
-    """Refuse numbers that are impossible in a flight, in messages that count from `first`, as in ("row", 2).
-
-    Raises:
-        ValueError: origin, sample, field and what to do, in one line.
-    """
-    if len(t) == 0:
-        raise ValueError(f"{origin}: has no samples; record or export the flight again")
-    for sample, name, complaint in _problems(t, x, u):
-        raise ValueError(f"{origin}: {unit} {sample + first}, field {name}: {complaint}")
-
-
 def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     """Impossible values: index of the sample, field and what to do."""
     rotors = input_names(u.shape[1])
@@ -90,21 +76,12 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     # Compare, as a difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"
-        why = wrapped(float(t[row - 1] - t[row] + np.median(np.diff(t[:row])))) if row > 1 else ""
-        few = t[row] == t[row - 1] and (np.diff(t) == 0).mean() > SHARED
-        mend = FEW_DIGITS if few else f"{why}: count on, or split the file there" if why else ORDER
-        yield row, "t", f"time {times}; {mend}"
+        yield row, "t", f"time {times}; sort the samples, drop doubles, split restarted clocks"
     for row, norm in wrong_norms(x[:, QUATERNION]):
         advice = "cut out samples without an attitude" if norm == 0 else "are these the four quaternion columns?"
         yield row, "qw qx qy qz", f"norm is {norm:.4g}, not 1; {advice}"
     for row, column in np.argwhere(u < 0)[:1].tolist():
         yield row, rotors[column], f"rotor speed {u[row, column]:.6g} is negative; give its magnitude in rad/s"
-
-
-def wrapped(fall: float) -> str:
-    """Which counter, if any, falls by so many seconds when it begins anew."""
-    found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
-    return f"a counter of {found[0]} began anew" if found else ""
 
 
 def unlike_one(q: Float[np.ndarray, "n 4"]) -> Bool[np.ndarray, " n"]:

@@ -7,13 +7,13 @@ import pytest
 from recorded import LOGS, write
 from rich.console import Console
 
+from benchmarks.log_mistakes import parts_of, recording_of
 from experiments.identify.__main__ import Config, checked, main
 from experiments.identify.checked import compared
 from experiments.real_flight.simulated import vehicle_toml
 from hybrid_jax.dynamics.actuators import Actuator
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS
-from hybrid_jax.flights.load import recording_of
 from hybrid_jax.vehicle import IRIS
 
 ACTUATOR = "[actuator]\ncurve = [100.0, 900.0]\n"
@@ -86,7 +86,7 @@ def failed(recording, learn=("k", "Ix"), vehicle=IRIS):
 
 def commanded(log, *left_out):
     """A recording of commands, without some signals."""
-    recording = recording_of(log)
+    recording = recording_of(parts_of(log))
     speeds = recording.signals["rotor_speed"]
     signals = {name: signal for name, signal in recording.signals.items() if name not in ("rotor_speed", *left_out)}
     return replace(recording, signals=signals | {"command": replace(speeds, values=(log.u - 100) / 900)})
@@ -109,10 +109,10 @@ def test_states_are_compared_with_what_there_is_of_them():
 
 def test_a_thrust_that_is_learned_may_be_off_but_not_in_another_unit():
     weak, ratio = replace(IRIS, thrust_coefficient=IRIS.thrust_coefficient / 3), "specific force over thrust per mass"
-    assert ratio not in failed(recording_of(LOGS[0]), vehicle=weak)
-    assert ratio in failed(recording_of(LOGS[0]), learn=("Ix",), vehicle=weak)
+    assert ratio not in failed(recording_of(parts_of(LOGS[0])), vehicle=weak)
+    assert ratio in failed(recording_of(parts_of(LOGS[0])), learn=("Ix",), vehicle=weak)
     rpm = replace(LOGS[0], u=LOGS[0].u * 30 / np.pi)
-    assert ratio in failed(recording_of(rpm))
+    assert ratio in failed(recording_of(parts_of(rpm)))
 
 
 def test_slow_signals_are_not_compared_as_if_they_were_fast():

@@ -5,10 +5,19 @@ import pytest
 from surface import refusal
 
 from hybrid_jax.flights import attitude
-from hybrid_jax.flights.attitude import Frames, from_euler, mean_of_held, rotation_of, to_library
+from hybrid_jax.flights.attitude import Frames, from_euler, mean_of_held, rotation_of
+from hybrid_jax.flights.formats import raw
 
 NED, LEVEL = Frames("NED", "FRD", "world"), np.array([[1.0, 0, 0, 0]])
 NONE, DEG = np.zeros((1, 3)), np.pi / 180
+
+
+def to_library(p, q, v, omega, frames):
+    turned = raw.attitude(q, frames.world, frames.body)
+    moving = (
+        rotation_of(turned).apply(raw.body(v, frames.body)) if frames.velocity == "body" else raw.world(v, frames.world)
+    )
+    return np.concatenate([raw.world(p, frames.world), turned, moving, raw.body(omega, frames.body)], axis=1)
 
 
 def row(*numbers):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hybrid_jax.flights.formats.column_map import load_column_map, record_mapped
+from hybrid_jax.flights.formats.column_map import load_column_map, read_mapped
 from hybrid_jax.flights.formats.raw import own_samples
 
 
@@ -57,14 +57,14 @@ def test_a_mapped_csv_says_which_columns_were_lines(tmp_path):
     rates = rng.normal(size=(501, 3))
     names = ["t", "u0", "u1", "u2", "u3", "p", "q", "r"]
     rows = [",".join(map(repr, row)) for row in np.column_stack([t, slow, rates]).tolist()]
-    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows]))
+    (tmp_path / "log.csv").write_text("\n".join([",".join(names), *rows, ""]))
     (tmp_path / "map.toml").write_text(
         'frames = { world = "NED", body = "FRD", velocity = "world" }\n'
         'time = { columns = ["t"], unit = "s" }\n'
         'body_rates = { columns = ["p", "q", "r"], unit = "rad/s" }\n'
         'motors = { columns = ["u0", "u1", "u2", "u3"], unit = "pwm" }\n'
     )
-    found = record_mapped(tmp_path / "log.csv", load_column_map(tmp_path / "map.toml"))
+    found = read_mapped(tmp_path / "log.csv", load_column_map(tmp_path / "map.toml"))
     assert len(found.signals["command"]) == 51
     assert len(found.signals["rates"]) == 501
     (note,) = found.notes

@@ -12,8 +12,8 @@ motors = {columns = ["m3", "m1", "m4", "m2"], unit = "rpm"}     # rad/s, rpm, re
 format = {delimiter = ";", decimal = ","}                       # optional, by default "," and "."
 
 All but frames and time may be left out; training on states needs position, attitude, velocity, body_rates and motors.
-Commands are in unit share (0 … 1), pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047); or in any unit of the
-log, called command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
+Commands are in unit share (0 … 1), percent, pwm (1000 … 2000 µs), 16bit (0 … 65535) or dshot (48 … 2047); or in any
+unit of the log, called command, with polynomial = [c0, c1, …]: rad/s = c0 + c1 command + c2 command² …
 """
 
 import math
@@ -23,11 +23,11 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.flights.attitude import Frames, from_euler, to_library
+from hybrid_jax.flights.attitude import Frames, from_euler
 from hybrid_jax.flights.formats import raw
-from hybrid_jax.flights.formats.csv import flight_log, read_table
-from hybrid_jax.flights.log import FlightLog, wrong_norms
+from hybrid_jax.flights.formats.csv import header_of, notes_on_end, read_table
 from hybrid_jax.flights.recording import Recording
+from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, STATE_NAMES, VELOCITY, input_names
 from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS, from_table, read_tables, require_known
 
 SCALES = {
@@ -39,13 +39,12 @@ SCALES = {
     "specific_force": {"m/s²": 1.0, "m/s^2": 1.0, "g": 9.81},
     "voltage": {"V": 1.0, "mV": 1e-3},
     "motors": {"rad/s": 1.0, "rpm": math.pi / 30, "rev/s": 2 * math.pi, "command": 1.0}
-    | {"share": 1.0, "pwm": 1e-3, "16bit": 1 / 65535, "dshot": 1 / 1999},
+    | {"share": 1.0, "percent": 1e-2, "pwm": 1e-3, "16bit": 1 / 65535, "dshot": 1 / 1999},
 }
 REST = {"pwm": 1000.0, "dshot": 48.0}  # values of motors at rest
 DISARMED = 0.8  # of the value at rest
-SHARES = ("share", "pwm", "16bit", "dshot")  # units of commands
+SHARES = ("share", "percent", "pwm", "16bit", "dshot")  # units of commands
 COUNTS = {"time": 1, "position": 3, "velocity": 3, "body_rates": 3, "specific_force": 3, "voltage": 1}
-STATES = ("position", "attitude", "velocity", "body_rates", "motors")  # what training on states needs
 
 
 @dataclass(frozen=True)
@@ -150,37 +149,43 @@ def load_column_map(path: str | Path) -> ColumnMap:
     return from_table(ColumnMap, parts, str(path))
 
 
-def read_mapped(path: str | Path, column_map: ColumnMap) -> FlightLog:
-    """Read one flight of a CSV file, plain or gzip, into the library's units and frames, at the times of its rows.
-
-    Raises:
-        ValueError: file, row, field and what to do, in one line.
-    """
-    stated = column_map.quantities
-    for name in STATES:
-        if name not in stated:
-            raise ValueError(
-                f"{path}: the column map states no {name}; a model of states is trained on all of {STATES}"
-            )
-    if stated["motors"].unit in SHARES and not stated["motors"].polynomial:
-        raise ValueError(f"{path}: [motors] are commands; add polynomial = [c0, c1, …]: rad/s = c0 + c1 share …")
-    parts = _parts(path, column_map)
-    q = _attitude(parts["attitude"], stated["attitude"], path)
-    u = _speeds(parts["motors"], stated["motors"])
-    x = to_library(parts["position"], q, parts["velocity"], parts["body_rates"], column_map.frames)
-    return flight_log(path, np.concatenate([parts["time"], x, u], axis=1))
+def library_map(path: str | Path) -> ColumnMap:
+    """The map of a file with the library's columns t, px … wz, u0 …; errors as of `read_table`."""
+    names, motors = header_of(path), input_names(MOST_ROTORS)
+    count = max([FEWEST_ROTORS, *(i + 1 for i, name in enumerate(motors) if name in names)])
+    parts = {"position": POSITION, "attitude": QUATERNION, "velocity": VELOCITY, "body_rates": BODY_RATES}
+    units = {"position": "m", "attitude": "wxyz", "velocity": "m/s", "body_rates": "rad/s"}
+    stated = {name: Columns(STATE_NAMES[part], units[name]) for name, part in parts.items()}
+    frames, time = Frames("ENU", "FLU", "world"), Columns(("t",), "s")
+    return ColumnMap(frames, time, **stated, motors=Columns(motors[:count], "rad/s"))
 
 
-def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
+def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Recording:
     """Read what a CSV file, plain or gzip, holds of the quantities of a recording.
 
+    A row without a time is left out. A quantity that stands in some rows only, as in tables of several rates that were
+    joined, has the times of these.
+
+    Args:
+        path: of the file.
+        column_map: the meaning of its columns; by default it has the library's.
+
     Raises:
         ValueError: file, row, field and what to do, in one line.
     """
+    column_map = library_map(path) if column_map is None else column_map
     parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
-    t, found = parts.pop("time")[:, 0], {}
+    t, found, notes = parts.pop("time")[:, 0], {}, list(notes_on_end(path))
+    timed = np.isfinite(t)
+    notes += [f"{(~timed).sum()} rows without a time: left out"] * (not timed.all())
     for name, values in parts.items():
         quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), raw.XYZ
+        source = f"columns {' '.join(stated[name].columns)}"
+        told = timed & np.isfinite(values).all(axis=1)
+        seldom = told.sum() < raw.LOST * timed.sum()
+        notes += [f"{source}: {name} stands in {told.sum()} of {len(t)} rows"] * bool(seldom)
+        rows = told if seldom else timed
+        values = values[rows]
         if name == "attitude":
             values = raw.attitude(_attitude(values, stated[name], path), frames.world, frames.body)
             axes = raw.WXYZ
@@ -195,9 +200,8 @@ def record_mapped(path: str | Path, column_map: ColumnMap) -> Recording:
         else:
             values = raw.body(values, frames.body)
             quantity = "body_velocity" if name == "velocity" else quantity
-        source = f"columns {' '.join(stated[name].columns)}"
-        found[quantity] = raw.Samples(t, values, axes, source)
-    return raw.record(path, found, facts={"format": "CSV"})
+        found[quantity] = raw.Samples(t[rows], values, axes, source)
+    return raw.record(path, found, notes=notes, facts={"format": "CSV"})
 
 
 def _parts(path, column_map: ColumnMap) -> dict[str, Float[np.ndarray, "n k"]]:
@@ -227,15 +231,11 @@ def _attitude(values: Float[np.ndarray, "n k"], stated: Columns, origin: str | P
     fields = " ".join(stated.columns)
     if len(stated.columns) == 3:
         # Yaw may be counted over turns, tilt may not.
-        for row in np.flatnonzero((np.abs(values[:, :2]) > 2 * math.pi).any(axis=1))[:1]:
+        if (np.abs(values[:, :2]) > 2 * math.pi).any():
             advice = 'roll or pitch above 2π; are the angles degrees? set [attitude] unit = "deg"'
-            raise ValueError(f"{origin}: row {row + 2}, field {fields}: {advice}")
+            raise ValueError(f"{origin}: field {fields}: {advice}")
         return from_euler(values)
-    q = np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
-    for row, norm in wrong_norms(q):
-        advice = "cut out samples without an attitude, or name the four quaternion columns"
-        raise ValueError(f"{origin}: row {row + 2}, field {fields}: norm is {norm:.4g}, not 1; {advice}")
-    return q
+    return np.roll(values, 1, axis=1) if stated.unit == "xyzw" else values
 
 
 def _check(name: str, stated: Columns) -> None:

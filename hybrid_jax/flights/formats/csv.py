@@ -1,7 +1,4 @@
-"""Flight-log CSV, plain or gzip: t, then the state, then the rotor speeds, one row per sample; SI units.
-
-The header names the columns. Their order is free, and other columns are ignored.
-"""
+"""Tables of numbers in CSV files, plain or gzip, with a header that names the columns, in any order."""
 
 import contextlib
 import io
@@ -14,35 +11,14 @@ from typing import IO
 import numpy as np
 from jaxtyping import Float
 
-from hybrid_jax.flights.attitude import rates_between
 from hybrid_jax.flights.formats.raw import opened, readable
-from hybrid_jax.flights.log import COLUMNS, FlightLog, require_possible
-from hybrid_jax.state import BODY_RATES, QUATERNION, input_names
-from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
 BLOCK = 1 << 22  # characters read at once
 LISTS = "a list in a cell: write each of its numbers in a column of its own"
 MAX_ROW_LENGTH = 1 << 16
-FURTHER = input_names(MOST_ROTORS)[FEWEST_ROTORS:]
+COMMENT = re.compile("[#%]+ *")
+NOTHING = ("", "null", "none", "na", "n/a", "-")  # cells without a number, beside nan
 MAX_ROWS = 4_000_000  # 0.6 GB of numbers; eleven hours at 100 Hz
-
-
-def read_csv(path: str | Path, *, max_rows: int = MAX_ROWS) -> FlightLog:
-    """Read one flight.
-
-    Raises:
-        ValueError: file, row (the first line is row 1), field and what to do, in one line.
-    """
-    return flight_log(path, read_table(path, COLUMNS[:-1], max_rows=max_rows, further=FURTHER))
-
-
-def flight_log(path: str | Path, table: Float[np.ndarray, "n c"]) -> FlightLog:
-    """Check the table of a file, in the order of `COLUMNS`, of any rotors; row i + 2 of the file holds table[i]."""
-    parts = table[:, 0], table[:, 1:14], table[:, 14:]
-    require_possible(*parts, path, "row", 2)
-    log = FlightLog(*parts, str(path))
-    _refuse_degrees(log)
-    return log
 
 
 def read_table(
@@ -52,12 +28,10 @@ def read_table(
     delimiter: str = ",",
     decimal: str = ".",
     max_rows: int = MAX_ROWS,
-    further: Sequence[str] = (),
 ) -> Float[np.ndarray, "n c"]:
-    """Read the named columns of a CSV file with a header, in the given order; all numbers must be finite.
+    """Read the named columns of a CSV file with a header, in the given order; a cell without a number is NaN.
 
-    Args:
-        further: columns that are read, too, up to the last of them that the file has.
+    Lines before the header that begin with # or % or say `sep=;` are passed over; the header may begin with them, too.
 
     Raises:
         ValueError: file, row, field and what to do, in one line.
@@ -65,7 +39,7 @@ def read_table(
     try:
         with readable(path) as file:
             text = io.TextIOWrapper(file, encoding="utf-8-sig")
-            parts = list(_parts(path, text, [columns, further], delimiter, decimal, max_rows))
+            parts = list(_parts(path, text, columns, delimiter, decimal, max_rows))
     except UnicodeDecodeError as error:
         raise ValueError(f"{path}: is not text; export the log as CSV in UTF-8") from error
     return np.concatenate(parts)
@@ -80,17 +54,30 @@ def notes_on_end(path: str | Path) -> tuple[str, ...]:
     return () if ended else (note,)
 
 
+def header_of(path: str | Path, delimiter: str = ",") -> list[str]:
+    """The names of the columns; errors as of `read_table`."""
+    with readable(path) as file, contextlib.suppress(UnicodeDecodeError):
+        return _header(io.TextIOWrapper(file, encoding="utf-8-sig"), delimiter)[0]
+    return []
+
+
+def _header(text: IO[str], delimiter: str) -> tuple[list[str], str, int]:
+    """Names of the columns, the line that holds them, and its row."""
+    row, line = 1, text.readline(MAX_ROW_LENGTH)
+    while (COMMENT.match(line) and delimiter not in line) or line.startswith("sep="):
+        row, line = row + 1, text.readline(MAX_ROW_LENGTH)
+    line = COMMENT.sub("", line.replace('"', ""))  # R and others put names in quotes, or all cells
+    return [name.strip() for name in line.split(delimiter)], line, row
+
+
 def _parts(
-    path, text: IO[str], asked, delimiter: str, decimal: str, max_rows: int
+    path, text: IO[str], columns: Sequence[str], delimiter: str, decimal: str, max_rows: int
 ) -> Iterator[Float[np.ndarray, "n c"]]:
-    header = text.readline(MAX_ROW_LENGTH).replace('"', "")  # R and others put names in quotes, or all cells
-    names = [name.strip() for name in header.split(delimiter)]
-    columns, further = asked
-    columns = [*columns, *further[: max((i + 1 for i, name in enumerate(further) if name in names), default=0)]]
+    names, header, above = _header(text, delimiter)
     for name in columns:
         if names.count(name) != 1:
             raise ValueError(_header_complaint(path, name, names, header, delimiter))
-    picked, row = [names.index(name) for name in columns], 2
+    picked, row = [names.index(name) for name in columns], above + 1
     while block := text.read(BLOCK):
         block += text.readline(MAX_ROW_LENGTH)
         block = block.replace('"', "")
@@ -100,12 +87,12 @@ def _parts(
         elif len(lines[-1]) >= MAX_ROW_LENGTH:
             last = row + len(lines) - 1
             raise ValueError(f"{path}: row {last}: is too long for a row of numbers; is this a CSV file?")
-        if row - 2 + len(lines) > max_rows:
+        if row - above - 1 + len(lines) > max_rows:
             raise ValueError(f"{path}: row {max_rows + 2}: more than {max_rows} rows; split the file by flight")
         yield _numbers(path, lines, row, names, picked, delimiter)
         row += len(lines)
-    if row == 2:
-        raise ValueError(f"{path}: row 2: there are no samples below the header; record or export the flight again")
+    if row == above + 1:
+        raise ValueError(f"{path}: row {row}: there are no samples below the header; record or export the flight again")
 
 
 def _header_complaint(path, name: str, names: list[str], header: str, delimiter: str) -> str:
@@ -113,7 +100,7 @@ def _header_complaint(path, name: str, names: list[str], header: str, delimiter:
         return f"{path}: row 1: the file is empty or has no header; export the log again"
     if name in names:
         return f"{path}: row 1, field {name}: stands {names.count(name)} times in the header; rename all but one"
-    for other in (";", "\t", ","):
+    for other in (";", "\t", ",", " "):
         if len(names) == 1 and other != delimiter and header.count(other) > 2:
             advice = f"set format = {{delimiter = {json.dumps(other)}}} in a column map, columns=…"
             return f"{path}: row 1: the fields are separated by {other!r}, not {delimiter!r}; {advice}"
@@ -130,11 +117,20 @@ def _numbers(path, lines: list[str], row: int, names, picked, delimiter: str) ->
             found = f"{line.count(delimiter) + 1} fields" if line.strip() else "a blank line"
             mend = LISTS if "[" in line else "repair or cut the row out"
             raise ValueError(f"{path}: row {row + at}: {found}, the header has {commas + 1}; {mend}")
-    with contextlib.suppress(ValueError):
-        table = np.loadtxt(lines, delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
-        if table.shape == (len(lines), len(picked)) and np.isfinite(table).all():
-            return table
+    for told in (lambda line: line, lambda line: _told(line, picked, delimiter)):
+        with contextlib.suppress(ValueError):
+            table = np.loadtxt(list(map(told, lines)), delimiter=delimiter, usecols=picked, comments=None, ndmin=2)
+            if table.shape == (len(lines), len(picked)):
+                return table
     raise ValueError(f"{path}: {_bad_cell(lines, row, names, picked, delimiter)}")
+
+
+def _told(line: str, picked, delimiter: str) -> str:
+    """A row in which picked cells that hold nothing are NaN."""
+    cells = line.split(delimiter)
+    for column in picked:
+        cells[column] = "nan" if cells[column].strip().lower() in NOTHING else cells[column]
+    return delimiter.join(cells)
 
 
 def _bad_cell(lines, row, names, picked, delimiter) -> str:
@@ -143,29 +139,14 @@ def _bad_cell(lines, row, names, picked, delimiter) -> str:
         for column in picked:
             cell = cells[column].strip()
             with contextlib.suppress(ValueError):
-                if np.isfinite(np.loadtxt([cell or "-"], delimiter=delimiter, comments=None)).all():
-                    continue
+                np.loadtxt(["nan" if cell.lower() in NOTHING else cell], delimiter=delimiter, comments=None)
+                continue
             if re.fullmatch(r"[+-]?\d+,\d+([eE][+-]?\d+)?", cell):
                 advice = 'set format = {delimiter = ";", decimal = ","} in a column map, columns=…'
                 return f"row {row + at}, field {names[column]}: {cell[:40]!r} has a decimal comma; {advice}"
             if re.match(r"\d{4}-\d\d-\d\d", cell) or cell.startswith("["):
                 kind = LISTS if cell.startswith("[") else "a date: write the time in seconds"
                 return f"row {row + at}, field {names[column]}: {cell[:40]!r} is {kind}"
-            found = f"{cell[:40]!r} is not a finite number" if cell else "the cell is empty"
-            return f"row {row + at}, field {names[column]}: {found}; cut the row out (it becomes a gap) or repair it"
+            found = f"{cell[:40]!r} is not a number; empty the cell (it becomes a gap) or repair it"
+            return f"row {row + at}, field {names[column]}: {found}"
     return f"rows {row} to {row + len(lines) - 1}: cannot be read as numbers; export the log again"
-
-
-def _refuse_degrees(log: FlightLog) -> None:
-    """Refuse body rates that are about 180/π times those of the attitude."""
-    if len(log) < 3:
-        return
-    log = log[:100_000]  # enough to decide, without a copy of a long log
-    turned = np.linalg.norm(rates_between(log.t, log.x[:, QUATERNION]), axis=1)
-    stated = np.linalg.norm(log.x[:-1, BODY_RATES], axis=1)
-    # Medians are robust to noise and lost samples.
-    if np.median(turned) > 0.02 and 30 < np.median(stated) / np.median(turned) < 110:
-        raise ValueError(
-            f"{log.name}: row {int(stated.argmax()) + 2}, field wx wy wz: body rates (here {stated.max():.4g}) are 57 "
-            "times those of the attitude: degrees per second; convert them to rad/s or declare the unit in a column map"
-        )

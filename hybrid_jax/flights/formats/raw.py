@@ -13,12 +13,16 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
-from hybrid_jax.flights.log import FEW_DIGITS, SHARED, unlike_one, wrapped, wrong_norms
+from hybrid_jax.flights.log import unlike_one, wrong_norms
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
 GZIP = b"\x1f\x8b"
 XYZ, WXYZ, BATTERY = ("x", "y", "z"), ("w", "x", "y", "z"), ("battery",)
 LATE = 0.1  # s; a time that is further behind is a restarted clock, not a sample that came late
+SHARED = 0.1  # share of samples with the time of the one before, from which on that is no double
+FEW_DIGITS = "it has too few digits, as of %g: write it with nine after the point, or as whole µs"
+# Counters that may begin anew: what they are called, and the seconds that they count to.
+WRAPS = {f"{bits} bits of {unit}": 2**bits * tick for bits in (16, 32) for unit, tick in (("µs", 1e-6), ("ms", 1e-3))}
 STRAY = 0.01  # share of samples whose time stamps may be wrong
 APART = 0.5  # share of a log's time by which a few samples at an end must lie off to be such
 LOST = 0.5  # share of samples that may be no number, or no rotation, and are left out
@@ -188,6 +192,12 @@ def _in_order(where: str, ticks: np.ndarray, tick: float) -> tuple[np.ndarray, l
     return kept[rising], lines + ([f"{repeated} samples that repeat a time"] if repeated else [])
 
 
+def wrapped(fall: float) -> str:
+    """Which counter, if any, falls by so many seconds when it begins anew."""
+    found = [name for name, seconds in WRAPS.items() if abs(fall / seconds - 1) < 0.02]
+    return f"a counter of {found[0]} began anew" if found else ""
+
+
 def longest_rise(t: Float[np.ndarray, " n"]) -> np.ndarray:
     """Indices of the longest sequence of times that do not fall."""
     tops, at, before = [], [], np.full(len(t), -1)
@@ -275,9 +285,10 @@ def body(values: Float[np.ndarray, "n 3"], frame: str) -> Float[np.ndarray, "n 3
 
 def attitude(q: Float[np.ndarray, "n 4"], world: str, body: str) -> Float[np.ndarray, "n 4"]:
     """Attitudes between other frames as attitudes between the library's; those of no rotation stay as they are."""
-    sound = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0)
+    with np.errstate(over="ignore"):
+        sound = np.isfinite(q).all(axis=1) & (np.linalg.norm(q, axis=1) > 0)
     turned = np.array(q, float)
-    if sound.any():
+    if (world, body) != ("ENU", "FLU") and sound.any():
         matrices = WORLDS[world] @ rotation_of(q[sound]).as_matrix() @ BODIES[body].T
         # Not of length 1: a wrong norm must still be seen.
         norms = np.linalg.norm(q[sound], axis=1, keepdims=True)
