@@ -8,7 +8,7 @@ from typing import Literal
 
 from rich.console import Console
 
-from experiments.render import picture
+from experiments.flying.images import picture
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from experiments.runner.options import CountFromZero, check_numbers

@@ -99,7 +99,7 @@ def test_there_is_no_cycle():
 def test_the_test_sees_imports():
     """A parser that finds nothing would let everything pass."""
     assert "hybrid_jax.dynamics.base" in LIBRARY["hybrid_jax.dynamics.rigid_body"]
-    assert "hybrid_jax.sim.scene" in modules("experiments")["experiments.render"]
+    assert "hybrid_jax.sim.scene" in modules("experiments")["experiments.flying.images"]
     assert "hybrid_jax.training.fitting" in modules("experiments")["experiments.paper.conditions"]
 
 

@@ -14,8 +14,8 @@ from experiments.closed_loop.claims import THREE
 from experiments.closed_loop.figures import COLOURS_OF, floor_note
 from experiments.closed_loop.flights import DRAW_EVERY, Flown
 from experiments.closed_loop.results import DOMAINS, EXTERNAL_FORCE, KNOWN, Agent
+from experiments.flying.images import FRAME_HEIGHT, FRAME_WIDTH, frames
 from experiments.flying.scenario import PATHS, REFERENCES
-from experiments.render import FRAME_HEIGHT, FRAME_WIDTH, frames
 from experiments.reporting.plots import STYLE, legend_below, subplots, tick_errors
 from hybrid_jax.control import Controller, sample
 from hybrid_jax.state import POSITION

@@ -9,9 +9,9 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import fields
+from dataclasses import field, fields, make_dataclass
 from importlib import import_module
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TypeVar, get_type_hints
 
 import tyro
 
@@ -26,14 +26,19 @@ VERBS = {
     "fit": "learn a vehicle from its logs",
     "adapt": "adapt a model to logs after a change, and say what changed",
     "check": "compare a model's predictions with flights",
+    "plan": "plan the flight that tells the parameters of a model best",
+    "replay": "show a flight in 3-D, and where a model expects the vehicle",
+    "export": "write a model as C, CasADi functions or StableHLO",
 }
+RARE = "rare"  # in the annotation of an option: --help-all lists it, --help does not
 USAGE = """usage: hybrid-jax VERB ...
 
 From folders of logs to a model that can be trusted:
 
 {verbs}
 
-hybrid-jax VERB --help says more. Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
+hybrid-jax VERB --help says more, VERB --help-all all.
+Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
 
 
 class ChecksFailed(Exception):
@@ -58,11 +63,17 @@ def run(arguments: Sequence[str]) -> None:
 
 def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, **more: Any) -> Options:
     """The options that a command line gives, an instance of a dataclass; ValueError if it gives none."""
-    output = io.StringIO()
+    output, given = io.StringIO(), list(sys.argv[1:] if arguments is None else arguments)
     more = {"description": inspect.cleandoc(kind.__doc__ or "")} | more
+    asked = kind
+    if "--help-all" in given:
+        given = ["--help"]
+    elif {"-h", "--help"} & {*given} and (rare := _rare(kind)):
+        asked = make_dataclass(kind.__name__, rare, bases=(kind,), frozen=True)
+        more["description"] += f"\n\n--help-all lists {len(rare)} more options."
     try:
         with contextlib.redirect_stderr(output):
-            return tyro.cli(kind, prog=program, args=arguments, **more)
+            return tyro.cli(asked, prog=program, args=given, **more)
     except SystemExit as stop:
         if not stop.code:
             raise  # --help
@@ -70,6 +81,13 @@ def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, *
         wrong = re.search(r"Unrecognized options: (--[\w-]+)", message)
         known = [f"--{field.name.replace('_', '-')}" for field in fields(kind)]  # pyright: ignore[reportArgumentType]
         raise ValueError(f"{message}{_meant(wrong[1], known) if wrong else ''}; see --help") from None
+
+
+def _rare(kind: type) -> list[tuple[str, Any, Any]]:
+    """The options that --help leaves out, as fields that it does not see."""
+    hints = get_type_hints(kind, include_extras=True)
+    rare = [each for each in fields(kind) if RARE in getattr(hints[each.name], "__metadata__", ())]
+    return [(each.name, tyro.conf.Suppress[hints[each.name]], field(default=each.default)) for each in rare]
 
 
 def split_lists(arguments: Sequence[str], lists: Sequence[str]) -> list[str]:

@@ -47,11 +47,16 @@ def load_known(path: Path) -> Known:
     return Known(model.field, vehicle, model.about)
 
 
+def reading_of(known: Known, options: FlightOptions) -> Any:
+    """The options, with commands turned into speeds as they were for the model, if nothing else is said."""
+    if options.polynomial or not known.about.get("polynomial"):
+        return options
+    return replace(options, polynomial=tuple(known.about["polynomial"]))
+
+
 def flights_for(known: Known, folder: Path, options: FlightOptions, changed: bool) -> Flights:
     """The flights of a folder, of which none may be one that the model learned from."""
-    if not options.polynomial and known.about.get("polynomial"):
-        options = replace(options, polynomial=tuple(known.about["polynomial"]))
-    found = read_flights(folder, known.vehicle, known.dt, options, changed)
+    found = read_flights(folder, known.vehicle, known.dt, reading_of(known, options), changed)
     names = {content: name for name, content in known.about["learned_from"].items()}
     for name, content in found.contents.items():
         if content in names:

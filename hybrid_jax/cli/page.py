@@ -49,7 +49,7 @@ class Page:
         question: that the verb answers.
         answer: in a sentence.
         table: of a few rows.
-        figures: caption and picture; the first stands beside the answer, the others are folded.
+        figures: caption and picture, or the bytes of a GIF; the first stands beside the answer, the others are folded.
         meaning: sentences on what it means.
         todo: sentences on what to do next.
         details: folded tables.
@@ -59,7 +59,7 @@ class Page:
     question: str
     answer: str
     table: Table | None = None
-    figures: Sequence[tuple[str, Figure]] = ()
+    figures: Sequence[tuple[str, Figure | bytes]] = ()
     meaning: Sequence[str] = ()
     todo: Sequence[str] = ()
     details: Sequence[Table] = ()
@@ -99,11 +99,13 @@ def document(page: Page) -> str:
     return f'<!doctype html><html lang="en"><head>{head}{title}</head><body>{"".join(parts)}</body></html>\n'
 
 
-def _figure(caption: str, figure: Figure) -> str:
-    data = io.BytesIO()
-    with mpl.rc_context(STYLE):
-        figure.savefig(data, format="png", dpi=130)
-    picture = f'<img alt="{_text(caption)}" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
+def _figure(caption: str, figure: Figure | bytes) -> str:
+    data = io.BytesIO(figure if isinstance(figure, bytes) else b"")
+    if isinstance(figure, Figure):
+        with mpl.rc_context(STYLE):
+            figure.savefig(data, format="png", dpi=130)
+    kind, text = "gif" if isinstance(figure, bytes) else "png", base64.b64encode(data.getvalue()).decode()
+    picture = f'<img alt="{_text(caption)}" src="data:image/{kind};base64,{text}">'
     return f"<figure>{picture}<figcaption>{_text(caption)}</figcaption></figure>"
 
 

@@ -11,11 +11,14 @@ from pathlib import Path
 import jax
 import numpy as np
 import pytest
+from PIL import Image
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
 from hybrid_jax.cli import main
-from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED
+from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS
+from hybrid_jax.dynamics.rigid_body import rigid_body
+from hybrid_jax.io.models import save
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, random_flights
 from hybrid_jax.vehicle import IRIS
 
@@ -23,14 +26,14 @@ from hybrid_jax.vehicle import IRIS
 def test_help_lists_the_verbs(capsys):
     main([])
     said = capsys.readouterr().out
-    assert all(f"  {verb} " in said for verb in ("inspect", "fit", "adapt", "check"))
+    assert all(f"  {verb} " in said for verb in VERBS)
 
 
-@pytest.mark.parametrize("verb", ["inspect", "fit", "adapt", "check"])
+@pytest.mark.parametrize("verb", VERBS)
 def test_help_of_a_verb_has_at_most_a_dozen_options(called, verb):
     code, said, _ = called(verb, "--help")
     assert code == 0
-    assert len(re.findall(r"│ +(?:-\w, )?--(?!help)[a-z-]+", said)) <= 14
+    assert len(re.findall(r"│ +(?:-\w, )?--(?!help)[a-z-]+", said)) <= 12
 
 
 @pytest.mark.parametrize(
@@ -97,6 +100,34 @@ def test_predictions_are_compared_with_the_simplest(fitted, called):
     assert code == 0
     assert "times as exact as with frozen rates" in said
     assert set(json.loads((fitted / "check" / "report.json").read_text())["rmse"]) >= {"model", "no forces"}
+
+
+@pytest.mark.slow
+def test_a_flight_is_shown_with_what_a_model_expects(fitted, called):
+    flight, out = fitted / "after" / "flight0.csv.gz", fitted / "replay"
+    options = ["--other", fitted / "source.npz", "--seconds", 1, "--out", out]
+    code, said, _ = called("replay", fitted / "source.npz", flight, *options)
+    assert code == 0
+    assert "0.5 s ahead it is " in said
+    assert 'src="data:image/gif;base64,' in (out / "report.html").read_text()
+    with Image.open(out / "replay.gif") as picture:
+        assert picture.n_frames == 10  # pyright: ignore[reportAttributeAccessIssue]
+    verify = [sys.executable, "-m", "rerun", "rrd", "verify", out / "replay.rrd"]
+    assert subprocess.run(verify, capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.slow
+def test_set_points_of_a_plan_begin_and_end_in_the_middle(tmp_path, called):
+    save(tmp_path / "model.npz", rigid_body(IRIS), {"dt": 0.02})
+    files = ["-o", tmp_path / "plan.csv", "--out", tmp_path]
+    code, said, _ = called("plan", tmp_path / "model.npz", *files, "--seconds", 2, "--starts", 1, "--steps", 0)
+    assert code == 0
+    assert "is told worst" in said
+    points = np.genfromtxt(tmp_path / "plan.csv", delimiter=",", names=True)
+    assert points.dtype.names == ("t", "px", "py", "pz", "yaw", "vx", "vy", "vz")
+    np.testing.assert_allclose([*points[0]][1:], [0, 0, 1.75, 0, 0, 0, 0], atol=1e-5)
+    np.testing.assert_allclose([*points[-1]][1:], [0, 0, 1.75, 0, 0, 0, 0], atol=1e-4)
+    assert np.ptp(points["px"]) > 0.01
 
 
 @pytest.mark.slow

@@ -1,13 +1,15 @@
 """The program in docs/howto/c.md compiles without a warning, and says what JAX says."""
 
 import re
+from unittest import mock
 
 import numpy as np
+import pytest
 from compiled import C99, needs_compiler, run
 from smoke import ROOT
 
 import hybrid_jax as hj
-from experiments import export as command
+from hybrid_jax.cli import main
 
 (PROGRAM,) = re.findall(r"```c\n(#include.*?)```", (ROOT / "docs" / "howto" / "c.md").read_text(), flags=re.DOTALL)
 
@@ -16,7 +18,9 @@ from experiments import export as command
 def test_the_program_runs(tmp_path):
     body = hj.rigid_body(hj.IRIS)
     hj.save(tmp_path / "model.npz", body, {"dt": 0.01})
-    command.main([str(tmp_path / "model.npz"), "--c", str(tmp_path / "board"), "--name", "iris"])
+    folders = ["-o", tmp_path / "board", "--out", tmp_path]
+    with mock.patch("hybrid_jax.cli.command.configure"), pytest.raises(SystemExit, match="0"):
+        main([*map(str, ("export", tmp_path / "model.npz", "--name", "iris", *folders))])
     (tmp_path / "main.c").write_text(PROGRAM)
     sources = "main.c", "board/iris.c"
     run("gcc", *C99, "-O2", "-Iboard", *sources, "-lm", "-o", "program", cwd=tmp_path)

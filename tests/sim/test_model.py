@@ -8,7 +8,7 @@ import pytest
 from mujoco import mjx
 from smoke import script
 
-from experiments.render import picture
+from experiments.flying.images import picture
 from hybrid_jax.sim import check_versions
 from hybrid_jax.sim.forces import parameters_of
 from hybrid_jax.sim.scene import build_model, traced_model

@@ -1,4 +1,4 @@
-"""Images of the simulated vehicle (Fig. 6), rendered by MuJoCo in a process of its own: see --help.
+"""Images of the simulated vehicle (Fig. 6), rendered by MuJoCo in a process of its own.
 
 MuJoCo chooses its OpenGL backend when it is first imported; one backend after the other is tried.
 """
@@ -11,20 +11,16 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated
 
 import matplotlib.image
 import numpy as np
-import tyro
 from jaxtyping import Float, UInt8
 
 POSE = (0.0, 0.0, 0.30, 0.995, -0.04, 0.07, 0.05)  # position [m] and (w, x, y, z), which MuJoCo normalises
 WIDTH, HEIGHT = 1600, 1200  # pixels
 FRAME_WIDTH, FRAME_HEIGHT = 320, 240
-CHILD = "from experiments import render; render._write()"  # without what the command line of this module imports
+CHILD = "from experiments.flying import images; images._write()"
 
 Images = UInt8[np.ndarray, "n h w 3"]
 
@@ -91,21 +87,3 @@ def _render(poses: list[list[float]], height: int, width: int, place: list[float
 def _write() -> None:
     """Write the images that the command line of the other process asks for."""
     np.save(sys.argv[1], _render(*json.loads(sys.argv[2])))
-
-
-@dataclass(frozen=True)
-class Options:
-    """Render the simulated vehicle, the Iris (Fig. 6). Needs the system package libosmesa6 or libegl1."""
-
-    file: Annotated[Path, tyro.conf.Positional]
-    """Picture to write (.png)."""
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    from experiments.runner import command
-
-    command.call("render", Options, lambda options: picture(options.file), arguments)
-
-
-if __name__ == "__main__":
-    main()

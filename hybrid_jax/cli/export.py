@@ -1,0 +1,220 @@
+"""`hybrid-jax export`: a model as C, CasADi functions or StableHLO, for programs outside this library."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+import scipy.spatial
+import tyro
+from jaxtyping import Float
+
+from hybrid_jax import checks
+from hybrid_jax.cli import page
+from hybrid_jax.cli.command import RARE, step
+from hybrid_jax.dynamics.base import AbstractVectorField, state_space
+from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
+from hybrid_jax.estimation.least_squares import ravel_parameters
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.export import casadi_function, casadi_step, export_adaptation_c, export_c, export_program
+from hybrid_jax.export.program import sizes_of, vehicle_in
+from hybrid_jax.io.models import load
+from hybrid_jax.networks import smoothed
+from hybrid_jax.online import OnlineAdaptation
+from hybrid_jax.state import SENSOR_NOISE, STATE_SIZE
+from hybrid_jax.vehicle import Vehicle
+
+__all__ = ["LISTS", "Options", "run"]
+LISTS = ("--to", "--noise", "--process", "--prior", "--disturbance", "--platforms")
+FILTER = ("period", "noise", "process", "prior", "disturbance")
+COUNT = 10_000  # states over which a smooth model is compared
+PARTS = (3, 4, 3, 3)  # position, quaternion, velocity and body rates of a state
+PROCESS = (0.0, 0.0, 0.003, 0.005)  # of a rigid body, as in docs/howto/online.md
+PRIOR, DISTURBANCE = 0.3, (3.0, 3.0, 3.0, 5.0, 5.0, 5.0)
+
+
+@dataclass(frozen=True)
+class Options:
+    """Write the field ẋ = f(x, u) of a model, and a step x⁺ = F(x, u) of it, for programs outside this library.
+
+    c: NAME.h and NAME.c in C99, for a flight controller, and if the physics has parameters NAME_adaptation.h and
+    NAME_adaptation.c: a filter that adapts them in flight. casadi: field.casadi and step.casadi, which
+    casadi.Function.load reads. stablehlo: field.npz and step.npz, which hybrid_jax.export.load_program reads, or JAX.
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """A file that `hybrid-jax fit` or `adapt`, an experiment or hybrid_jax.save wrote."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """Folder for the files."""
+    to: tuple[Literal["c", "casadi", "stablehlo"], ...] = ("c",)
+    """What to write, such as c,casadi."""
+    name: str = "model"
+    """Name of the C files, and prefix of their functions."""
+    double: bool = False
+    """C in double precision."""
+    smooth: float | None = None
+    """Put ½ (z + √(z² + 1/β²)) with this β in the place of ReLU, as solvers of optimal control problems need it, and
+    say how much ẋ changes over a box of states. With 5 they converge where with 30 they mostly do not: see
+    docs/howto/solvers.md."""
+    dt: float | None = None
+    """Length of a step [s]; by default that of the flights that the model was trained on."""
+    out: Path = Path("runs/export")
+    """Folder of the page."""
+    period: Annotated[float | None, RARE] = None
+    """Of the filter in C: time between two samples [s]; by default the length of a step."""
+    noise: Annotated[tuple[float, ...], RARE] = ()
+    """Of the filter: standard deviation of what is measured: position [m], quaternion, velocity [m/s] and body rates
+    [rad/s], by default 0.001 0.002 0.02 0.02; or one number for all states, or one for each. A system other than a
+    rigid body has no default, and no filter without it."""
+    process: Annotated[tuple[float, ...], RARE] = ()
+    """Of the filter: what the model leaves out of the derivatives of these states, as white noise [1/sqrt(s)]; by
+    default 0 0 0.003 0.005 for a rigid body, else 0."""
+    prior: Annotated[tuple[str, ...], RARE] = ()
+    """Of the filter: by how much each parameter may change, as a standard deviation (of a rigid body mostly of its
+    logarithm): one number for all, or words such as Ix=0.3 k=0.2; 0.3 where nothing is said."""
+    disturbance: Annotated[tuple[float, ...], RARE] = ()
+    """Of the filter: by how much a constant disturbance of a rigid body may change, likewise: three accelerations
+    [m/s^2] and three angular ones [rad/s^2], by default 3 3 3 5 5 5, or one number for all; 0: there is none."""
+    batched: Annotated[bool, RARE] = False
+    """The programs of StableHLO take x (b, d) and u (b, m), for any b, instead of x (d,) and u (m,)."""
+    platforms: Annotated[tuple[Literal["cpu", "cuda", "rocm", "tpu"], ...], RARE] = ("cpu",)
+    """Platforms to compile StableHLO for."""
+    state_size: Annotated[int | None, RARE] = None
+    """Size of x, for a model of another system."""
+    input_size: Annotated[int | None, RARE] = None
+    """Size of u, likewise."""
+
+
+def run(options: Options) -> int:
+    model = load(options.model)
+    dt = model.about.get("dt") if options.dt is None else options.dt
+    if dt is None:
+        raise ValueError(f"--dt is needed: {options.model} does not say how long the steps of its flights were")
+    checks.positive(f"{options.model}: dt" if options.dt is None else "--dt", dt, "a positive number of seconds")
+    if "c" not in options.to and any(getattr(options, name) for name in FILTER):
+        raise ValueError(f"--{', --'.join(FILTER)} need --to c: the filter is written as C alone")
+    if options.smooth is not None:
+        checks.positive("--smooth", options.smooth)
+    field, d, m = model.field, *sizes_of(model.field, options.state_size, options.input_size)
+    sizes: dict[str, Any] = {"state_size": d, "input_size": m}
+    own: dict[str, Any] = sizes | {"smooth": options.smooth}
+    said: list[str] = []
+    adaptation = _filter(options, field, dt, d) if "c" in options.to else ""
+    for folder in (options.output, options.out):
+        checks.writable_folder("--output" if folder is options.output else "--out", folder)
+    written: list[Path] = []
+    with step(f"writing {', '.join(options.to)}"):
+        if "c" in options.to:
+            written += export_c(options.output, field, dt, name=options.name, double=options.double, **own)
+        if isinstance(adaptation, OnlineAdaptation):
+            name = f"{options.name}_adaptation"
+            written += export_adaptation_c(options.output, adaptation, name=name, double=options.double, **sizes)
+            said.append(f"{name} adapts {', '.join(adaptation.names)}, with a sample every {adaptation.dt:g} s.")
+        elif adaptation:
+            said.append(f"No filter is written: {adaptation}.")
+        for kind, length in (("field", None), ("step", dt)) if "stablehlo" in options.to else ():
+            more: dict[str, Any] = {"batched": options.batched, "platforms": options.platforms, "about": model.about}
+            export_program(options.output / f"{kind}.npz", field, length, **own, **more)
+            written.append(options.output / f"{kind}.npz")
+        if "casadi" in options.to:
+            for kind, function in (("field", casadi_function(field, **own)), ("step", casadi_step(field, dt, **own))):
+                function.save(str(options.output / f"{kind}.casadi"))
+                written.append(options.output / f"{kind}.casadi")
+    if options.smooth is not None:
+        said.append(_change(field, options.smooth))
+    page.write(options.out, "export", _page(options, dt, written, said), {"files": list(map(str, written)), "dt": dt})
+    return 0
+
+
+def _page(options: Options, dt: float, written: Sequence[Path], said: Sequence[str]) -> page.Page:
+    rows = [(str(path), f"{path.stat().st_size / 1024:.0f} KB") for path in written]
+    compiled = f"gcc -std=c99 -O2 -I{options.output} main.c {options.output / options.name}.c -lm"
+    todo = [f"Compile it with yours: {compiled}. docs/howto/c.md has a program."] if "c" in options.to else []
+    return page.Page(
+        f"What runs {options.model.name} elsewhere?",
+        f"{len(written)} files in {options.output}: ẋ = f(x, u), and a step of {dt:g} s.",
+        page.Table("Files", ("file", "size"), rows),
+        meaning=said,
+        todo=todo or ["docs/howto/export.md says what reads them."],
+    )
+
+
+def _filter(options: Options, field: AbstractVectorField, dt: float, d: int) -> OnlineAdaptation | str:
+    """The filter, or why there is none; ValueError for options that do not fit the model."""
+    rigid = state_space(field) == RIGID_BODY_SPACE and d == STATE_SIZE
+    if options.period is not None:
+        checks.positive("--period", options.period)
+    try:
+        ravel_parameters(field)
+    except ValueError as error:  # it has no parameters
+        if any(getattr(options, name) for name in FILTER):
+            raise
+        return str(error)
+    sensors = options.noise or SENSOR_NOISE * rigid
+    if not sensors:
+        return "--noise must say how exactly the states are measured"
+    if options.disturbance and not rigid:
+        raise ValueError("--disturbance is that of a rigid body, and the model is none")
+    noise, process = (
+        _of_states("noise", sensors, d),
+        _of_states("process", options.process or PROCESS * rigid or (0,), d),
+    )
+    disturbance = options.disturbance or DISTURBANCE * rigid
+    if len(disturbance) not in (0, 1, 6):
+        raise ValueError(f"--disturbance must be 1 or 6 numbers, got {len(disturbance)}")
+    field = field if options.smooth is None else smoothed(field, options.smooth)
+    beyond = disturbance if any(disturbance) else 0.0
+    return OnlineAdaptation(field, options.period or dt, noise, _prior(options.prior, field), beyond, process=process)
+
+
+def _of_states(name: str, numbers: tuple[float, ...], d: int) -> tuple[float, ...]:
+    """A number for each of d states, or one for all."""
+    (checks.positive if name == "noise" else checks.not_negative)(f"--{name}", min(numbers))
+    if len(numbers) in (1, d):
+        return numbers
+    if d == STATE_SIZE and len(numbers) == len(PARTS):
+        return tuple(np.repeat(numbers, PARTS).tolist())
+    expected = f"1, {len(PARTS)} or {d}" if d == STATE_SIZE else f"1 or {d}"
+    raise ValueError(f"--{name} must be {expected} numbers, got {len(numbers)}")
+
+
+def _prior(words: tuple[str, ...], field: AbstractVectorField) -> float | dict[str, float]:
+    """The standard deviation of each parameter; ValueError for a word that is not NAME=NUMBER."""
+    try:
+        if len(words) == 1 and "=" not in words[0]:
+            return float(words[0])
+        named = {name: float(value) for name, value in (word.split("=") for word in words)}
+    except ValueError:
+        raise ValueError(f"--prior must be a number, or words such as Ix=0.3, got {' '.join(words)}") from None
+    groups = {name.partition("[")[0] for name in named_parameters(field)} - {"disturbance"}
+    return dict.fromkeys(groups, PRIOR) | named
+
+
+def _change(field: AbstractVectorField, beta: float) -> str:
+    """The largest difference in ẋ between the smooth field and the field, as a sentence."""
+    vehicle = vehicle_in(field)
+    if vehicle is None or state_space(field) != RIGID_BODY_SPACE:
+        return "How much smoothing changes ẋ was not looked at: the model is not of a multirotor."
+    x, u = _box(vehicle)
+    columns = jnp.asarray(x.T), jnp.asarray(u.T)
+    before, after = (np.asarray(eqx.filter_jit(one.infer_batch)(*columns)) for one in (field, smoothed(field, beta)))
+    off = np.abs(after - before).max(axis=1)
+    entry = int(off.argmax())
+    size = np.sqrt(np.mean(np.square(before[entry])))
+    told = f"smooth {beta:g}: ẋ differs by at most {off[entry]:.2g}"
+    return f"{told}, in {RIGID_BODY_SPACE.names[entry]}, of RMS {size:.2g}; {COUNT} states of a box."
+
+
+def _box(vehicle: Vehicle) -> tuple[Float[np.ndarray, "n 13"], Float[np.ndarray, "n m"]]:
+    """States within 2 m of a place at 1.5 m, tilted by up to 45°, at any yaw, at up to 3 m/s and 3 rad/s for each axis,
+    and rotor speeds of 0.7 … 1.3 times that of hover."""
+    rng, rotation = np.random.default_rng(0), scipy.spatial.transform.Rotation
+    tilt, axis, yaw = rng.uniform(0, np.pi / 4, COUNT), *rng.uniform(0, 2 * np.pi, (2, COUNT))
+    lean = rotation.from_rotvec(np.stack([tilt * np.cos(axis), tilt * np.sin(axis), 0 * tilt], axis=1))
+    q = (rotation.from_euler("z", yaw[:, None]) * lean).as_quat()[:, [3, 0, 1, 2]]
+    position = rng.uniform(-1, 1, (COUNT, 3)) * [2, 2, 1.5] + [0, 0, 1.5]
+    x = np.concatenate([position, q, rng.uniform(-3, 3, (COUNT, 6))], axis=1)
+    return x, vehicle.hover_speed * rng.uniform(0.7, 1.3, (COUNT, vehicle.rotors))

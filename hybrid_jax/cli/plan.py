@@ -1,0 +1,136 @@
+"""`hybrid-jax plan`: the most informative ten seconds of flight for a model."""
+
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import jax
+import matplotlib as mpl
+import numpy as np
+import tyro
+from jaxtyping import Float
+from matplotlib.figure import Figure
+
+from hybrid_jax import checks
+from hybrid_jax.cli import page
+from hybrid_jax.cli.command import RARE, step
+from hybrid_jax.dynamics.disturbance import with_disturbance
+from hybrid_jax.estimation.uncertainty import named_parameters
+from hybrid_jax.io.files import write_atomic
+from hybrid_jax.io.models import load
+from hybrid_jax.planning import Excitation, FlightBounds, excitation
+from hybrid_jax.state import POSITION, VELOCITY
+
+__all__ = ["LISTS", "Options", "run"]
+LISTS = ("--learn", "--low", "--high", "--rotor-speed", "--noise")
+WINDOW, HALF = 10, 1.96  # intervals; standard errors on either side of a 95 % interval
+HEADER = "t,px,py,pz,yaw,vx,vy,vz"
+BOX = FlightBounds()
+
+
+@dataclass(frozen=True)
+class Options:
+    """Plan the flight whose data tell the parameters of a model best, inside a box.
+
+    It begins and ends in hover at the centre of the box. A steady force and torque are taken as unknown, too.
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Model that `hybrid-jax fit` or `adapt` wrote."""
+    output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+    """CSV file for the set points: time [s], position [m], yaw [rad], velocity [m/s]."""
+    learn: tuple[str, ...] = ()
+    """Parameters that the flight is to tell; by default all of the model's physics."""
+    seconds: float = 10.0
+    """Length of the flight [s]."""
+    low: tuple[float, float, float] = BOX.low
+    """Corner of the box with the least x, y and z [m]; z points up."""
+    high: tuple[float, float, float] = BOX.high
+    """The opposite corner [m]."""
+    speed: float = BOX.speed
+    """Highest speed [m/s]."""
+    tilt: float = BOX.tilt
+    """Largest tilt [rad]."""
+    yaw: float = BOX.yaw
+    """Largest heading either way of 0 [rad]."""
+    bandwidth: float = 2.0
+    """Highest frequency of the flight [Hz]: what your controller cannot follow tells less than planned."""
+    out: Path = Path("runs/plan")
+    """Folder of the page."""
+    rotor_speed: Annotated[tuple[float, float], RARE] = BOX.rotor_speed
+    """Least and most that a rotor may turn, as shares of the vehicle's highest speed."""
+    noise: Annotated[tuple[float, ...], RARE] = ()
+    """Standard deviation of the noise of each of the 13 states; by default that of motion capture."""
+    starts: Annotated[int, RARE] = 4
+    """Random flights that the search starts from."""
+    steps: Annotated[int, RARE] = 200
+    """Steps of the search."""
+    seed: Annotated[int, RARE] = 0
+    """Of the random flights."""
+
+
+def run(options: Options) -> int:
+    checks.writable_folder("--out", options.out)
+    checks.writable_folder("--output", options.output.parent)
+    model = load(options.model)
+    dt = model.about.get("dt", 0.01)
+    box = FlightBounds(options.low, options.high, options.speed, options.tilt, options.yaw, options.rotor_speed)
+    search = {name: getattr(options, name) for name in ("seconds", "bandwidth", "starts", "steps", "seed")}
+    with step("searching for the flight, a minute or two"), warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        field = with_disturbance(model.field)
+        found = excitation(
+            field, options.learn or None, box, noise=options.noise or None, window=WINDOW * dt, dt=dt, **search
+        )
+    points = _set_points(found)
+    lines = [HEADER, *(",".join(f"{number:.5g}" for number in row) for row in points)]
+    write_atomic(options.output, ("\n".join(lines) + "\n").encode())
+    values = {name: float(value) for name, value in named_parameters(field).items()}
+    said = [str(each.message).removeprefix("excitation: ") for each in caught]
+    shown = _page(options, found, points, values, said)
+    told = {"standard_errors": found.standard_errors, "margins": found.margins, "set_points": options.output}
+    page.write(options.out, "plan", shown, told)
+    return 0
+
+
+def _set_points(found: Excitation) -> Float[np.ndarray, "n 8"]:
+    place, yaw = jax.vmap(found.reference)(found.t)
+    return np.column_stack([found.t, place, yaw, found.states[:, VELOCITY]])
+
+
+def _page(options: Options, found: Excitation, points: np.ndarray, values: dict[str, float], said) -> page.Page:
+    halves = {name: HALF * error for name, error in found.standard_errors.items()}
+    shares = {name: half / abs(values[name]) if values[name] else np.inf for name, half in halves.items()}
+    rows = [(name, f"{values[name]:.4g}", f"± {half:.2g}", f"{shares[name]:.1%}") for name, half in halves.items()]
+    header = ("parameter", "value", "half-width", "of the value")
+    worst = max(found.parameters, key=lambda name: shares[name])
+    return page.Page(
+        f"Which {options.seconds:g} s of flight tell the parameters of {options.model.name} best?",
+        f"{options.output}: every parameter to ± {shares[worst]:.1%} or better; {worst} is told worst.",
+        page.Table("Expected 95 % intervals", header, rows[:5]),
+        [("The flight: from above, and over time", _figure(found, points))],
+        said,
+        [
+            "Fly these set points, first at a height where an error costs nothing, and log the flight.",
+            f"Then: hybrid-jax adapt {options.model} LOGS -o adapted.npz.",
+        ],
+        [
+            *([page.Table("All intervals", header, rows)] * (len(rows) > 5)),
+            page.Table("Limits", ("limit", "left"), [(name, f"{left:.0%}") for name, left in found.margins.items()]),
+        ],
+    )
+
+
+@mpl.rc_context(page.STYLE)
+def _figure(found: Excitation, points: np.ndarray) -> Figure:
+    figure = Figure(figsize=(7.5, 3.5), layout="constrained")
+    above, time = figure.subplots(1, 2)
+    above.plot(*found.states[:, POSITION].T[:2])
+    above.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
+    speed = np.linalg.norm(found.states[:, VELOCITY], axis=1)
+    for name, values in (("height [m]", points[:, 3]), ("yaw [rad]", points[:, 4]), ("speed [m/s]", speed)):
+        time.plot(found.t, values, label=name)
+    time.set_xlabel("time [s]")
+    time.legend()
+    return figure

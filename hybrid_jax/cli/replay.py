@@ -1,0 +1,133 @@
+"""`hybrid-jax replay`: a flight in 3-D, and where models expected the vehicle to be."""
+
+import tempfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+from jaxtyping import Float
+from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.figure import Figure
+
+from hybrid_jax import checks
+from hybrid_jax.cli import page
+from hybrid_jax.cli.command import step
+from hybrid_jax.cli.logs import LISTS, FlightOptions, read_flights, windows_of
+from hybrid_jax.cli.model import load_known, reading_of
+from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.io.files import write_atomic
+from hybrid_jax.state import POSITION, QUATERNION
+from hybrid_jax.trajectories import Trajectories
+
+__all__ = ["LISTS", "Options", "run"]
+SHOWN = 10  # pictures a second
+TRUE, COLOURS = "tab:blue", ("tab:orange", "tab:green")
+Forecasts = Mapping[str, Float[np.ndarray, "n t 3"]]
+
+
+@dataclass(frozen=True)
+class Options(FlightOptions):
+    """Show a flight in 3-D, and at each time where a model expects the vehicle next, under the inputs that were flown.
+
+    Writes replay.gif, which the page shows, and if rerun is installed (pip install 'hybrid_jax[replay]') replay.rrd for
+    its viewer: rerun replay.rrd.
+    """
+
+    model: Annotated[Path, tyro.conf.Positional]
+    """Model that `hybrid-jax fit` or `adapt` wrote."""
+    flight: Annotated[Path, tyro.conf.Positional]
+    """One log."""
+    other: Path | None = None
+    """A second model to compare, such as that before adaptation."""
+    ahead: float = 0.5
+    """How far ahead models predict [s]."""
+    seconds: float = 10.0
+    """How much of the flight is shown [s]."""
+    out: Path = Path("runs/replay")
+    """Folder of the page."""
+
+
+def run(options: Options) -> int:
+    for name in ("ahead", "seconds"):
+        checks.positive(f"--{name}", getattr(options, name), "a positive number of seconds")
+    checks.writable_folder("--out", options.out)
+    models = {path: load_known(path) for path in (options.model, options.other) if path is not None}
+    first = models[options.model]
+    logs = read_flights(options.flight, first.vehicle, first.dt, reading_of(first, options), changed=True).logs
+    if len(logs) > 1:
+        raise ValueError(f"{options.flight}: holds {len(logs)} flights; give one of them")
+    steps, every = max(1, round(options.ahead / first.dt)), max(1, round(1 / SHOWN / first.dt))
+    windows = windows_of(logs, steps, every).windows[: max(1, round(options.seconds * SHOWN))]
+    with step(f"predicting and drawing {len(windows)} pictures"):
+        forecasts = {
+            str(path): np.asarray(rollout_batch(known.field, windows.x0, windows.u, windows.dt))[..., POSITION]
+            for path, known in models.items()
+        }
+        picture = _animated(windows, forecasts, every * windows.dt)
+        write_atomic(options.out / "replay.gif", picture)
+        recorded = _recorded(options.out / "replay.rrd", windows, forecasts, first.vehicle, every * windows.dt)
+    ends = {name: np.linalg.norm(each[:, -1] - windows.x[:, -1, POSITION], axis=1) for name, each in forecasts.items()}
+    rms = {name: float(np.sqrt(np.mean(np.square(each)))) for name, each in ends.items()}
+    rows = [(name, f"{rms[name]:.3g} m", f"{np.max(each):.3g} m") for name, each in ends.items()]
+    seconds = steps * windows.dt
+    shown = page.Page(
+        f"Where do models expect the vehicle of {options.flight.name}?",
+        f"{seconds:g} s ahead it is {rms[str(options.model)]:.3g} m from where {options.model.name} expects it.",
+        page.Table(f"Distance after {seconds:g} s", ("model", "RMS", "largest"), rows),
+        [("The flight, and what models expect next, in real time", picture)],
+        todo=["In 3-D: rerun " + str(recorded) if recorded else "For 3-D: pip install 'hybrid_jax[replay]'"],
+    )
+    page.write(options.out, "replay", shown, {"distance": rms, "files": [options.out / "replay.gif", recorded]})
+    return 0
+
+
+def _animated(windows: Trajectories, forecasts: Forecasts, dt: float) -> bytes:
+    """An animated picture in real time."""
+    path = np.asarray(windows.x0)[:, POSITION]
+    middle, half = (path.min(axis=0) + path.max(axis=0)) / 2, max(0.6, 0.6 * np.ptp(path, axis=0).max())
+    figure = Figure(figsize=(6.4, 5.2), layout="constrained")
+    axes = figure.add_subplot(projection="3d")
+    limits = np.stack([middle - half, middle + half]).T
+    axes.set(xlim=limits[0], ylim=limits[1], zlim=limits[2], xlabel="x [m]", ylabel="y [m]", zlabel="z [m]")
+    (trail,) = axes.plot([], [], [], color=TRUE, linewidth=1.2, label="flown")
+    (vehicle,) = axes.plot([], [], [], "o", color=TRUE, markersize=6)
+    nexts = [axes.plot([], [], [], color=each, label=name)[0] for name, each in zip(forecasts, COLOURS, strict=False)]
+    axes.legend(loc="upper left", fontsize=8)
+
+    def frame(i: int):
+        figure.suptitle(f"{i * dt:.1f} s")
+        points = path[: i + 1], path[i : i + 1], *(each[i] for each in forecasts.values())
+        for line, place in zip((trail, vehicle, *nexts), points, strict=True):
+            line.set_data_3d(  # pyright: ignore[reportAttributeAccessIssue]
+                *np.where(np.abs(place - middle) < 4 * half, place, np.nan).T
+            )
+
+    moving = FuncAnimation(figure, frame, frames=len(path))  # pyright: ignore[reportArgumentType]
+    with tempfile.TemporaryDirectory() as folder:
+        moving.save(Path(folder) / "a.gif", PillowWriter(fps=round(1 / dt)))
+        return (Path(folder) / "a.gif").read_bytes()
+
+
+def _recorded(path: Path, windows: Trajectories, forecasts: Forecasts, vehicle, dt: float) -> Path | None:
+    """A recording for the viewer of rerun; none if that is not installed."""
+    try:
+        import rerun
+    except ImportError:
+        return None
+    recorder, x = rerun.RecordingStream("hybrid_jax"), np.asarray(windows.x0)
+    recorder.save(path)
+    recorder.log("world", rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+    arms = [np.array([[0, 0, 0], [*rotor, 0]]) for rotor in vehicle.rotor_positions]
+    recorder.log("world/vehicle/arms", rerun.LineStrips3D(arms, radii=0.01), static=True)
+    for i, state in enumerate(x):
+        recorder.set_time("flight", duration=i * dt)
+        quaternion = rerun.Quaternion(xyzw=np.roll(state[QUATERNION], -1))
+        recorder.log("world/vehicle", rerun.Transform3D(translation=state[POSITION], quaternion=quaternion))
+        recorder.log("world/path", rerun.LineStrips3D([x[: i + 1, POSITION]]))
+        for name, each in forecasts.items():
+            recorder.log(f"world/{name}", rerun.LineStrips3D([each[i]], radii=0.005))
+    recorder.flush()
+    return path

@@ -1,0 +1,100 @@
+"""`hybrid-jax export`: a model's file becomes programs, or the command says in one line why not."""
+
+import json
+import re
+
+import jax
+import numpy as np
+import pytest
+
+import hybrid_jax as hj
+from hybrid_jax.dynamics.baselines import Kinematics
+from hybrid_jax.export import export_adaptation_c, load_program
+
+ca = pytest.importorskip("casadi")
+X, U = np.array([0, 0, 1, 1.0, 0, 0, 0, 0.3, 0, 0, 0, 0, 0.1]), np.full(4, 650.0)
+
+
+@pytest.fixture(scope="module")
+def field():
+    return hj.Hybrid(hj.rigid_body(hj.IRIS), hj.residual_network(13, 4, jax.random.key(0), hidden=4))
+
+
+def test_all_that_is_written_is_the_model(field, tmp_path, called):
+    model, out = tmp_path / "model.npz", tmp_path / "files"
+    hj.save(model, field, {"seed": 3, "dt": 0.02})
+    called("export", model, "-o", out, "--to", "casadi,stablehlo", "--out", tmp_path)
+    names = ["field.npz", "step.npz", "field.casadi", "step.casadi"]
+    assert json.loads((tmp_path / "report.json").read_text())["files"] == [str(out / name) for name in names]
+    step, field = load_program(out / "step.npz"), load_program(out / "field.npz")
+    assert (step.dt, step.about["seed"], field.dt) == (0.02, 3, None)
+    predicted = hj.load(model).predict(X, U[None], 0.02)[0]
+    np.testing.assert_allclose(step(X, U), predicted, rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(ca.Function.load(str(out / "step.casadi"))(X, U).full()[:, 0], predicted, atol=1e-5)
+    derivative = ca.Function.load(str(out / "field.casadi"))(X, U).full()[:, 0]
+    np.testing.assert_allclose(field(X, U), derivative, rtol=1e-5, atol=1e-4)
+
+
+def test_c_is_written_and_how_much_smoothing_changes_is_said(field, tmp_path, called, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hj.save("model.npz", field, {"dt": 0.02})
+    _, said, _ = called("export", "model.npz", "-o", "board", "--name", "iris", "--double", "--smooth", "30")
+    assert {path.name for path in (tmp_path / "board").iterdir()} == {
+        *("iris.h", "iris.c", "iris_adaptation.h", "iris_adaptation.c")
+    }
+    assert "IRIS_DT 0.02" in (tmp_path / "board" / "iris.h").read_text()
+    assert "typedef double real" in (tmp_path / "board" / "iris.c").read_text()
+    (found,) = map(float, re.findall(r"smooth 30: ẋ differs by at most ([\d.e-]+),", said))
+    assert 0 < found <= np.abs(field.residual.weight_out).sum(axis=1).max() / 60
+
+
+def test_the_filter_that_is_written_is_that_of_the_options(tmp_path, called):
+    hj.save(tmp_path / "model.npz", hj.rigid_body(hj.IRIS), {"dt": 0.02})
+    options = "--double --period 0.01 --noise 0.1,0.2,0.3,0.4 --process 0.5 --prior Ix=0.6 --disturbance 0"
+    _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *options.split())
+    assert "model_adaptation adapts Ix, Iy, k, with a sample every 0.01 s" in said
+    noise, prior = np.repeat([0.1, 0.2, 0.3, 0.4], [3, 4, 3, 3]), {"Ix": 0.6, "Iy": 0.3, "k": 0.3}
+    wanted = hj.OnlineAdaptation(hj.rigid_body(hj.IRIS), 0.01, noise, prior, process=0.5)
+    for path in export_adaptation_c(tmp_path / "wanted", wanted, name="model_adaptation", double=True):
+        assert (tmp_path / path.name).read_text() == path.read_text()
+
+
+def test_a_model_without_parameters_has_no_filter(tmp_path, called):
+    hj.save(tmp_path / "model.npz", Kinematics(), {"dt": 0.02})
+    sizes = ["--state-size", "13", "--input-size", "4"]
+    _, said, _ = called("export", tmp_path / "model.npz", "-o", tmp_path, "--out", tmp_path, *sizes)
+    assert "No filter is written: field: its physics, Kinematics, has no parameter" in said
+
+
+@pytest.mark.parametrize(
+    ("about", "options", "message"),
+    [
+        ({"dt": 0.02}, ["--state-size", "12"], "field: RigidBody does not take"),
+        *(
+            ({"dt": 0.02}, ["--dt", dt], f"--dt must be a positive number of seconds, got {dt}")
+            for dt in ("-0.01", "0", "nan")
+        ),
+        ({}, [], "--dt is needed"),
+        *(
+            ({"dt": 0.02}, [f"--{option}", *words], message)
+            for option, words, message in (
+                ("smooth", ["-1"], "--smooth must be"),
+                ("name", ["1"], "name must be a lower-case C identifier"),
+                ("period", ["1", "--to", "casadi"], "need --to c"),
+                ("noise", ["1", "2"], "--noise must be 1, 4 or 13 numbers, got 2"),
+                ("noise", ["0"], "--noise must be a positive finite number, got 0"),
+                ("disturbance", ["1", "2"], "--disturbance must be 1 or 6 numbers, got 2"),
+                ("prior", ["Ix"], "--prior must be a number, or words such as Ix=0.3, got Ix"),
+                ("prior", ["m=1"], "prior: m: must be among Ix, Iy, k"),
+            )
+        ),
+    ],
+    ids=str,
+)
+def test_bad_input_ends_in_one_line(about, options, message, field, tmp_path, called, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    hj.save("model.npz", field, about)
+    code, _, printed = called("export", "model.npz", "-o", "files", *options)
+    assert code == 2
+    assert message in printed.splitlines()[-1]
+    assert not [*tmp_path.glob("files/*"), *tmp_path.glob("runs/*/*")]  # nothing is written half
