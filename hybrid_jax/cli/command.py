@@ -24,6 +24,7 @@ BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED = 2, 3, 4
 VERBS = {
     "inspect": "say what logs hold and lack, and write a vehicle file from them",
     "fit": "learn a vehicle from its logs",
+    "identify": "learn a vehicle from its commands and whatever was measured",
     "adapt": "adapt a model to logs after a change, and say what changed",
     "check": "compare a model's predictions with flights",
     "plan": "plan the flight that tells the parameters of a model best",

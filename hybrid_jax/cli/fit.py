@@ -12,7 +12,7 @@ from jaxtyping import Float, PRNGKeyArray
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import METHODS, Adaptation, adapt
-from hybrid_jax.cli import errors, page
+from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.choice import choose, expected
 from hybrid_jax.cli.command import step
 from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, read_flights, windows_of
@@ -22,6 +22,8 @@ from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import RIGID_BODY_SPACE
 from hybrid_jax.dynamics.vehicle_file import LAG, VehicleModel, load_vehicle_model
 from hybrid_jax.extrapolation import features_of
+from hybrid_jax.flights.conversion import missing_states
+from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import FlightLog
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
@@ -35,6 +37,7 @@ __all__ = ["LISTS", "Options", "run"]
 TRAINED, VALIDATED = 2000, 500  # windows
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
+IDENTIFIED = ("output", "vehicle", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
 PHYSICS = "theta_least_squares"
 QUANTILES = np.linspace(0.01, 0.99, 99)
 FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid")  # the simplest first
@@ -47,7 +50,8 @@ class Options(FlightOptions):
     Each flight is left out in turn: what is learned from the others chooses between physics alone and physics with a
     network, and says which error to expect on a flight that nobody has recorded.
 
-    Logs need position, velocity, attitude, body rates, and rotor speeds or commands with --polynomial.
+    Logs with position, velocity, attitude, body rates, and rotor speeds or commands with --polynomial become flights.
+    Logs that lack some of it are identified from: see hybrid-jax identify.
     """
 
     before: Annotated[Path, tyro.conf.Positional]
@@ -70,6 +74,9 @@ def run(options: Options) -> int:
     checks.positive("--dt", options.dt)
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
+    if _identified(options):
+        own = {name: getattr(options, name) for name in IDENTIFIED}
+        return identify.run(identify.Options(folder=options.before, **own))
     model = _vehicle_model(options)
     flights = read_flights(options.before, model.vehicle, options.dt, options)
     if len(flights.logs) < 2:
@@ -96,6 +103,17 @@ def run(options: Options) -> int:
     shown = _page(options, flights, physics, found, chosen, (value, low, high))
     page.write(options.out, "fit", shown, about | {"model": options.output, "adaptation": physics.to_dict()})
     return 0
+
+
+def _identified(options: Options) -> bool:
+    """Whether the first log that can be read lacks what training on flights needs, by what it measured."""
+    actuator = load_vehicle_model(options.vehicle).actuator
+    paths = find_logs(options.before)[0] if options.before.is_dir() else [options.before]
+    found = next((read_recording(path, **options.reading) for path in paths if path.exists()), None)
+    if found is None:
+        return False  # which is refused where all logs are read
+    commands = actuator is not None and not options.polynomial and "rotor_speed" not in found.signals
+    return commands or bool({*missing_states(found)} - {"motors"})
 
 
 def _vehicle_model(options: Options) -> VehicleModel:

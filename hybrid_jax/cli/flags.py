@@ -10,8 +10,7 @@ _TOOL = _LOGS | {"failed": "--anyway"}  # which cuts and resamples flights by it
 _LOGS |= {name: f"--cleaning.{name.replace('_', '-')}" for name in _CLEANING} | {"failed": "--anyway"}
 FLAGS: Mapping[str, Mapping[str, str]] = {
     "real_flight": _LOGS | {"dt": "--cleaning.resample"},
-    "identify": _LOGS,
-    **dict.fromkeys(("inspect", "fit", "adapt", "check"), _TOOL),
+    **dict.fromkeys(("inspect", "fit", "identify", "adapt", "check", "replay"), _TOOL),
 }
 _KEYS = ("columns", "polynomial")  # words of column maps as well: options only before a value
 _VALUE = r"\([^)]*\)|\{[^}]*\}|\"[^\"]*\"|[^\s,;:)]+"

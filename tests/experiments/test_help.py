@@ -5,7 +5,7 @@ from importlib import import_module
 import pytest
 
 
-@pytest.mark.parametrize("name", ["identify.crazypad", "identify.nanobench"])
+@pytest.mark.parametrize("name", ["identification.crazypad", "identification.nanobench"])
 @pytest.mark.parametrize(
     ("arguments", "code"), [(["--help"], 0), ([], 2), (["none", "more"], 2), (["none"], 2)], ids=str
 )

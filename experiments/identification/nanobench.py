@@ -1,4 +1,4 @@
-"""From one airframe to another: python -m experiments.identify.nanobench --help"""
+"""From one airframe to another: python -m experiments.identification.nanobench --help"""
 
 import itertools
 from dataclasses import dataclass, replace
@@ -15,12 +15,12 @@ from jaxtyping import Array, Float
 from rich.console import Console
 
 import hybrid_jax as hj
-from experiments.identify.checked import inputs_of
-from experiments.identify.crazypad import ACTUATOR, VEHICLE, first_seconds, force_errors, rms
+from experiments.identification.crazypad import ACTUATOR, VEHICLE, first_seconds, force_errors, rms
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
 from hybrid_jax.adaptation.ridge import defects
+from hybrid_jax.cli.compared import inputs_of
 from hybrid_jax.dynamics import FrozenRates, HoldState, Terms
 from hybrid_jax.dynamics.actuators import Actuated, actuated, rotor_speeds
 from hybrid_jax.dynamics.disturbance import disturbed
@@ -164,7 +164,7 @@ def run(options: Options) -> None:
     print_tables(console, [*shown, Table("Flights of B left out, RMSE", ("model", *names), lines)])
 
 
-main = partial(command.call, "identify.nanobench", Options, run)
+main = partial(command.call, "identification.nanobench", Options, run)
 
 if __name__ == "__main__":
     main()

@@ -1,4 +1,4 @@
-"""Which rotor is damaged, and by how much: python -m experiments.identify.crazypad --help"""
+"""Which rotor is damaged, and by how much: python -m experiments.identification.crazypad --help"""
 
 import re
 from dataclasses import dataclass, replace
@@ -12,10 +12,10 @@ import tyro
 from jaxtyping import Float
 from rich.console import Console
 
-from experiments.identify.checked import inputs_of
 from experiments.reporting.tables import Table, print_tables
 from experiments.runner import command
 from hybrid_jax import runtime
+from hybrid_jax.cli.compared import inputs_of
 from hybrid_jax.dynamics.actuators import Actuator, actuated, rotor_speeds
 from hybrid_jax.dynamics.rigid_body import corrected, rigid_body
 from hybrid_jax.flights.checks.airborne import airborne, within
@@ -172,7 +172,7 @@ def run(options: Options) -> None:
     print_tables(console, [Table(title, (*header, "from normal", "those seconds", "interpolated"), lines)])
 
 
-main = partial(command.call, "identify.crazypad", Options, run)
+main = partial(command.call, "identification.crazypad", Options, run)
 
 if __name__ == "__main__":
     main()

@@ -1,11 +1,13 @@
 """The command that identifies a vehicle: bad input ends in one line, a small log in a report and a model."""
 
+import json
+from typing import Any
+
 import numpy as np
 import pytest
 
 import hybrid_jax as hj
-from experiments.identify.__main__ import main
-from experiments.identify.report import _by_step, _nearest
+from hybrid_jax.cli.identify import _by_step, _nearest
 from hybrid_jax.vehicle import IRIS
 
 VEHICLE = f"""
@@ -31,9 +33,8 @@ motors = { columns = ["c0", "c1", "c2", "c3"], unit = "share" }
 
 
 @pytest.fixture
-def files(tmp_path, monkeypatch):
+def files(tmp_path):
     """A rig that shakes its thrust: k is a tenth more than nominal, the lag 0.08 s."""
-    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
     rng, dt = np.random.default_rng(0), 0.01
     t = dt * np.arange(1600)
     c = np.repeat(rng.uniform(0.45, 0.75, 100), 16)
@@ -50,21 +51,24 @@ def files(tmp_path, monkeypatch):
         np.savetxt(path, table, "%.9g", ",", header="t,ax,ay,az,c0,c1,c2,c3", comments="")
     (tmp_path / "vehicle.toml").write_text(VEHICLE)
     (tmp_path / "columns.toml").write_text(COLUMNS)
-    options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "out": "out"}
+    options = {"vehicle": "vehicle.toml", "columns": "columns.toml", "output": "model.npz", "out": "out"}
     return tmp_path, [str(tmp_path / "logs"), *(f"--{key}={tmp_path / value}" for key, value in options.items())]
 
 
-def test_a_folder_of_commands_becomes_a_report_and_a_model(files):
+def test_a_folder_of_commands_becomes_a_page_and_a_model(files, called):
     folder, arguments = files
-    test, model = folder / "logs" / "two.csv", folder / "model.npz"
-    main([*arguments, "--dt", "0.01", "--steps", "40", "--windows", "20", "--test", str(test), "--model", str(model)])
-    theta = hj.load(model).field.theta()
+    test = folder / "logs" / "two.csv"
+    short = ["--dt", "0.01", "--steps", "40", "--windows", "20", "--test", test]
+    code, said, _ = called("identify", *arguments, *short)
+    assert code == 0
+    assert "2 of 2 numbers are told" in said
+    model: Any = hj.load(folder / "model.npz").field
+    theta = model.theta()
     np.testing.assert_allclose(theta["k"], 1.1 * IRIS.thrust_coefficient, rtol=0.01)
     np.testing.assert_allclose(theta["time_constant"], 0.08, rtol=0.05)
-    page = (folder / "out" / "report.md").read_text()
-    assert "time_constant" in page
-    assert "two.csv" in page
-    assert (folder / "out" / "errors.png").stat().st_size > 0
+    page = (folder / "out" / "report.html").read_text()
+    assert all(words in page for words in ("time_constant", "two.csv", "data:image/png;base64,"))
+    assert json.loads((folder / "out" / "report.json").read_text())["parameters"]["k"]["low"] > 0
 
 
 def test_errors_are_shown_at_steps_that_were_measured():
@@ -85,13 +89,22 @@ def test_errors_are_shown_at_steps_that_were_measured():
         (["--measured", "speed"], "--measured must be of"),
         (["--steps", "0"], "--steps must be an integer of at least 1"),
         (["--windows", "0"], "--windows must be an integer of at least 1"),  # it named a field that is no option
-        (["--learn", "k,motor_time_constant"], "motor_time_constant is for real_flight alone: give --learn k"),
+        (
+            ["--learn", "k,motor_time_constant"],
+            "motor_time_constant is for rotor speeds alone, not for commands: give --learn k",
+        ),
         (["--motor-order", "0,1,2,2"], "--motor-order must be of 0, 1, 2, 3, each at most once"),
     ],
 )
-def test_bad_options_end_in_one_line(files, capsys, more, said):
-    with pytest.raises(SystemExit) as stop:
-        main([*files[1], *more])
-    assert stop.value.code == 2
-    lines = capsys.readouterr().err.strip().splitlines()
-    assert said in lines[-1]
+def test_bad_options_end_in_one_line(files, called, more, said):
+    code, _, printed = called("identify", *files[1], *more)
+    assert code == 2
+    assert said in printed.splitlines()[-1]
+
+
+def test_fit_hands_logs_without_states_over(files, called, monkeypatch):
+    given = []
+    monkeypatch.setattr("hybrid_jax.cli.identify.run", lambda options: given.append(options) or 0)
+    code, *_ = called("fit", *files[1], "--learn", "k")
+    assert code == 0
+    assert (given[0].folder, given[0].learn) == (files[0] / "logs", ("k",))

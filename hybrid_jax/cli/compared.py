@@ -1,4 +1,4 @@
-"""Checks of logs before a vehicle is identified from them, as far as their signals allow."""
+"""Checks of logs before a vehicle is identified from them, as far as their signals allow, and of what drags it."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -10,8 +10,8 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.cli.command import ChecksFailed
-from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.dynamics.actuators import Actuated
+from hybrid_jax.flights.attitude import interpolate, interpolate_attitude, rotation_of
 from hybrid_jax.flights.checks.airborne import airborne, within
 from hybrid_jax.flights.checks.consistency import ORDER, RATIO, SPIN, THRUST, Check, check_log
 from hybrid_jax.flights.checks.suitability import check_recording, failures
@@ -25,6 +25,7 @@ from hybrid_jax.vehicle import Vehicle
 MEND = "nothing was identified; mend the logs as the lines above say, or go on with --anyway"
 NOT_NEEDED = ("quantities", "slowest signal")  # what a log lacks is not compared, and what is slow at its own times
 MOTORS = "rotor_speed"
+DRAGGED = 0.6  # correlation of forces with the velocity from which on they are drag
 GUESSED = 10.0  # factor by which a thrust that is learned may be off; units are farther off
 OF_THRUST = {"curve", "mass", "k", "k_rotors"}
 # Checks of a flight: what they need, and the longest interval [s] of that at which they tell something. Identification
@@ -54,7 +55,7 @@ def check_consistent(recordings: Sequence[Recording], field: Any, learn: Sequenc
 
 def _require(found: Sequence[tuple[Recording, list[Check]]], anyway: bool) -> list[str]:
     needed = [(Path(log.name).name, [each for each in checks if each.name not in NOT_NEEDED]) for log, checks in found]
-    lines = [in_flags("identify", line) for name, checks in needed for line in failures(checks, name)]
+    lines = [line for name, checks in needed for line in failures(checks, name)]
     if lines and not anyway:
         raise ChecksFailed(*lines, MEND)
     return lines
@@ -122,3 +123,34 @@ def _filled(recording: Recording, signals: dict[str, Signal], dt: float) -> Reco
             axes, rest = (WXYZ, [1.0, 0, 0, 0]) if name == "attitude" else (XYZ, [0.0] * 3)
             kept[name] = Signal(motors.t[[0, -1]], np.tile(rest, (2, 1)), axes, "nothing")
     return replace(recording, signals=kept)
+
+
+def unlearned_drag(logs: Sequence[Recording]) -> str:
+    """What is to be said where forces across the thrust follow the velocity; empty where they do not."""
+    both = [pair for log in logs if (pair := _across(log)) is not None]
+    if not both:
+        return ""
+    force, velocity = (np.concatenate(each) for each in zip(*both, strict=True))
+    slope = (force * velocity).sum() / max((velocity**2).sum(), 1e-12)
+    correlation = (force * velocity).sum() / max(np.sqrt((force**2).sum() * (velocity**2).sum()), 1e-12)
+    if correlation > -DRAGGED:
+        return ""
+    told = f"specific force across the thrust is {slope:.2g} v (correlation {correlation:.2f})"
+    return f"{told}: drag, which is not learned, so lag and inertia take it up: learn drag as well"
+
+
+def _across(log: Recording) -> tuple[np.ndarray, np.ndarray] | None:
+    """Specific force and velocity along x and y of the body, if both were measured."""
+    signals = log.signals
+    force, q = signals.get("specific_force"), signals.get("attitude")
+    if force is None or force.axes != ("x", "y", "z") or not {"velocity", "body_velocity"} & signals.keys():
+        return None
+    if "body_velocity" in signals:
+        own = signals["body_velocity"]
+        return force.values[:, :2], interpolate(force.t, own.t, own.values)[:, :2]
+    if q is None:
+        return None
+    inside = (force.t >= q.t[0]) & (force.t <= q.t[-1])
+    t, own = force.t[inside], signals["velocity"]
+    turned = rotation_of(interpolate_attitude(t, q.t, q.values)).inv().apply(interpolate(t, own.t, own.values))
+    return force.values[inside, :2], turned[:, :2]

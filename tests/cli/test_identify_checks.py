@@ -5,12 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from recorded import LOGS, write
-from rich.console import Console
 
 from benchmarks.log_mistakes import parts_of, recording_of
-from experiments.identify.__main__ import Config, checked, main
-from experiments.identify.checked import compared
 from experiments.real_flight.simulated import vehicle_toml
+from hybrid_jax.cli.compared import compared
+from hybrid_jax.cli.identify import Options, checked
 from hybrid_jax.dynamics.actuators import Actuator
 from hybrid_jax.dynamics.vehicle_file import VehicleModel
 from hybrid_jax.flights.checks.consistency import FAILS
@@ -22,27 +21,29 @@ SWAPPED = replace(LOGS[0], u=LOGS[0].u[:, [1, 2, 3, 0]])
 
 @pytest.fixture
 def folder(tmp_path, monkeypatch):
-    monkeypatch.setattr("hybrid_jax.runtime.configure", lambda: None)  # JAX has begun in this process
     (tmp_path / "v.toml").write_text('learn = ["Ix", "curve"]\n' + vehicle_toml(IRIS) + ACTUATOR)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def ended(capsys, *arguments):
+@pytest.fixture
+def ended(called):
     """The exit code, and the lines on stderr."""
-    with pytest.raises(SystemExit) as stop:
-        main(["logs", "--vehicle", "v.toml", *arguments])
-    return stop.value.code, capsys.readouterr().err.splitlines()
+
+    def end(*arguments):
+        code, _, said = called("identify", "logs", "-o", "model.npz", "--vehicle", "v.toml", *arguments)
+        return code, said.splitlines()
+
+    return end
 
 
-def test_a_check_that_fails_ends_in_what_to_type(folder, capsys):
+def test_a_check_that_fails_ends_in_what_to_type(folder, ended):
     write(folder / "logs", [SWAPPED])
     (folder / "logs" / "notes.txt").write_text("windy")
-    code, lines = ended(capsys, "--learn", "Ix,Iy")
+    code, lines = ended("--learn", "Ix,Iy")
     assert code == 3
-    assert lines[0] == "notes.txt: left: no format that is read"
-    assert "motor order against roll and pitch: " in lines[1]
-    assert lines[1].endswith("--motor-order 3,0,1,2")
+    assert "motor order against roll and pitch: " in lines[0]
+    assert lines[0].endswith("--motor-order 3,0,1,2")
     assert "nothing was identified" in lines[-1]
     assert not [*(folder / "runs" / "identify").glob("*")]
 
@@ -53,27 +54,27 @@ MENDS = {"anyway": ({"anyway": True}, ["motor order"]), "mended": ({"motor_order
 @pytest.mark.parametrize(("more", "failed"), MENDS.values(), ids=MENDS)
 def test_it_goes_on_when_asked_or_mended(folder, more, failed):
     write(folder / "logs", [SWAPPED])
-    config = Config(folder / "logs", folder / "v.toml", learn=("Ix",), **more)
-    *_, lines = checked(config, Console(quiet=True))
+    config = Options(folder / "logs", folder / "m.npz", folder / "v.toml", learn=("Ix",), **more)
+    *_, lines = checked(config)
     assert [line.split(": ")[1].split(" against")[0] for line in lines] == failed
 
 
-def test_a_flight_is_not_both_fitted_and_predicted(folder, capsys):
+def test_a_flight_is_not_both_fitted_and_predicted(folder, ended):
     """Under another name its predictions would look like those of an unseen flight."""
     write(folder / "logs", LOGS[:2])
     write(folder, [LOGS[1]])
-    code, (line,) = ended(capsys, "--learn", "Ix", "--test", "chirp_run2.csv.gz")
+    code, (line,) = ended("--learn", "Ix", "--test", "chirp_run2.csv.gz")
     assert code == 2
     assert "--test chirp_run2.csv.gz: the same flight as logs/chirp_run2.csv.gz" in line
 
 
 @pytest.mark.parametrize(("learn", "rest"), [("Ix,curve,delay", "Ix"), ("curve", "Ix Iy")])
-def test_what_speeds_do_not_tell_is_refused(folder, capsys, learn, rest):
+def test_what_speeds_do_not_tell_is_refused(folder, ended, learn, rest):
     """It vanished from the result."""
     write(folder / "logs", LOGS[:1])
-    code, (line,) = ended(capsys, "--learn", learn)
+    code, (line,) = ended("--learn", learn)
     assert code == 2
-    assert line.startswith("identify: v.toml: learn: curve")
+    assert line.startswith("hybrid-jax identify: v.toml: learn: curve")
     assert line.endswith(f"has rotor speeds alone: give --learn {rest}")
 
 

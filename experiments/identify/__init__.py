@@ -1,1 +1,0 @@
-"""Identify a vehicle from logs of commands; see docs/howto/identify.md."""
