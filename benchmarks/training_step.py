@@ -20,9 +20,7 @@ from jaxtyping import PyTree
 from benchmarks import plain
 from benchmarks.subjects import SETTINGS, Model, make_windows, training_run
 from benchmarks.timing import Call, Findings, Ratio, Times, agree, compile_all, compiled, in_turns, run, table
-from hybrid_jax import kernels
 from hybrid_jax.dynamics.base import trainable
-from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.kernels import library
 from hybrid_jax.training.fitting import gradient_step
 
@@ -80,7 +78,7 @@ def prepare(model: Model, preset: Preset) -> Contest:
     arguments, ours = (state.field, state.adam, plan, windows), partial(gradient_step, settings=settings)
     calls, seconds = compile_all({"ours": ours, "plain": plain.training_step}, *arguments)
     difference = compare(f"steps of {model}", calls["ours"](), calls["plain"]())
-    if batch_norms(state.field) and kernels.status() == "used":
+    if library.obstacle() is None:
         calls[BARE], seconds[BARE] = without_kernels(ours, *arguments)
         compare(f"steps of {model} with and without kernels", calls["ours"](), calls[BARE]())
     exact = in_double_precision(ours, *arguments)
@@ -91,7 +89,7 @@ def prepare(model: Model, preset: Preset) -> Contest:
 def without_kernels(function: Callable[..., PyTree], *arguments: PyTree) -> tuple[Call, float]:
     """`compiled`, by JAX alone."""
     jax.clear_caches()  # of what was traced with kernels
-    with mock.patch.object(library, "is_available", return_value=False):
+    with mock.patch.object(library, "obstacle", return_value="switched off"):
         found = compiled(function, *arguments)
     jax.clear_caches()
     return found

@@ -19,7 +19,6 @@ from experiments.reporting import names
 from experiments.reporting.names import FINE_TUNED, SOURCE_ONLY, TARGET_ONLY
 from experiments.reporting.results import Results
 from experiments.runner.stages import Stage, Stages, stages_of
-from hybrid_jax import kernels
 from hybrid_jax.adaptation import METHODS, LeastSquares, Method
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.io.archive import Arrays
@@ -237,7 +236,6 @@ def capacity(config: Config) -> tuple[int, int]:
 
 def _compile(model: str, vehicle: Vehicle, config: Config) -> None:
     """Compile all programs that training and testing a model will run; they depend on shapes only."""
-    kernels.status()  # first: training needs the kernels, and while GCC compiles them the flights' program is traced
     shared, fresh = settings(config), fresh_fields(model, vehicle, config)
     source, target = (
         {name: placeholder(spec) for name, spec in splits(config).items()} for splits in (source_splits, target_splits)

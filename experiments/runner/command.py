@@ -6,7 +6,6 @@ import gc
 import io
 import signal
 import sys
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
@@ -17,7 +16,7 @@ from rich.console import Console
 from experiments.runner.cache import source_digest
 from experiments.runner.options import Run
 from experiments.runner.run_record import OtherRun, recorded
-from hybrid_jax import checks, kernels
+from hybrid_jax import checks
 from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, ChecksFailed, parsed
 from hybrid_jax.cli.flags import in_flags
 from hybrid_jax.runtime import configure
@@ -56,8 +55,6 @@ def run(
                 hosts.initialize(config.coordinator, config.processes, config.process_id, alike)
             except ValueError as error:
                 raise ValueError(f"--distributed: {error}") from error
-        # Compiles the kernels beside what comes first, if there are none yet: GCC takes some seconds.
-        threading.Thread(target=kernels.status, daemon=True).start()
         for number in (signal.SIGTERM, signal.SIGHUP):
             if signal.getsignal(number) != signal.SIG_IGN:  # as `nohup` leaves it
                 signal.signal(number, _interrupt)

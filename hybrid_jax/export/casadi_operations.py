@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from jax.extend.core import ClosedJaxpr
 
-from hybrid_jax.export.translation import Translation
+from hybrid_jax.codegen.translation import Translation
 
 Column = ca.SX | ca.DM
 

@@ -1,240 +1,188 @@
-"""Rollouts of the paper's models by kernels: all intervals in one call, and its derivative.
+"""Fields as kernels: what a field computes of one sample, as source, and the layers around batch normalisation apart.
 
-A model is a rigid body, a network with one hidden layer and ReLU, or their sum, in single precision, by RK4.
+A field is taken apart into weights, functions of what it learns that JAX evaluates once a rollout, and a program of one
+sample of these, x and u: forward, and backward by `jax.vjp`. Batch normalisation couples samples, so the layers around
+it are written by hand (cpp/layer.h): the program then returns what they read beside ẋ, which is of what they return, y.
 """
 
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Sequence
+from dataclasses import dataclass, fields
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, PyTree
 
-from hybrid_jax.dynamics.base import AbstractVectorField, as_field
-from hybrid_jax.dynamics.composition import Hybrid
-from hybrid_jax.dynamics.equations import derivative
-from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
-from hybrid_jax.dynamics.terms import Terms
-from hybrid_jax.integrate import RK4, Solver, integrate
+from hybrid_jax.dynamics.batching import batch_norms
 from hybrid_jax.kernels import library
-from hybrid_jax.networks.activations import ACTIVATIONS
+from hybrid_jax.kernels.source import Source
+from hybrid_jax.kernels.trace import Shape, Split, split, traced
 from hybrid_jax.networks.mlp import ResidualNetwork
-from hybrid_jax.networks.normalisation import BatchNorm, Bias, ChannelScaling, InputScaling
-from hybrid_jax.networks.normalised_layer import normalised_layer
-from hybrid_jax.state import STATE_SIZE
-from hybrid_jax.vehicle import Vehicle
+from hybrid_jax.networks.normalisation import BatchNorm
 
-RELU = ACTIVATIONS["relu"]
-Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
-VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at least so many
-UNITS = 2 * VECTOR  # hidden units that a kernel works on at once, at most: their number is a multiple of it
+UNITS = 32  # hidden units that the layer works on at once, at most: their number is a multiple of it
+MOST = 20_000  # weights: more take long to translate
+REFUSED: dict[str, str] = {}  # name of a field → why there is no kernel for it
 
 
-class Constants(NamedTuple):
-    """What a kernel is compiled for besides shapes."""
+class Sizes(NamedTuple):
+    """Numbers of x, of u, and of what the layer reads, has of units and returns, or 0."""
 
-    dt: float
-    vehicle: Vehicle | None  # of the rigid body, if there is one
-    epsilon: float  # of batch normalisation
-
-    def numbers(self) -> list[float]:
-        """dt, ε, and the vehicle as rigid_body.h has it."""
-        numbers = [self.dt, self.epsilon]
-        if (vehicle := self.vehicle) is not None:
-            rotors = [(*position, spin) for position, spin in zip(vehicle.rotor_positions, vehicle.spin, strict=True)]
-            body = vehicle.mass, vehicle.gravity, vehicle.inertia[2], vehicle.torque_coefficient
-            numbers += [*body, *np.ravel(rotors)]
-        return numbers
-
-    def physics(self, theta: Float[Array, " 3"], x, u) -> Float[Array, "d b"] | float:
-        """ẋ of the rigid body."""
-        if self.vehicle is None:
-            return 0.0
-        known = {name: (value,) for name, value in zip(LEARNED, theta, strict=True)}
-        return derivative(self.vehicle, Terms(), known, tuple(x), tuple(u))
+    d: int
+    m: int
+    reads: int = 0
+    units: int = 0
+    returns: int = 0
 
 
-class KernelField(NamedTuple):
-    """A field for which there are kernels."""
+@dataclass(frozen=True, eq=False)
+class Kernel:
+    """What serves a field: the library, and how the field's arrays become its weights."""
 
-    physics: RigidBody | None
-    network: ResidualNetwork | None
+    prefix: str
+    sizes: Sizes
+    forward: Split
+    back: Split | None
+    order: tuple[int, ...]  # of the weights, as the library has them
+    epsilon: float
 
-    def serves(self, x0: Shaped, u: Shaped, windows_axis: int) -> bool:
-        """Whether the kernels are for these arrays, of which they check no shapes themselves."""
-        if (x0.ndim, u.ndim) != (2, 3) or x0.shape[windows_axis] != u.shape[windows_axis]:
-            return False
-        arrays = jax.tree.leaves((eqx.filter((self.physics, self.network), eqx.is_array), x0, u))
-        single = all(array.dtype == jnp.float32 for array in arrays)
-        fits = self._fits(x0.shape[1 + windows_axis], u.shape[2 + windows_axis])
-        return single and fits and x0.shape[windows_axis] >= VECTOR and library.is_available()
+    def weights(self, field: PyTree) -> Array:
+        """The weights of a field in one array."""
+        weights = self.forward.weights(*jax.tree.leaves(eqx.filter(field, _is_array)))
+        return joined([weights[i] for i in self.order])
 
-    def _fits(self, d: int, inputs: int) -> bool:
-        """Whether states of d numbers and so many inputs are those of physics and network."""
-        if (network := self.network) is not None:
-            h = len(network.weight_in)
-            shapes = network.weight_in.shape, network.weight_out.shape, network.bias_out.shape
-            of_norm = [array.shape for array in jax.tree.leaves(network.norm)]
-            if shapes != ((h, d + inputs), (d, h), (d,)) or set(of_norm) != {(h,)} or h % UNITS:
-                return False
-        if self.physics is None:
-            return True
-        scalars = all(jnp.ndim(ratio) == 0 for ratio in self.physics.deviations.values())
-        return scalars and (d, inputs) == (STATE_SIZE, self.physics.vehicle.rotors)
+    def apart(self, weights: Array) -> list[Array]:
+        """The weights from one array."""
+        shapes = [self.forward.shapes[i].shape for i in self.order]
+        ends = np.cumsum([0, *(int(np.prod(shape)) for shape in shapes)]).tolist()
+        parts = [weights[start:end].reshape(s) for start, end, s in zip(ends, ends[1:], shapes, strict=False)]
+        return [parts[self.order.index(i)] for i in range(len(parts))]
 
-    def rollout(self, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float) -> Float[Array, "t d b"]:
-        """In training mode, in which batch normalisation takes the scaling's offset away."""
-        d, m, network = len(x0), len(x0) + u.shape[1], self.network
-        layers, epsilon = [jnp.zeros(shape, jnp.float32) for shape in ((0, m), 0, 0, (d, 0), d)], 0.0
-        if network is not None:
-            assert isinstance(network.norm, BatchNorm)
-            weight_in, epsilon = network.weight_in * _input_scaling(network, d)[1], network.norm.epsilon
-            layers = [weight_in, network.norm.gain, network.norm.shift, *self._output_layer(network, x0)]
-        return _rollout(self._constants(dt, epsilon), self._theta(), *layers, x0, u)
+    def back_weights(self, weights: Array) -> Array:
+        """Those of the way back."""
+        assert self.back is not None
+        return joined(self.back.weights(*self.apart(weights)))
 
-    def predict(self, x0: Float[Array, "n d"], u: Float[Array, "n t m"], dt: float) -> Float[Array, "n t d"]:
-        """In inference mode."""
-        d, m, network = x0.shape[1], x0.shape[1] + u.shape[2], self.network
-        layers = [jnp.zeros(shape, jnp.float32) for shape in (m, m, (0, m), 0, (d, 0), d)]
-        if network is not None:
-            assert isinstance(network.norm, BatchNorm | Bias)
-            hidden, output = network.norm.fold(network.weight_in), self._output_layer(network, x0.T)
-            layers = [*_input_scaling(network, d), *hidden, *output]
-        return _predict(self._constants(dt), self._theta(), *layers, x0, u)
-
-    def _constants(self, dt: float, epsilon: float = 0.0) -> Constants:
-        return Constants(float(dt), self.physics.vehicle if self.physics else None, epsilon)
-
-    def _theta(self) -> Float[Array, " 3"]:
-        known = self.physics.theta() if self.physics else dict.fromkeys(LEARNED, jnp.zeros((), jnp.float32))
-        return jnp.stack([known[name] for name in LEARNED])
-
-    def _output_layer(self, network: ResidualNetwork, x: Float[Array, "d b"]) -> list[Array]:
-        """W₂ and b₂ with what scaling and physics do to the network's output, which are factors of its rows."""
-        layer = [network.scaling.outputs(part) for part in (network.weight_out, network.bias_out)]
-        return layer if self.physics is None else [as_field(self.physics).apply_residual(x, part) for part in layer]
+    def evaluate(self, weights: Array, x: Array, u: Array, y: Array) -> list[Array]:
+        """ẋ and what the layer reads, of one sample."""
+        return self.forward.program(*self.apart(weights), x, u, y)
 
 
-def _input_scaling(network: ResidualNetwork, d: int) -> tuple[Float[Array, " m"], Float[Array, " m"]]:
-    """z = ([x, u] − offset) factor."""
-    sizes = d, network.weight_in.shape[1] - d
-    zeros, ones = (tuple(jnp.full(size, value, jnp.float32) for size in sizes) for value in (0, 1))
-    at_zero, factor = jax.jvp(network.scaling.concatenate, zeros, ones)
-    return -at_zero / factor, factor
+def joined(arrays: Sequence[Array]) -> Array:
+    return jnp.concatenate([jnp.zeros(0, jnp.float32), *(jnp.ravel(one) for one in arrays)])
 
 
-def serves_training(field: AbstractVectorField, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
-    """Whether `trained` serves a minibatch of these shapes, whose windows lie along an axis."""
-    return _training_kernel(field, x0, u, solver, 1, windows_axis) is not None
-
-
-def trained(
-    field: AbstractVectorField, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1
-) -> Float[Array, "t d b"] | None:
-    """The trajectories of a minibatch in training mode, or None if no kernel is for them."""
-    own = _training_kernel(field, x0, u, solver, substeps, -1)
-    return own and own.rollout(x0, u, dt)
-
-
-def predicted(
-    field: AbstractVectorField, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver
-) -> Float[Array, "n t d"] | None:
-    """The trajectories of windows x0 (n, d), u (n, t, m) in inference mode, or None if no kernel is for them."""
-    own = _kernel_field(field, solver, 1)
-    if own and (own.network is None or type(own.network.norm) in (BatchNorm, Bias)) and own.serves(x0, u, 0):
-        return own.predict(jnp.asarray(x0), jnp.asarray(u), dt)
-    return None
-
-
-def _training_kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int) -> KernelField | None:
-    own = _kernel_field(field, solver, substeps)
-    fits = own and (own.network is None or type(own.network.norm) is BatchNorm) and own.serves(x0, u, axis)
-    return own if fits else None
-
-
-def _kernel_field(field: AbstractVectorField, solver: Solver, substeps: int) -> KernelField | None:
-    alone = (field, None) if isinstance(field, RigidBody) else (None, field)
-    physics, network = (field.physics, field.residual) if type(field) is Hybrid else alone
-    if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1):
+def layer_of(field: PyTree) -> ResidualNetwork | None:
+    """The network whose batch normalisation couples samples, if any; ValueError if it is not one for kernels."""
+    if not (norms := batch_norms(field)):
         return None
-    if physics is not None and not (type(physics) is RigidBody and _is_plain(physics)):
+    networks = [node for node in _networks(field) if isinstance(node.norm, BatchNorm)]
+    if len(norms) > 1 or len(networks) != 1:
+        raise ValueError("its batch normalisation is not that of one residual network")
+    (network,) = networks
+    if network.activation != "relu" or len(network.weight_in) % UNITS:
+        raise ValueError(f"its batch normalisation is not followed by ReLU, or its units are no multiple of {UNITS}")
+    return network
+
+
+def kernel_of(field: PyTree, d: int, m: int, training: bool) -> Kernel | None:
+    """The kernel of a field of d states and m inputs, or None; `REFUSED` then has the reason."""
+    arrays, rest = eqx.partition(field, _is_array)
+    shapes, structure = jax.tree.flatten(jax.tree.map(lambda leaf: Shape(jnp.shape(leaf), leaf.dtype), arrays))
+    static, frame = jax.tree.flatten(rest)
+    try:
+        key = tuple((*one.shape, str(one.dtype)) for one in shapes), structure, tuple(static), frame, d, m, training
+        if key not in _KNOWN:
+            with jax.ensure_compile_time_eval():  # this may be inside of a program that JAX traces
+                _KNOWN[key] = _made(eqx.combine(jax.tree.unflatten(structure, shapes), rest), Sizes(d, m), training)
+    except Exception as error:  # a user's code may raise anything
+        known = isinstance(error, ValueError | library.Unusable)
+        reason = str(error) if known else f"{type(error).__name__}: {error}"
+        REFUSED[type(field).__name__] = reason.removeprefix("field: ").partition("\n")[0]
         return None
+    return _KNOWN[key]
+
+
+_KNOWN: dict[Any, Kernel] = {}
+
+
+def _made(field: PyTree, sizes: Sizes, training: bool) -> Kernel:
+    """The kernel of a field of shapes in place of arrays."""
+    _check_methods(field, "train_batch" if training else "infer_batch")
+    shapes, structure = jax.tree.flatten(eqx.filter(field, _is_shape))
+    rest, network, epsilon = eqx.filter(field, _is_shape, inverse=True), layer_of(field) if training else None, 0.0
     if network is not None:
-        if type(network) is not ResidualNetwork or network.activation != "relu":
-            return None
-        if type(network.scaling) not in (InputScaling, ChannelScaling):
-            return None
-    return KernelField(physics, network)  # pyright: ignore[reportArgumentType]
+        (units, reads), (returns,), epsilon = network.weight_in.shape, network.bias_out.shape, network.norm.epsilon  # pyright: ignore
+        sizes = Sizes(sizes.d, sizes.m, reads, units, returns)
+    of_sample = [Shape((size,), jnp.float32) for size in (sizes.d, sizes.m, sizes.returns)]
+
+    def evaluate(*arrays):
+        whole = eqx.combine(jax.tree.unflatten(structure, arrays[:-3]), rest)
+        return _with_reading(whole, *arrays[-3:]) if network else [whole(*arrays[-3:-1]), jnp.zeros(0, jnp.float32)]
+
+    program = traced(evaluate, *shapes, *of_sample)
+    slope = program.shapes[program.outputs[0]]
+    if (slope.shape, slope.dtype) != ((sizes.d,), jnp.float32):
+        raise ValueError(f"it returns {slope}")
+    forward = split(program, len(shapes))
+    if any(one.dtype != jnp.float32 for one in forward.shapes):
+        raise ValueError("its numbers are not all in single precision")
+    if (count := sum(int(np.prod(one.shape)) for one in forward.shapes)) > MOST:
+        raise ValueError(f"it has {count} weights, more than {MOST}")
+    source = Source(forward, of_sample)
+    back = source.add_backward() if training else None
+    source.add_forward()
+    constants = dict(zip(("D", "M", "Z", "H", "Y"), sizes, strict=True)) | {"P": count}
+    prefix = library.compiled(source.text(constants, training), source.needs_math())
+    return Kernel(prefix, sizes, forward, back, source.order, epsilon)
 
 
-def _is_plain(body: RigidBody) -> bool:
-    return set(body.deviations) == set(LEARNED) and body.terms == Terms()
+class _Reader(ResidualNetwork):
+    """In place of a network with batch normalisation: it tells what it reads, and returns what it is given."""
+
+    returned: Array = eqx.field(default=None)  # pyright: ignore[reportAssignmentType]
+    tell: Any = eqx.field(static=True, default=None)
+
+    def __call__(self, x, u):
+        self.tell(self.inputs(x, u))
+        return self.scaling.outputs(self.returned)
 
 
-@partial(jax.custom_vjp, nondiff_argnums=(0,))
-def _rollout(constants: Constants, *arrays: Array) -> Float[Array, "t d b"]:
-    """`_plain_rollout`, each way in one call."""
-    return _forward(constants, *arrays)[0]
+def _with_reading(field: PyTree, x: Array, u: Array, y: Array) -> list[Array]:
+    """ẋ, where the network with batch normalisation returns y, and what it reads."""
+    read: list[Array] = []
+    (network,) = [node for node in _networks(field) if isinstance(node.norm, BatchNorm)]
+    parts = {one.name: getattr(network, one.name) for one in fields(ResidualNetwork)}
+    reader = _Reader(**parts, returned=y, tell=read.append)
+    whole = jax.tree.map(lambda node: reader if node is network else node, field, is_leaf=lambda node: node is network)
+    slope = whole(x, u)
+    if len(read) != 1:
+        raise ValueError(f"its batch normalisation is evaluated {len(read)} times")
+    return [slope, read[0]]
 
 
-def _plain_rollout(constants: Constants, theta, weight_in, gain, shift, weight_out, bias_out, x0, u):
-    layers = weight_in, gain, shift, weight_out, bias_out
+def _networks(field: PyTree) -> list[ResidualNetwork]:
+    def is_network(node) -> bool:
+        return isinstance(node, ResidualNetwork)
 
-    def field(x, u):
-        y: Array = normalised_layer(constants.epsilon, RELU, *layers, jnp.concatenate([x, u]))  # pyright: ignore[reportAssignmentType]
-        return constants.physics(theta, x, u) + y
-
-    return integrate(field, x0, u, constants.dt, RK4())
+    return [node for node in jax.tree.leaves(field, is_leaf=is_network) if is_network(node)]
 
 
-def _forward(constants: Constants, *arrays: Array):
-    (h, m), x0, u = arrays[1].shape, *arrays[-2:]
-    kept = len(u) * 4 * (x0.size + (m * x0.shape[1] + h if h else 0))  # of every stage, see rollout.cc
-    results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
-
-    def kernel(*arrays):
-        return library.call("rollout_forward", results, *arrays, numbers=constants.numbers())
-
-    def plain(*arrays):
-        return [_plain_rollout(constants, *arrays), jnp.zeros(kept, x0.dtype)]
-
-    states, saved = library.with_derivative(kernel, plain)(*arrays)
-    return states, (*arrays, saved)
+def _check_methods(node: Any, method: str) -> None:
+    """Refuse a field with a batched form of a user's own, which may be another function than that of one sample."""
+    own = getattr(type(node), method, None)
+    if own is not None and not own.__module__.startswith("hybrid_jax."):
+        raise ValueError(f"{type(node).__name__} has a {method} of its own")
+    parts = vars(node).values() if isinstance(node, eqx.Module) else node if isinstance(node, tuple | list) else ()
+    for part in node.values() if isinstance(node, dict) else parts:
+        _check_methods(part, method)
 
 
-def _backward(constants: Constants, saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
-    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
-
-    def kernel(*arrays):
-        return tuple(library.call("rollout_backward", results, *arrays, numbers=constants.numbers()))
-
-    def plain(*arrays):
-        *arrays, _, d_states = arrays
-        return jax.vjp(partial(_plain_rollout, constants), *arrays)[1](d_states)
-
-    return library.with_derivative(kernel, plain)(*saved, d_states)
+def _is_array(leaf: Any) -> bool:
+    return isinstance(leaf, np.ndarray) or eqx.is_array(leaf)
 
 
-_rollout.defvjp(_forward, _backward)
-
-
-def _predict(constants: Constants, *arrays: Array) -> Float[Array, "n t d"]:
-    x0, u = arrays[-2:]
-    states = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype)
-
-    def kernel(*arrays):
-        return library.call("prediction", states, *arrays, numbers=constants.numbers())
-
-    return library.with_derivative(kernel, partial(_plain_prediction, constants))(*arrays)
-
-
-def _plain_prediction(constants: Constants, theta, offset, factor, weight_in, bias_in, weight_out, bias_out, x0, u):
-    def field(x, u):
-        z = (jnp.concatenate([x, u]) - offset[:, None]) * factor[:, None]
-        hidden = RELU(weight_in @ z + bias_in[:, None])
-        return constants.physics(theta, x, u) + weight_out @ hidden + bias_out[:, None]
-
-    states = integrate(field, jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1), constants.dt, RK4())
-    return jnp.moveaxis(states, -1, 0)
+def _is_shape(leaf: Any) -> bool:
+    return isinstance(leaf, Shape)

@@ -15,7 +15,6 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
 
@@ -27,8 +26,7 @@ from hybrid_jax import runtime
 
 SWITCH = "HYBRID_JAX_NATIVE"
 SOURCES = Path(__file__).parent / "cpp"
-UNITS = "normalised_layer", "rollout", "prediction"  # files that are compiled, side by side
-HANDLERS = "rollout_forward", "rollout_backward", "prediction"
+HANDLERS = "forward", "backward", "predict"
 # Errors and exceptions of the square root are not asked for: without them several are taken at once.
 OPTIONS = ["-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math", "-fPIC", "-w"]
 LONGEST = 300  # s to compile
@@ -41,14 +39,27 @@ class Unusable(Exception):
     """Why there is no library."""
 
 
+@cache
 def obstacle() -> str | None:
-    """Why there are no kernels in this process, or None. Compiles them if need be."""
-    return _found()[1]
+    """Why there are no kernels in this process, or None."""
+    try:
+        _check_machine()
+        _folder()
+    except Unusable as reason:
+        return str(reason)
+    except OSError as error:
+        return f"they could not be kept: {error}"
+    return None
 
 
-def is_available() -> bool:
-    """Whether there are kernels in this process. Compiles them if need be."""
-    return _found()[0] is not None
+def compiled(source: str, needs_math: bool) -> str:
+    """What the names of XLA's targets begin with of a source, which is compiled and registered, if need be.
+
+    Raises:
+        Unusable: it could not be compiled, or not be kept.
+    """
+    with _LOCK:
+        return _registered(source, needs_math)
 
 
 def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ()):
@@ -56,7 +67,7 @@ def call(handler: str, results: Results, *arrays, numbers: Sequence[float] = ())
 
     Lanes under `vmap` are one call.
     """
-    kernel = jax.ffi.ffi_call(f"{_found()[0]}{handler}", results, vmap_method="broadcast_all")
+    kernel = jax.ffi.ffi_call(handler, results, vmap_method="broadcast_all")
     return kernel(*arrays, numbers=np.array(numbers, np.float32))
 
 
@@ -65,21 +76,6 @@ def with_derivative(kernel: Callable, plain: Callable) -> Callable:
     function = jax.custom_jvp(kernel)
     function.defjvp(lambda arrays, tangents: jax.jvp(plain, arrays, tangents))
     return function
-
-
-def _found() -> tuple[str | None, str | None]:
-    """What the names of XLA's targets begin with, once compiled and registered; or why there are none."""
-    with _LOCK:
-        return _looked_for()
-
-
-@cache
-def _looked_for() -> tuple[str | None, str | None]:
-    try:
-        _check_machine()
-        return _register(), None
-    except Unusable as reason:
-        return None, str(reason)
 
 
 def _check_machine() -> None:
@@ -97,23 +93,31 @@ def _compiler() -> str | None:
     return shutil.which(os.environ.get("CXX") or "g++")
 
 
-def _register() -> str:
-    begin = f"hybrid_jax_{_digest()}_"
+@cache
+def _registered(source: str, needs_math: bool) -> str:
+    digest = _digest(source)
+    begin = f"hybrid_jax_{digest}_"
     try:
-        library = ctypes.CDLL(str(_checked_library()))
+        library = ctypes.CDLL(str(_checked_library(digest, source, needs_math)))
     except OSError as error:
-        raise Unusable(f"they could not be compiled, or not be kept: {error}") from error
+        raise Unusable(f"they could not be kept, or not be loaded: {error}") from error
     for handler in HANDLERS:
-        jax.ffi.register_ffi_target(begin + handler, jax.ffi.pycapsule(getattr(library, handler)), platform="cpu")
+        if hasattr(library, handler):
+            target = jax.ffi.pycapsule(getattr(library, handler))
+            jax.ffi.register_ffi_target(begin + handler, target, platform="cpu")
     return begin
 
 
+def _digest(source: str) -> str:
+    return hashlib.sha256((source + _made_by()).encode()).hexdigest()[:16]
+
+
 @cache
-def _digest() -> str:
+def _made_by() -> str:
+    """What a library depends on besides its source."""
     compiler = Path(_compiler() or "").resolve()
     made_by = compiler, compiler.stat().st_mtime_ns, OPTIONS, jax.__version__, runtime.machine()[-2:]
-    sources = b"".join(path.read_bytes() for path in sorted(SOURCES.iterdir()))
-    return hashlib.sha256(sources + repr(made_by).encode()).hexdigest()[:16]
+    return "".join(path.read_text() for path in sorted(SOURCES.iterdir())) + repr(made_by)
 
 
 def _folder() -> Path:
@@ -128,11 +132,11 @@ def _folder() -> Path:
     return folder
 
 
-def _checked_library() -> Path:
+def _checked_library(digest: str, source: str, needs_math: bool) -> Path:
     """The file of the library, compiled if there is none, or none that is as it was written."""
-    library = _folder() / f"{_digest()}.so"
+    library = _folder() / f"{digest}.so"
     if not _is_whole(library):
-        _compile(library)
+        _compile(library, source, needs_math)
     for path in (library, _checksum(library)):
         path.touch()  # it was used
     return library
@@ -149,13 +153,12 @@ def _checksum(library: Path) -> Path:
     return library.with_suffix(".sha256")
 
 
-def _compile(library: Path) -> None:
-    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor() as threads:
-        objects = [Path(folder) / f"{name}.o" for name in UNITS]
-        include = f"-I{jax.ffi.include_dir()}"
-        pairs = zip(UNITS, objects, strict=True)
-        list(threads.map(_run_compiler, [["-c", include, f"{SOURCES / name}.cc", "-o", str(to)] for name, to in pairs]))
-        _run_compiler(["-shared", *map(str, objects), "-o", str(linked := Path(folder) / library.name)])
+def _compile(library: Path, source: str, needs_math: bool) -> None:
+    with tempfile.TemporaryDirectory() as folder:
+        (text := Path(folder) / "field.cc").write_text(source)
+        include = [f"-I{jax.ffi.include_dir()}", f"-I{SOURCES}"]
+        linked = Path(folder) / library.name
+        _run_compiler(["-shared", *include, str(text), *["-lmvec"] * needs_math, "-o", str(linked)])
         content = linked.read_bytes()
     _write(library, content)
     _write(_checksum(library), hashlib.sha256(content).hexdigest().encode())
@@ -167,8 +170,8 @@ def _run_compiler(arguments: list[str]) -> None:
     try:
         subprocess.run(command, check=True, capture_output=True, text=True, timeout=LONGEST)
     except subprocess.SubprocessError as error:
-        said = (getattr(error, "stderr", None) or str(error)).strip().partition("\n")[0]
-        raise Unusable(f"they could not be compiled: {said}") from error
+        said = [line for line in (getattr(error, "stderr", None) or "").splitlines() if "error" in line]
+        raise Unusable(f"it could not be compiled: {(said or [f'{command[0]} fails'])[0]}") from error
 
 
 def _write(path: Path, content: bytes) -> None:

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 
+from hybrid_jax.codegen.printer import CPrinter
+from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.export.c.fields import body_of, check_name, written
-from hybrid_jax.export.c.printer import CPrinter
-from hybrid_jax.export.c.tables import Tables
 from hybrid_jax.export.program import Size, sizes_of
 
 HEADER = """\

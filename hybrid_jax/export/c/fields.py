@@ -10,11 +10,11 @@ import jax
 import jax.numpy as jnp
 
 from hybrid_jax import checks
+from hybrid_jax.codegen.nodes import Entry, Statement
+from hybrid_jax.codegen.operations import CTranslation, column
+from hybrid_jax.codegen.printer import CPrinter
+from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
-from hybrid_jax.export.c.nodes import Entry, Statement
-from hybrid_jax.export.c.operations import CTranslation, column
-from hybrid_jax.export.c.printer import CPrinter
-from hybrid_jax.export.c.tables import Tables
 from hybrid_jax.export.c.templates import HEADER, SOURCE
 from hybrid_jax.export.program import Size, prepared, sizes_of, vehicle_in
 from hybrid_jax.io.files import write_atomic

@@ -24,7 +24,6 @@ struct Numbers {
   const float* at;
   int64_t size;
   float operator[](int64_t i) const { return at[i]; }
-  Numbers from(int64_t i) const { return {at + i, size - i}; }
 };
 
 struct Call {
@@ -38,7 +37,7 @@ struct Call {
 };
 
 // Where the parts of a lane begin; the lanes of a sweep are the first axes of all arrays of a call.
-struct Lane {
+struct LaneOf {
   const Call& call;
   int64_t lane, lanes;
   float* of(Array all) const { return all.data() + lane * (all.count() / lanes); }

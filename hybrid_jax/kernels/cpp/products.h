@@ -5,6 +5,7 @@
 #pragma once
 
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 #include "vectors.h"
@@ -129,24 +130,24 @@ void sums(const float* vectors, int64_t n, float* to) {
   }
 }
 
-// Each row less its mean.
-void centre(const float* from, float* to, int64_t rows, int64_t n) {
-  for (int64_t r = 0; r < rows; ++r, from += n, to += n) {
-    const float mean = sum(from, n) / float(n);
-    for (int64_t i = 0; i < n; i += V) store(to + first(i, n), load(from + first(i, n)) - mean);
+// Each row of n numbers, of which N lie in a row, less its mean.
+void centre(float* rows, int64_t count, int64_t n, int64_t N) {
+  for (; count--; rows += N) {
+    const float mean = sum(rows, n) / float(n);
+    for (int64_t i = 0; i < N; i += V) store(rows + i, load(rows + i) - mean);
   }
 }
 
 // Arrays of this thread, with room for a vector behind them: the kernels are called too often to ask for memory.
 enum Part {
-  W1, W1T, W2T, D_W1T, BIAS, HIDDEN, ACTIVE, ROWS, REST, POINT, SLOPE, SUM, NETWORK, D_SLOPE, D_NEXT, D_POINT, D_Z, D_X, D_U, PARTS
+  W1, W1T, W2T, D_W1T, BIAS, HIDDEN, ACTIVE, ROWS, REST, CENTRED, RESULT, D_RESULT, D_Z, POINT, STATE, SLOPE, SUM, INPUT,
+  D_X, D_U, D_NEXT, D_SLOPE, D_POINT, SUMS, FACTORS, READ_FACTORS, PARTS
 };
 float* scratch(Part part, int64_t n) {
   thread_local std::vector<float> parts[PARTS];
   std::vector<float>& all = parts[part];
   if (int64_t(all.size()) < n + 2 * V) all.resize(n + 2 * V);
-  // A vector that begins within a line of the cache takes two accesses.
-  return reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(all.data()) + sizeof(Vec) - 1) & -sizeof(Vec));
+  return aligned(all.data());
 }
 
 }  // namespace

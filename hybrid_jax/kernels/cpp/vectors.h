@@ -19,6 +19,12 @@ constexpr int V = 8;
 typedef float Vec __attribute__((vector_size(4 * V), aligned(4), may_alias));
 typedef int32_t Places __attribute__((vector_size(4 * V)));
 
+// A vector that begins within a line of the cache takes two accesses.
+#define HELD alignas(sizeof(Vec))
+INLINE float* aligned(float* at) {
+  return reinterpret_cast<float*>((reinterpret_cast<uintptr_t>(at) + sizeof(Vec) - 1) & -sizeof(Vec));
+}
+
 INLINE Vec load(const float* from) { return *reinterpret_cast<const Vec*>(from); }
 INLINE void store(float* to, Vec v) { *reinterpret_cast<Vec*>(to) = v; }
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hybrid_jax.export.c.nodes import (
+from hybrid_jax.codegen.nodes import (
     Address,
     Assign,
     Element,
@@ -17,7 +17,7 @@ from hybrid_jax.export.c.nodes import (
     Variable,
     nested,
 )
-from hybrid_jax.export.c.tables import Tables
+from hybrid_jax.codegen.tables import Tables
 
 LOOPED = 8  # so many entries are copied by a loop
 

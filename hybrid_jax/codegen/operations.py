@@ -11,8 +11,8 @@ from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from hybrid_jax.export.c import loops
-from hybrid_jax.export.c.nodes import (
+from hybrid_jax.codegen import loops
+from hybrid_jax.codegen.nodes import (
     Address,
     Array,
     Call,
@@ -27,9 +27,9 @@ from hybrid_jax.export.c.nodes import (
     names,
     nested,
 )
-from hybrid_jax.export.c.printer import OPERATIONS
-from hybrid_jax.export.c.tables import Tables
-from hybrid_jax.export.translation import Entries, Translation, Value
+from hybrid_jax.codegen.printer import OPERATIONS
+from hybrid_jax.codegen.tables import Tables
+from hybrid_jax.codegen.translation import Entries, Translation, Value
 
 EXPANDED = 24  # operations on at most so many entries are written out; more become a loop if they can
 COPIED = 200  # and on at most so many if they cannot

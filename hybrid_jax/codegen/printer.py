@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from hybrid_jax.export.c import nodes
-from hybrid_jax.export.c.nodes import Address, Element, Entry, Operation
-from hybrid_jax.export.c.tables import Tables
-from hybrid_jax.export.c.templates import HELPERS
+from hybrid_jax.codegen import nodes
+from hybrid_jax.codegen.helpers import HELPERS
+from hybrid_jax.codegen.nodes import Address, Element, Entry, Operation
+from hybrid_jax.codegen.tables import Tables
 
 _SAME_NAME = (
     *("floor", "ceil", "sqrt", "exp", "expm1", "log", "log1p", "erf", "erfc", "exp2", "cbrt", "atan2", "pow"),

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from hybrid_jax.export.c.nodes import Function, Parameter, Statement
+from hybrid_jax.codegen.nodes import Function, Parameter, Statement
 
 
 @dataclass

@@ -205,12 +205,24 @@ def _broadcast(params, a: np.ndarray) -> np.ndarray:
     return np.broadcast_to(a.reshape(aligned), shape)
 
 
+def _padded(params, a: np.ndarray, value: np.ndarray) -> np.ndarray:
+    pads = params["padding_config"]
+    if any(low < 0 or high < 0 for low, high, _ in pads):
+        return np.asarray(jax.lax.pad(a, value, pads))
+    lengths = [size + inner * max(size - 1, 0) for (*_, inner), size in zip(pads, a.shape, strict=True)]
+    sizes = [low + length + high for (low, high, _), length in zip(pads, lengths, strict=True)]
+    made, places = np.full(sizes, value, np.result_type(a, value)), zip(pads, lengths, strict=True)
+    made[tuple(slice(low, low + length, inner + 1) for (low, _, inner), length in places)] = a
+    return made
+
+
 _BY_NUMPY: dict[str, Callable[..., np.ndarray]] = {
     "slice": _sliced,
     "broadcast_in_dim": _broadcast,
     "squeeze": lambda params, a: a.squeeze(params["dimensions"]),
     "reshape": lambda params, a: a.reshape(params["new_sizes"]),
     "transpose": lambda params, a: a.transpose(params["permutation"]),
+    "pad": _padded,
     "concatenate": lambda params, *parts: np.concatenate(parts, params["dimension"]),
 }
 

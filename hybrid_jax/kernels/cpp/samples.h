@@ -1,0 +1,103 @@
+// Operations on a number of each of V samples, for generated code: a `real` is such a vector, a float the same for all.
+
+#pragma once
+
+#include <cmath>
+
+#include "vectors.h"
+
+namespace {
+
+using real = Vec;
+using logical = Places;  // -1 where it is true
+
+INLINE Vec wide(Vec v) { return v; }
+INLINE Vec wide(float v) { return v - Vec{}; }
+INLINE logical wide(logical v) { return v; }
+
+template <class Mask, class A, class B>
+INLINE Vec choose(Mask which, A a, B b) {
+  return which ? wide(a) : wide(b);
+}
+template <class Mask> INLINE Vec number(Mask which) { return choose(which, 1.0f, 0.0f); }
+
+// NaN, if one is NaN.
+template <class A, class B> INLINE Vec larger(A a, B b) { const Vec l = wide(a), r = wide(b); return (l > r) | (l != l) ? l : r; }
+template <class A, class B> INLINE Vec smaller(A a, B b) { const Vec l = wide(a), r = wide(b); return (l < r) | (l != l) ? l : r; }
+
+// Of glibc's library of vectors, within four units in the last place; and number by number.
+#if defined(__AVX512F__)
+#define OF_VECTORS(NAME) _ZGVeN16v_##NAME
+#define OF_PAIRS(NAME) _ZGVeN16vv_##NAME
+#else
+#define OF_VECTORS(NAME) _ZGVdN8v_##NAME
+#define OF_PAIRS(NAME) _ZGVdN8vv_##NAME
+#endif
+typedef float Whole __attribute__((vector_size(4 * V)));
+#define OF_ONE(NAME)                                 \
+  extern "C" Whole OF_VECTORS(NAME)(Whole);          \
+  template <class A> INLINE Vec NAME(A a) { return OF_VECTORS(NAME)(wide(a)); }
+#define OF_TWO(NAME)                                 \
+  extern "C" Whole OF_PAIRS(NAME)(Whole, Whole);     \
+  template <class A, class B> INLINE Vec NAME(A a, B b) { return OF_PAIRS(NAME)(wide(a), wide(b)); }
+#define EACH(NAME, OF)                               \
+  template <class A> INLINE Vec NAME(A a) {          \
+    float each[V];                                   \
+    store(each, wide(a));                            \
+    for (int j = 0; j < V; ++j) each[j] = OF(each[j]); \
+    return load(each);                               \
+  }
+OF_ONE(expf) OF_ONE(expm1f) OF_ONE(logf) OF_ONE(log1pf) OF_ONE(erff) OF_ONE(erfcf) OF_ONE(exp2f) OF_ONE(cbrtf)
+OF_ONE(sinf) OF_ONE(cosf) OF_ONE(tanf) OF_ONE(asinf) OF_ONE(acosf) OF_ONE(atanf)
+OF_ONE(sinhf) OF_ONE(coshf) OF_ONE(tanhf) OF_ONE(asinhf) OF_ONE(acoshf) OF_ONE(atanhf)
+OF_TWO(atan2f) OF_TWO(powf)
+EACH(sqrtf, std::sqrt) EACH(floorf, std::floor) EACH(ceilf, std::ceil) EACH(fabsf, std::fabs)
+template <class A, class B> INLINE Vec fmodf(A a, B b) {
+  Vec l = wide(a), r = wide(b);
+  for (int j = 0; j < V; ++j) l[j] = std::fmod(l[j], r[j]);
+  return l;
+}
+
+// out = W v, with W[i, k] at w[i row + k step]; eight rows at a time, whose sums need not wait for each other.
+template <int R, class W, class X>
+INLINE void rows_of(const W* w, int64_t row, int64_t step, const X* v, Vec* out, int columns) {
+  Vec sum[R] = {};
+  for (int k = 0; k < columns; ++k)
+#pragma GCC unroll 8
+    for (int r = 0; r < R; ++r) sum[r] += w[r * row + k * step] * v[k];
+#pragma GCC unroll 8
+  for (int r = 0; r < R; ++r) out[r] = sum[r];
+}
+template <class W, class X>
+INLINE void dense(const W* w, int64_t row, int64_t step, const X* v, Vec* out, int rows, int columns) {
+  int i = 0;
+  for (; i + 8 <= rows; i += 8) rows_of<8>(w + i * row, row, step, v, out + i, columns);
+  for (; i < rows; ++i) rows_of<1>(w + i * row, row, step, v, out + i, columns);
+}
+// out = A B, of m x k and k x n.
+template <class A, class B>
+INLINE void product(const A* a, const B* b, Vec* out, int m, int k, int n) {
+  for (int j = 0; j < n; ++j)
+    for (int i = 0; i < m; ++i) {
+      Vec sum{};
+      for (int l = 0; l < k; ++l) sum += a[i * k + l] * b[l * n + j];
+      out[i * n + j] = sum;
+    }
+}
+
+// Where results go that are added up over samples, and factors whose products are.
+struct Sums {
+  Vec* at;
+  struct Sum { Vec* at; INLINE void operator=(Vec v) const { *at += v; } };
+  INLINE Sum operator[](int64_t i) const { return {at + i}; }
+  INLINE Sums operator+(int64_t i) const { return {at + i}; }
+};
+struct Slots {
+  Vec* at;
+  int64_t step;
+  INLINE Vec& operator[](int64_t i) const { return at[i * step]; }
+  INLINE Slots operator+(int64_t i) const { return {at + i * step, step}; }
+};
+struct Outer { int64_t rows, columns, place; };
+
+}  // namespace

@@ -1,0 +1,119 @@
+"""Rollouts of many windows by the kernel of a field: all intervals in one call, and its derivative in another."""
+
+from functools import partial
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from hybrid_jax.integrate import RK4, Solver, integrate
+from hybrid_jax.kernels import library
+from hybrid_jax.kernels.fields import Kernel, kernel_of, layer_of
+from hybrid_jax.networks.activations import ACTIVATIONS
+from hybrid_jax.networks.normalised_layer import normalised_layer
+
+Shaped = Array | np.ndarray | jax.ShapeDtypeStruct
+VECTOR = 16  # numbers in a vector, at most: of windows the kernels take at least so many
+
+
+def serves_training(field, x0: Shaped, u: Shaped, solver: Solver, windows_axis: int) -> bool:
+    """Whether `trained` serves a minibatch of these shapes, whose windows lie along an axis."""
+    return _kernel(field, x0, u, solver, 1, windows_axis, True) is not None
+
+
+def trained(field, x0: Float[Array, "d b"], u: Float[Array, "t m b"], dt: float, solver: Solver, substeps=1) -> Any:
+    """The trajectories (t, d, b) of a minibatch in training mode, or None if no kernel is for them."""
+    if (kernel := _kernel(field, x0, u, solver, substeps, -1, True)) is None:
+        return None
+    layer = [jnp.zeros(0, jnp.float32)] * 5
+    if (network := layer_of(field)) is not None:
+        norm = network.norm
+        layer = [network.weight_in, norm.gain, norm.shift, network.weight_out, network.bias_out]  # pyright: ignore[reportAttributeAccessIssue]
+    return _rollout((kernel, float(dt)), kernel.weights(field), *layer, x0, u)
+
+
+def predicted(field, x0: Array | np.ndarray, u: Array | np.ndarray, dt: float, solver: Solver):
+    """The trajectories (n, t, d) of windows x0 (n, d), u (n, t, m) in inference mode, or None without a kernel."""
+    if (kernel := _kernel(field, x0, u, solver, 1, 0, False)) is None:
+        return None
+    x0, u = jnp.asarray(x0), jnp.asarray(u)
+    states, layer = jax.ShapeDtypeStruct((*u.shape[:2], x0.shape[1]), x0.dtype), [jnp.zeros(0, jnp.float32)] * 5
+
+    def kept(*arrays):
+        return library.call(kernel.prefix + "predict", states, *arrays, numbers=[dt, 0.0])
+
+    def plain(weights, *arrays):
+        *layer, x0, u = arrays
+        whole = _plain((kernel, dt), weights, *layer, jnp.moveaxis(x0, 0, -1), jnp.moveaxis(u, 0, -1))
+        return jnp.moveaxis(whole, -1, 0)
+
+    return library.with_derivative(kept, plain)(kernel.weights(field), *layer, x0, u)
+
+
+def _kernel(field, x0: Shaped, u: Shaped, solver: Solver, substeps: int, axis: int, training: bool) -> Kernel | None:
+    """The kernel for these arrays, of which it checks no shapes itself."""
+    if type(solver) is not RK4 or (solver.substeps, substeps) != (1, 1) or (x0.ndim, u.ndim) != (2, 3):
+        return None
+    if x0.shape[axis] != u.shape[axis] or x0.shape[axis] < VECTOR or library.obstacle() is not None:
+        return None
+    arrays = jax.tree.leaves(eqx.filter(field, eqx.is_inexact_array))
+    if any(leaf.dtype != jnp.float32 for leaf in (*arrays, x0, u)):
+        return None
+    return kernel_of(field, x0.shape[1 + axis], u.shape[2 + axis], training)
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(0,))
+def _rollout(kernel_and_dt: tuple[Kernel, float], *arrays: Array) -> Float[Array, "t d b"]:
+    """`_plain`, each way in one call."""
+    return _forward(kernel_and_dt, *arrays)[0]
+
+
+def _plain(kernel_and_dt: tuple[Kernel, float], weights: Array, *arrays: Array):
+    (kernel, dt), (*layers, x0, u) = kernel_and_dt, arrays
+
+    def field(x, u):
+        y = jnp.zeros((kernel.sizes.returns, x.shape[1]), x.dtype)
+        over_samples = jax.vmap(partial(kernel.evaluate, weights), in_axes=-1, out_axes=-1)
+        if kernel.sizes.returns:
+            y = normalised_layer(kernel.epsilon, ACTIVATIONS["relu"], *[*layers, over_samples(x, u, y)[1]])
+        return over_samples(x, u, y)[0]
+
+    return integrate(field, x0, u, dt, RK4())
+
+
+def _forward(kernel_and_dt: tuple[Kernel, float], *arrays: Array):
+    (kernel, dt), x0, u = kernel_and_dt, *arrays[-2:]
+    sizes, padded = kernel.sizes, -(-x0.shape[1] // VECTOR) * VECTOR
+    kept = len(u) * 4 * (padded * (sizes.d + sizes.returns) + sizes.units) + VECTOR  # see cpp/rollout.h
+    results = [jax.ShapeDtypeStruct(shape, x0.dtype) for shape in ((len(u), *x0.shape), (kept,))]
+
+    def call(*arrays):
+        return library.call(kernel.prefix + "forward", results, *arrays, numbers=[dt, kernel.epsilon])
+
+    def plain(*arrays):
+        return [_plain(kernel_and_dt, *arrays), jnp.zeros(kept, x0.dtype)]
+
+    states, saved = library.with_derivative(call, plain)(*arrays)
+    return states, (*arrays, saved)
+
+
+def _backward(kernel_and_dt: tuple[Kernel, float], saved: tuple[Array, ...], d_states: Float[Array, "t d b"]):
+    kernel, dt = kernel_and_dt
+    results = [jax.ShapeDtypeStruct(array.shape, array.dtype) for array in saved[:-1]]
+
+    def call(*arrays):
+        back = kernel.back_weights(arrays[0])
+        whole = *arrays[:-2], back, *arrays[-2:]
+        return tuple(library.call(kernel.prefix + "backward", results, *whole, numbers=[dt, kernel.epsilon]))
+
+    def plain(*arrays):
+        *arrays, _, d_states = arrays
+        return jax.vjp(partial(_plain, kernel_and_dt), *arrays)[1](d_states)
+
+    return library.with_derivative(call, plain)(*saved, d_states)
+
+
+_rollout.defvjp(_forward, _backward)

@@ -1,0 +1,89 @@
+"""Random fields of operations that kernels know have the values and the derivatives that JAX gives them."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+from hybrid_jax import kernels, rollouts
+from hybrid_jax.dynamics.base import AbstractVectorField
+from hybrid_jax.integrate import RK4, integrate
+from hybrid_jax.kernels import library
+
+STATES, INPUTS, WEIGHTS, DT, DEPTH = 25, 2, 6, 0.05, 4
+ONE = {
+    "sin": jnp.sin, "cos": jnp.cos, "tanh": jnp.tanh, "atan": jnp.arctan, "abs": jnp.abs, "sigmoid": jax.nn.sigmoid,
+    "exp": lambda a: jnp.exp(-jnp.square(a)), "log1p": lambda a: jnp.log1p(a * a), "erf": jax.scipy.special.erf,
+    "root": lambda a: jnp.sqrt(1 + a * a), "relu": jax.nn.relu, "softplus": jax.nn.softplus, "cube": lambda a: a**3 / 9,
+    "sinh": lambda a: jnp.sinh(jnp.sin(a)), "asin": lambda a: jnp.arcsin(0.9 * jnp.sin(a)),
+    "rsqrt": lambda a: 1 / jnp.sqrt(2 + a * a),
+}  # fmt: skip
+TWO = {
+    "add": jnp.add, "mul": lambda a, b: a * jnp.tanh(b), "sub": jnp.subtract, "div": lambda a, b: a / (1 + b * b),
+    "max": jnp.maximum, "min": jnp.minimum, "where": lambda a, b: jnp.where(a > b, a, 2 * b),
+    "atan2": lambda a, b: jnp.arctan2(a, 2 + b * b), "pow": lambda a, b: (1 + a * a) ** jnp.tanh(b),
+}  # fmt: skip
+
+
+class Random(AbstractVectorField):
+    """Each entry of ẋ is a random expression of weights and of entries of x and u; a layer mixes them."""
+
+    weights: Float[Array, " p"]
+    matrix: Float[Array, "d d"]
+    seed: int = eqx.field(static=True)
+
+    def __call__(self, x, u):
+        rng = np.random.default_rng(self.seed)
+        leaves = [*self.weights, *x, *u, 0.5]
+
+        def expression(depth):
+            if depth == 0:
+                return leaves[rng.integers(len(leaves))]
+            if rng.random() < 0.5:
+                return ONE[str(rng.choice(list(ONE)))](expression(depth - 1))
+            return TWO[str(rng.choice(list(TWO)))](expression(depth - 1), expression(rng.integers(depth)))
+
+        drift = jnp.stack([jnp.asarray(expression(DEPTH), x.dtype) for _ in range(STATES)])
+        return jnp.tanh(drift) - 0.1 * self.matrix @ jnp.sin(x)
+
+
+def both_ways(function, field, x0, u, d_states):
+    arrays, rest = eqx.partition(field, eqx.is_array)
+    states, pullback = jax.vjp(lambda arrays, x0, u: function(eqx.combine(arrays, rest), x0, u), arrays, x0, u)
+    return states, pullback(d_states)
+
+
+def by_kernel(field, x0, u):
+    return rollouts.rollout_minibatch(field, x0, u, DT, RK4())
+
+
+def by_jax(field, x0, u):
+    return integrate(jax.vmap(field, in_axes=-1, out_axes=-1), x0, u, DT, RK4())
+
+
+@pytest.mark.skipif(library.obstacle() is not None, reason=kernels.status())
+@pytest.mark.parametrize("seed", range(4))
+def test_a_hundred_random_expressions_are_those_of_jax(seed):
+    rng = np.random.default_rng(100 + seed)
+
+    def draw(*shape):
+        return rng.normal(size=shape).astype(np.float32)
+
+    field = Random(jnp.asarray(draw(WEIGHTS)), jnp.asarray(draw(STATES, STATES)), seed)
+    arguments = draw(STATES, 21), draw(2, INPUTS, 21), draw(2, STATES, 21)
+    arguments[0][3, 4] = np.nan
+    function = eqx.filter_jit(partial(both_ways, by_kernel))
+    assert "custom_call @hybrid_jax_" in function.lower(field, *arguments).as_text()
+    found = function(field, *arguments)
+    with jax.enable_x64(True):
+        double = jax.tree.map(lambda leaf: np.asarray(leaf, float) if eqx.is_array(leaf) else leaf, (field, *arguments))
+        exact = eqx.filter_jit(partial(both_ways, by_jax))(*double)
+    for one, other in zip(jax.tree.leaves(found), jax.tree.leaves(exact), strict=True):
+        np.testing.assert_array_equal(np.isnan(one), np.isnan(other))
+        known = ~np.isnan(other)
+        scale = np.abs(other[known]).max(initial=0)
+        np.testing.assert_allclose(one[known], other[known], rtol=0, atol=2e-6 * scale)
