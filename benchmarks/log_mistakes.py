@@ -63,6 +63,15 @@ def as_ned(log: Parts) -> Parts:
     }
 
 
+def about_z(angle, q):
+    turn = rotation_of(np.eye(4)[:1]).from_rotvec(np.multiply.outer(angle, [0.0, 0.0, 1.0]))
+    return quaternion_of(turn * rotation_of(q))
+
+
+def clockwise(q):
+    return about_z(-2 * rotation_of(q).as_euler("ZYX")[:, 0], q)
+
+
 def columns(name: str, change) -> Callable[[Parts], Parts]:
     return lambda log: log | {name: change(log[name])}
 
@@ -84,6 +93,9 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[Parts], Parts], str]]] = {
         "two motors": (columns("u", lambda u: u[:, [1, 0, 2, 3]]), "motor_order=(1, 0, 2, 3)"),
         "xyzw read as wxyz": (columns("q", lambda q: np.roll(q, -1, axis=1)), "(x, y, z, w), read as"),
         "wxyz read as xyzw": (columns("q", lambda q: np.roll(q, 1, axis=1)), "declare wxyz"),
+        "yaw clockwise": (columns("q", clockwise), "counted clockwise"),
+        "yaw from y": (columns("q", lambda q: about_z(-np.pi / 2, q)), "off by 90°"),
+        "yaw backwards": (columns("q", lambda q: about_z(np.pi, q)), "off by 180°"),
         "world to body": (columns("q", lambda q: q * [1, -1, -1, -1]), "conjugate"),
     },
     "frame": {

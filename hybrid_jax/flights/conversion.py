@@ -28,11 +28,11 @@ ADVICE = {
     "Betaflight blackbox": "blackbox cannot hold them: it serves to identify thrust, inertia and lag",
     "CSV": 'name the columns in a column map: columns="MAP.toml"',
 }
-# Topics of PX4 with the interval to log them at [ms]: since when [version], of those that came or went.
-PX4_TOPICS = {"vehicle_local_position": 10, "vehicle_attitude": 5, "sensor_combined": 5, "battery_status": 100}
-PX4_TOPICS |= {"vehicle_angular_velocity": 5, "actuator_motors": 5, "actuator_outputs": 5, "esc_status": 5}
-PX4_TOPICS |= {"vehicle_status": 100}
-SINCE = {"vehicle_angular_velocity": (1, 10), "actuator_motors": (1, 13), "esc_status": (1, 8)}
+# Topics of PX4 with the interval to log them at [ms], 0 for all; and since when those are that came later [version].
+PX4_TOPICS = {"vehicle_local_position": 0, "vehicle_attitude": 0, "sensor_combined": 5, "battery_status": 100}
+PX4_TOPICS |= {"vehicle_angular_velocity": 5, "vehicle_acceleration": 5, "actuator_motors": 5, "actuator_outputs": 5}
+PX4_TOPICS |= {"esc_status": 5, "vehicle_status": 100}
+SINCE = {"vehicle_angular_velocity": (1, 10), "vehicle_acceleration": (1, 11), "actuator_motors": (1, 13)}
 
 
 def px4_topics(version: tuple[int, int] | None) -> str:

@@ -36,10 +36,12 @@ MAGICS |= {b"H Product:Blackbox": BLACKBOX}
 # Formats that are known and not read, by their first bytes or suffix: what they are, and the way out.
 CONVERT = (
     "an ArduPilot DataFlash log, not read: mavlogdump.py --format csv --types TYPE FILE > TYPE.csv for TYPE ATT, "
-    'IMU, XKF1 and ESC (or RCOU); put them on one clock in one table, and say what it holds: columns="MAP.toml"'
+    "IMU, XKF1 and RCOU; join them to one table by TimeUS, with empty cells, and say what it holds: "
+    'columns="MAP.toml" (docs/howto/logs.md has the program and the map)'
 )
 PX4LOG = "a log of PX4's sdlog2, not read: log .ulg, as PX4 does from 1.4 on"
-UNREAD = {".px4log": PX4LOG, b"\xa3\x95\x80": CONVERT, b"PK\x03\x04": "a zip archive: unpack it and give its logs"}
+UNREAD = {".px4log": PX4LOG, b"\xa3\x95\x80": CONVERT, b"FMT, 128": CONVERT}
+UNREAD |= {b"PK\x03\x04": "a zip archive: unpack it and give its logs"}
 UNREAD |= {".tlog": "MAVLink telemetry, not read: it is too slow; give the log of the vehicle's own card"}
 OTHER = "no format that is read"
 BAG = "metadata.yaml"  # makes a folder one recording of ROS 2

@@ -11,6 +11,7 @@ from hybrid_jax.vehicle import FEWEST_ROTORS, MOST_ROTORS
 
 NORM_TOLERANCE = 0.02  # allows |q| of two printed digits; wrong columns are hardly ever within it
 COLUMNS = ("t", *STATE_NAMES, *INPUT_NAMES)  # of a quadrotor
+LARGEST = 1e9  # of any state or motor, in SI units; more is no measurement
 GAP = 1.5  # intervals longer than this many times the median are gaps
 JITTER = 0.1  # relative deviation from the median interval that still counts as evenly spaced
 
@@ -71,8 +72,9 @@ def _problems(t, x, u) -> Iterator[tuple[int, str, str]]:
     """Impossible values: index of the sample, field and what to do."""
     rotors = input_names(u.shape[1])
     for names, block in ((("t",), t[:, None]), (STATE_NAMES, x), (rotors, u)):
-        for row, column in np.argwhere(~np.isfinite(block))[:1].tolist():
-            yield row, names[column], f"is {block[row, column]}; cut the sample out (it becomes a gap) or repair it"
+        sound = np.isfinite(block) if names == ("t",) else np.abs(block) < LARGEST
+        for row, column in np.argwhere(~sound)[:1].tolist():
+            yield row, names[column], f"is {block[row, column]:.6g}; cut the sample out (it becomes a gap) or repair it"
     # Compare, as a difference of finite times may overflow.
     for row in np.flatnonzero(t[1:] <= t[:-1])[:1] + 1:
         times = f"{t[row]:.6g} {'repeats' if t[row] == t[row - 1] else 'goes back from'} {t[row - 1]:.6g}"

@@ -36,7 +36,8 @@ def test_the_arrays_given_are_not_changed(flight):
         ("u", (3, 2), np.nan, ("sample 3", "field u2")),
         ("u", (3, 2), -1.0, ("sample 3", "field u2", "negative")),
         ("x", (9, slice(3, 7)), 0.0, ("sample 9", "qw", "norm is 0")),
-        ("x", (9, 3), 1e200, ("sample 9", "qw", "norm is inf")),
+        ("x", (9, 3), 1e200, ("sample 9", "qw", "is 1e+200")),
+        ("x", (9, 0), 2e9, ("sample 9", "px", "is 2e+09")),
     ],
 )
 def test_impossible_values_are_named(flight, array, at, value, words):

@@ -41,6 +41,8 @@ MESSAGES = {  # of packages that no store of types has
     "px4_msgs/msg/VehicleLocalPosition": "uint64 timestamp\n"
     + "".join(f"float32 {name}\n" for name in ("x", "y", "z", "vx", "vy", "vz")),
     "mav_msgs/msg/Actuators": HEADER + "float64[] angles\nfloat64[] angular_velocities\nfloat64[] normalized\n",
+    "mavros_msgs/msg/ESCTelemetryItem": HEADER + "int32 rpm\nfloat32 voltage\n",
+    "mavros_msgs/msg/ESCTelemetry": HEADER + "mavros_msgs/ESCTelemetryItem[] esc_telemetry\n",
     "mavros_msgs/msg/RCOut": HEADER + "uint16[] channels\n",
 }
 
@@ -67,6 +69,7 @@ def messages(store, flight):
 
         (ned, vned), us = np.stack([p @ world, v @ world]).astype(np.float32).tolist(), at // 1000
         imu = (pose.orientation, zeros[:9], vector(*w), zeros[:9], vector(0.0, 0.0, 9.81), zeros[:9])
+        rpm = np.round(u * 30 / np.pi).astype(int).tolist()
         channels = np.concatenate([np.round(1000 + u), np.zeros(12)]).astype(np.uint16)
         odometry = kinds["Odometry"](header, "", covered, twist(back[i], w))
         yield (
@@ -91,6 +94,8 @@ def messages(store, flight):
                 "gyro": kinds["VehicleAngularVelocity"](us, (w @ body).astype(np.float32)),
                 "motors": kinds["Actuators"](header, np.zeros(0), u.copy(), np.zeros(0)),
                 "rc": kinds["RCOut"](header, channels),
+                "escs": kinds["ESCTelemetry"](header, [kinds["ESCTelemetryItem"](header, each, 16.0) for each in rpm]),
+                "point": kinds["PointStamped"](header, kinds["Point"](*p)),
                 "rotors": kinds["Float64MultiArray"](layout, u * 30 / np.pi),
             },
         )
@@ -124,7 +129,7 @@ def varint(value):
     return found + bytes([value])
 
 
-def blackbox(flight, ended=True, events=b"", headers=()):
+def blackbox(flight, ended=True, events=b"", headers=(), digital=True):
     """Bytes of a blackbox log of intra frames alone, of signed numbers."""
     names = ["loopIteration", "time", *(f"gyroADC[{i}]" for i in range(3)), *(f"accSmooth[{i}]" for i in range(3))]
     names += ["vbatLatest", *(f"motor[{i}]" for i in range(4)), *(f"eRPM[{i}]" for i in range(4))]
@@ -134,11 +139,11 @@ def blackbox(flight, ended=True, events=b"", headers=()):
     head += [f"Field I name:{','.join(names)}", f"Field I signed:{zeros}", f"Field I predictor:{zeros}"]
     head += [f"Field I encoding:{zeros}", f"Field P predictor:{zeros}", f"Field P encoding:{zeros}"]
     head += ["gyro_scale:0x3f800000", "acc_1G:2048", "vbatref:1600", "vbatcellvoltage:330,350,430"]
-    head += ["motorOutput:48,2047", "motor_poles:14"]
+    head += [f"motorOutput:{'48,2047' if digital else '1000,2000'}", "motor_poles:14"]
     content = b"".join(f"H {line}\n".encode() for line in [*head, *headers])
     for i, (t, x, u) in enumerate(zip(flight.t, flight.x, flight.u, strict=True)):
         row = [i, 10**6 + round(t * 1e6), *(x[10:] * 180 / np.pi), 0, 0, 2048, 1650]
-        row += [*(48 + u), *(u * 30 / np.pi * 7 / 100)]
+        row += [*(48 + u if digital else 1000 + u), *(u * 30 / np.pi * 7 / 100)]
         content += b"I" + b"".join(varint(round(value)) for value in row)
     return content + events + (b"E\xffEnd of log\0" if ended else b"")
 

@@ -217,6 +217,7 @@ def _compare_means(log: FlightLog, name: str, pairs: Pairs, least: float, span: 
         return Check(name, math.nan, "relative error", limit, UNKNOWN, MORE_FLIGHT)
     value, advice = _relative_error(a, b), _nearer(pairs, limit, least)
     doubtful = (not advice and name == THRUST) or ((" s late" in advice or " s early" in advice) and value <= limit)
+    doubtful |= mistakes.HEADING in advice  # an attitude turned about z is all that this check sees of it
     advice = advice or (UNUSUAL if value > limit else "")
     if name == THRUST and advice == UNUSUAL:
         advice = f"{UNUSUAL}; {CHANGED}"

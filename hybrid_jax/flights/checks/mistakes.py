@@ -13,6 +13,7 @@ from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, VELOCITY
 NOTHING = "nothing to correct"  # the log as it is
 LATE = (0.1, 0.2)  # delays and advances that are tried [s]
 WORLD = 'velocity is in the world, read as the body\'s: velocity = "world", or for a bag topics={"velocity": "TOPIC"}'
+HEADING = "the heading is counted from another axis than x, off by"
 BODY = 'velocity is in the body frame (FLU): set velocity = "body"'
 UP = np.array([0.0, 0.0, 1.0])
 GRAVITY = 9.81 * UP
@@ -70,6 +71,9 @@ def rates(log: FlightLog) -> Pairs:
     }
     for mistake, attitude in _attitudes(q).items():
         found[mistake] = rates_between(log.t, attitude), omega
+    w, x, y, z = q.T
+    mirrored = _turn(-2 * np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z)), q)
+    found["the heading is counted clockwise: flip the sign of yaw"] = rates_between(log.t, mirrored), omega
     for axis, signs in FLIPS.items():
         found[f"w{axis} has the wrong sign: flip it"] = turned, omega * signs
         found[f"q{axis} has the wrong sign: flip it"] = rates_between(log.t, q * [1, *signs]), omega
@@ -91,9 +95,18 @@ def accelerations(log: FlightLog) -> Pairs:
         'the body is FRD in a world with z up: set body = "FRD"': (quaternion_from_matrix(frd), v),
         BODY: (q, attitude.apply(v)),
     }
+    for degrees in (90, -90, 180):
+        stated[f"{HEADING} {degrees}°: add that to yaw"] = _turn(np.full(len(q), np.deg2rad(degrees)), q), v
     # Other mistakes of attitudes rotate thrust about z only, which wind or a load may do as well.
     stated |= {mistake: (other, v) for mistake, other in list(_attitudes(q).items())[:2]}
     return {mistake: _by_thrust(log, q, v, thrust) for mistake, (q, v) in stated.items()}
+
+
+def _turn(angle: Float[np.ndarray, " n"], q: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 4"]:
+    """Attitudes turned about the world's z [rad]."""
+    w, x, y, z = q.T
+    c, s = np.cos(angle / 2), np.sin(angle / 2)
+    return np.stack([c * w - s * z, c * x - s * y, c * y + s * x, c * z + s * w], axis=1)
 
 
 def _attitudes(q: Float[np.ndarray, "n 4"]) -> dict[str, Float[np.ndarray, "n 4"]]:

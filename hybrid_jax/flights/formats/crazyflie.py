@@ -34,7 +34,12 @@ def _named(pattern: str, axes: Iterable[str]) -> tuple[str, ...]:
 ANGLES = ("roll", "pitch", "yaw")
 # Quantity → where it may stand, the first that a log has counts: variables, and the factors of their values.
 SOURCES: dict[str, tuple[tuple[tuple[str, ...], float], ...]] = {
-    "position": ((_named("stateEstimate.{}", XYZ), 1.0), (_named("stateEstimateZ.{}", XYZ), 1e-3)),
+    "position": (
+        (_named("stateEstimate.{}", XYZ), 1.0),
+        (_named("stateEstimateZ.{}", XYZ), 1e-3),
+        (_named("kalman.state{}", "XYZ"), 1.0),
+    ),
+    "attitude": ((_named("stateEstimate.q{}", WXYZ), 1.0), (_named("kalman.q{}", "0123"), 1.0)),
     "velocity": ((_named("stateEstimate.v{}", XYZ), 1.0), (_named("stateEstimateZ.v{}", XYZ), 1e-3)),
     "rates": (
         (_named("gyro.{}", XYZ), DEGREES),
@@ -46,8 +51,7 @@ SOURCES: dict[str, tuple[tuple[tuple[str, ...], float], ...]] = {
     "rotor_speed": ((_named("rpm.m{}", MOTORS), np.pi / 30),),
     "command": ((_named("pwm.m{}_pwm", MOTORS), 1 / FULL), (_named("motor.m{}", MOTORS), 1 / FULL)),
 }
-AXES = {"voltage": BATTERY, "rotor_speed": tuple("0123"), "command": tuple("0123")}
-QUATERNION = _named("stateEstimate.q{}", WXYZ)
+AXES = {"attitude": WXYZ, "voltage": BATTERY, "rotor_speed": tuple("0123"), "command": tuple("0123")}
 EULER, COMPRESSED = _named("stateEstimate.{}", ANGLES), "stateEstimateZ.quat"
 ACCELERATION = _named("stateEstimate.a{}", XYZ)
 MIXED = _named("controller.cmd_{}", ("thrust", "roll", "pitch", "yaw"))
@@ -184,8 +188,8 @@ def _parts(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
 
 def _derived(columns, notes: list[str]) -> Iterator[tuple[str, Samples]]:
     """Attitude, and what only follows from other variables."""
-    if {*QUATERNION} <= {*columns}:
-        yield "attitude", Samples(columns[QUATERNION[0]][0], _stacked(columns, QUATERNION), WXYZ, " ".join(QUATERNION))
+    if any({*names} <= {*columns} for names, _ in SOURCES["attitude"]):
+        pass  # as quaternions, above
     elif COMPRESSED in columns:
         ticks, values, _ = columns[COMPRESSED]
         yield "attitude", Samples(ticks, unpack_attitude(values), WXYZ, COMPRESSED)

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float
 
 from hybrid_jax.flights.attitude import BODIES, WORLDS, quaternion_from_matrix, rotation_of
-from hybrid_jax.flights.log import unlike_one, wrong_norms
+from hybrid_jax.flights.log import LARGEST, unlike_one
 from hybrid_jax.flights.recording import GAP, Recording, Signal
 
 GZIP = b"\x1f\x8b"
@@ -34,7 +34,7 @@ HELD = 1.5  # rows in which a value stands, on average, from which on slow sampl
 REGULAR = 0.9  # share of the values that must stand in as many rows, or one more or less
 OPTIONAL = ("voltage",)  # of which any number of samples may be left out
 AS_TOLD = ("command", "voltage")  # quantities that may well keep a value
-RATIO, LARGEST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for each of its own, at most, at least
+RATIO, MOST, SMALL = 100, 2**31, 2**24  # bytes that a gzip file may hold: for each of its own, at most, at least
 
 
 class Samples(NamedTuple):
@@ -78,7 +78,7 @@ def readable(path: str | Path) -> Iterator[IO[bytes]]:
 
 def _refuse_bomb(path: str | Path) -> None:
     """Refuse gzip data that would fill the memory."""
-    size, most = 0, min(max(RATIO * Path(path).stat().st_size, SMALL), LARGEST)
+    size, most = 0, min(max(RATIO * Path(path).stat().st_size, SMALL), MOST)
     with opened(path) as file:
         while part := file.read(1 << 20):
             size += len(part)
@@ -131,10 +131,8 @@ def record(
             why = f"{name} is no {'rotation' if name == 'attitude' else 'number'} in {gone.sum()} samples"
             said.append(f"{part.source}: {why}, the first at {t[gone][0]:.4g} s: left out")
             t, part = t[~gone], part._replace(values=part.values[~gone])
-        elif name == "attitude":
-            for row, norm in wrong_norms(part.values):
-                where = f"{path}: {part.source}: the quaternion at {t[row]:.6g} s"
-                raise ValueError(f"{where} has norm {norm:.4g}, must be 1")
+        for row in np.flatnonzero(gone)[:1] if len(t) == len(gone) else ():
+            raise ValueError(f"{path}: {part.source}: {_wrong(name, part, row, t[row])}")
         own, values = own_samples(t, part.values, name not in AS_TOLD)
         if len(own) < len(t):
             apart = float(np.median(np.diff(own)))
@@ -149,9 +147,17 @@ def record(
 
 
 def _lost(name: str, part: Samples) -> np.ndarray:
-    """Which samples are no numbers, or no rotations."""
-    lost = ~np.isfinite(np.asarray(part.values)).all(axis=1)
+    """Which samples are no numbers, far beyond any measurement, or no rotations."""
+    lost = ~(np.abs(np.asarray(part.values)) < LARGEST).all(axis=1)
     return lost | np.asarray(unlike_one(part.values)) if name == "attitude" else np.asarray(lost)
+
+
+def _wrong(name: str, part: Samples, row: int, t: float) -> str:
+    if name == "attitude":
+        with np.errstate(over="ignore"):
+            return f"the quaternion at {t:.6g} s has norm {np.linalg.norm(part.values[row]):.4g}, must be 1"
+    column = int((~(np.abs(part.values[row]) < LARGEST)).argmax())
+    return f"{part.axes[column]} is {part.values[row, column]:.6g} at {t:.6g} s, must be a number below {LARGEST:g}"
 
 
 def _of_one_message(a: Samples, b: Samples) -> bool:

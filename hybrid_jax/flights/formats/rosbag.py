@@ -56,6 +56,7 @@ READERS: dict[str, dict[str, dict[str, tuple[tuple[str, ...], _Reader]]]] = {
         "PoseWithCovarianceStamped": _pose(lambda message: message.pose.pose),
         "Pose": _pose(lambda message: message),
         "TransformStamped": _TRANSFORM,
+        "PointStamped": {"position": (XYZ, lambda message: _xyz(message.point))},
     },
     "odometry": {
         "Odometry": _pose(lambda message: message.pose.pose)
@@ -78,7 +79,8 @@ READERS: dict[str, dict[str, dict[str, tuple[tuple[str, ...], _Reader]]]] = {
     },
     "voltage": {"BatteryState": {"voltage": (BATTERY, lambda message: [message.voltage])}},
 }
-ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped")}  # read in a role only if `topics` says so
+# Read in a role only if `topics` says so.
+ASKED_FOR = {("velocity", "Odometry"), ("velocity", "Vector3Stamped"), ("pose", "PointStamped")}
 ROLES = (*READERS, "motors")
 
 
@@ -216,11 +218,18 @@ def _states(role: str, kind: str, topic: str, messages) -> Iterator[tuple[str, S
         yield quantity, Samples(ticks, np.array([read(message) for _, message in messages], float), axes, topic)
 
 
+def _numbers(message, field: str):
+    """A field of a message, or with a point a field of each of its parts, such as esc_telemetry.rpm."""
+    whole, _, part = field.partition(".")
+    found = getattr(message, whole, ())
+    return [getattr(each, part, None) for each in found] if part else np.ravel(found)
+
+
 def _motors(path, topic: str, field: str, unit: str, messages) -> Iterator[tuple[str, Samples]]:
     fields = field.split("|")
-    name = next((name for name in fields if len(np.ravel(getattr(messages[0][1], name, ())))), fields[0])
+    name = next((name for name in fields if len(_numbers(messages[0][1], name))), fields[0])
     try:
-        rows = [np.asarray(getattr(message, name, ()), float).ravel() for _, message in messages]
+        rows = [np.asarray(_numbers(message, name), float).ravel() for _, message in messages]
     except (TypeError, ValueError) as error:
         raise ValueError(f"{path}: {topic}: field {name} must hold a number for each motor") from error
     counts = {len(row) for row in rows}
