@@ -1,16 +1,19 @@
 """What an experiment leaves in its folder, report.html, report.md, report.json and rows.csv, and in a terminal."""
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
 from rich.console import Console
 from rich.text import Text
 
-from experiments.reporting import claims, html, latex
+from experiments.reporting import claims, latex
 from experiments.reporting.contents import Report
 from experiments.reporting.results import leaves
 from experiments.reporting.tables import Table, markdown, plain, print_tables
+from hybrid_jax.cli.page import Page, document
+from hybrid_jax.cli.page import Table as Cells
 from hybrid_jax.io.files import json_text, json_value, write_atomic
 
 FORMAT = 2  # of report.json; 1 had no key "format", and rows of some experiments without all their tags
@@ -26,7 +29,7 @@ def write_report(out: str | Path, report: Report, console: Console | None = None
     out, record = Path(out), lines_of(to_json(report))
     tables = {f"{PAPER}/{latex.file_name(table)}.tex": latex.latex(table) for table in report.shown() if paper}
     contents = {CSV_NAME: (report.rows + report.more_rows).to_csv(), PAGE_NAME: page(report)} | tables
-    contents |= {HTML_NAME: html.document(report, out), JSON_NAME: record}
+    contents |= {HTML_NAME: document(shown_page(report, out)), JSON_NAME: record}
     for name, content in {name: content.encode() for name, content in contents.items()}.items():
         write_atomic(out / name, content)
     if console is not None:
@@ -55,6 +58,28 @@ def lines_of(record: dict[str, Any]) -> str:
         return "[\n" + ",\n".join(map(text, value)) + "\n]" if isinstance(value, list) and value else text(value)
 
     return "{\n" + ",\n".join(f"{text(name)}: {entry(value)}" for name, value in record.items()) + "\n}\n"
+
+
+def shown_page(report: Report, out: Path) -> Page:
+    """report.html as the console script writes its pages; figures are read from `out`."""
+    title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
+    said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|(?:^|\n)- ", introduction)]
+    tables = [Cells(table.title, table.header, table.lines) for table in report.shown()]
+    about = {"Environment": report.environment, "Configuration": report.config}
+    known = [
+        Cells(name, ("", ""), [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")])
+        for name, each in about.items()
+    ]
+    asked = Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])
+    return Page(
+        title.lstrip("# "),
+        " ".join(report.conclusions()),
+        tables[0] if tables else None,
+        [(caption, (out / path).read_bytes()) for path, caption in report.figures.items()],
+        report.warnings,
+        details=[*([asked] if asked.lines else []), *tables[1:], *known],
+        notes=report.notes,
+    )
 
 
 def page(report: Report) -> str:

@@ -4,9 +4,11 @@ import contextlib
 import difflib
 import inspect
 import io
+import os
 import re
 import signal
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import field, fields, make_dataclass
@@ -32,6 +34,7 @@ VERBS = {
     "export": "write a model as C, CasADi functions or StableHLO",
 }
 RARE = "rare"  # in the annotation of an option: --help-all lists it, --help does not
+INTERRUPTED = "interrupted, nothing was written"
 USAGE = """usage: hybrid-jax VERB ...
 
 From folders of logs to a model that can be trusted:
@@ -52,14 +55,35 @@ def run(arguments: Sequence[str]) -> None:
         print(USAGE.format(verbs="\n".join(f"  {name:<8} {about}" for name, about in VERBS.items())))
         return
     verb, *given = arguments
-    with exit_codes(f"hybrid-jax {verb}", verb, "interrupted, nothing was written"):
+    with exit_codes(f"hybrid-jax {verb}", verb, INTERRUPTED):
         if verb not in VERBS:
             raise ValueError(f"no such verb{_meant(verb, VERBS)}; see hybrid-jax --help")
         module = import_module(f"hybrid_jax.cli.{verb}")
         options = parsed(module.Options, f"hybrid-jax {verb}", split_lists(given, module.LISTS))
         configure()
+        _answer_at_once(f"hybrid-jax {verb}")
         code = module.run(options)
     sys.exit(code)
+
+
+def _answer_at_once(program: str) -> None:
+    """End the process on Ctrl-C, also while XLA compiles or runs, when Python's own handler would wait.
+
+    A file is renamed when it is whole, so none is left half.
+    """
+    if threading.current_thread() is not threading.main_thread():
+        return
+    ear, mouth = os.pipe()
+    os.set_blocking(mouth, False)
+    signal.set_wakeup_fd(mouth)  # to which a signal is written at once
+    signal.signal(signal.SIGINT, lambda *_: None)
+
+    def listen() -> None:
+        if os.read(ear, 1)[0] == signal.SIGINT:
+            os.write(2, f"{program}: {INTERRUPTED}\n".encode())
+            os._exit(128 + signal.SIGINT)
+
+    threading.Thread(target=listen, daemon=True).start()
 
 
 def parsed(kind: type[Options], program: str, arguments: Sequence[str] | None, **more: Any) -> Options:

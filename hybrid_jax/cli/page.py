@@ -49,7 +49,7 @@ class Page:
         question: that the verb answers.
         answer: in a sentence.
         table: of a few rows.
-        figures: caption and picture, or the bytes of a GIF; the first stands beside the answer, the others are folded.
+        figures: caption and picture, or the bytes of a PNG or GIF; the first is not folded.
         meaning: sentences on what it means.
         todo: sentences on what to do next.
         details: folded tables.
@@ -95,6 +95,7 @@ def document(page: Page) -> str:
     parts += [_folded("More pictures", "".join(others))] if others else []
     parts += [_folded("Notes", _list(page.notes))] if page.notes else []
     head = '<meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">'
+    head += '<link rel="icon" href="data:,">'  # without one a browser asks for it
     title = f"<title>{_text(page.question)}</title><style>{CSS}</style>"
     return f'<!doctype html><html lang="en"><head>{head}{title}</head><body>{"".join(parts)}</body></html>\n'
 
@@ -104,7 +105,8 @@ def _figure(caption: str, figure: Figure | bytes) -> str:
     if isinstance(figure, Figure):
         with mpl.rc_context(STYLE):
             figure.savefig(data, format="png", dpi=130)
-    kind, text = "gif" if isinstance(figure, bytes) else "png", base64.b64encode(data.getvalue()).decode()
+    kind = "gif" if data.getvalue().startswith(b"GIF") else "png"
+    text = base64.b64encode(data.getvalue()).decode()
     picture = f'<img alt="{_text(caption)}" src="data:image/{kind};base64,{text}">'
     return f"<figure>{picture}<figcaption>{_text(caption)}</figcaption></figure>"
 

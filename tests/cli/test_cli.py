@@ -1,11 +1,15 @@
 """The console script as a user meets it: help, refusals, and fit, adapt and check on logs that tests write."""
 
 import json
+import os
 import re
 import shutil
+import signal
 import subprocess
 import sys
+import time
 import venv
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -18,9 +22,9 @@ from experiments.real_flight.simulated import csv_of, vehicle_toml
 from hybrid_jax.cli import main
 from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, NOTHING_CHANGED, VERBS
 from hybrid_jax.dynamics.rigid_body import rigid_body
-from hybrid_jax.io.models import save
+from hybrid_jax.io.models import load, save
 from hybrid_jax.sim import PARAMETER_SHIFT, SOURCE, random_flights
-from hybrid_jax.vehicle import IRIS
+from hybrid_jax.vehicle import IRIS, load_vehicle
 
 
 def test_help_lists_the_verbs(capsys):
@@ -65,41 +69,79 @@ def written(folder, domain, flights, seed, seconds=11.0):
 
 
 @pytest.fixture(scope="module")
-def fitted(tmp_path_factory):
-    """Flights before and after other moments of inertia, and a model of those before."""
+def script(tmp_path_factory):
+    """The script of the wheel, in an environment that sees the packages of this one, and nothing of the checkout."""
+    folder = tmp_path_factory.mktemp("wheel")
+    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", folder, ROOT]
+    subprocess.run(build, check=True)
+    venv.create(folder / "env", system_site_packages=True, symlinks=True)
+    site = next((folder / "env").glob("lib/python*/site-packages"))
+    (site / "parent.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
+    (wheel,) = folder.glob("*.whl")
+    python = folder / "env" / "bin" / "python"
+    install = [python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--force-reinstall", wheel]
+    subprocess.run(install, check=True, env={}, cwd=folder)
+    where = [python, "-c", "import hybrid_jax; print(hybrid_jax.__file__)"]
+    found = subprocess.run(where, capture_output=True, text=True, env={}, cwd=folder).stdout
+    assert Path(found.strip()).is_relative_to(folder)
+    return python.with_name("hybrid-jax")
+
+
+@pytest.fixture(scope="module")
+def fitted(tmp_path_factory, script):
+    """Flights before and after other moments of inertia, and a model of those before, by the script of the wheel."""
     root = tmp_path_factory.mktemp("cli")
     (root / "v.toml").write_text(vehicle_toml(IRIS))
     for name, domain, flights, seed in (("before", SOURCE, 2, 0), ("after", PARAMETER_SHIFT, 2, 1)):
         written(root / name, domain, flights, seed)
-    options = ["-o", root / "source.npz", "--vehicle", root / "v.toml", "--out", root / "fit"]
-    with pytest.raises(SystemExit) as stop:
-        main(["fit", str(root / "before"), *map(str, options)])
-    assert not stop.value.code
+    ran(script, root, "inspect before --vehicle v.toml --write-vehicle written.toml --mass 1.5 --arm 0.25")
+    ran(script, root, "fit before -o source.npz --vehicle v.toml")
     return root
 
 
+def ran(script, folder, line):
+    """What a command line prints, of the script of the wheel."""
+    environment = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
+    given = [script, *line.split()]
+    done = subprocess.run(given, capture_output=True, text=True, env=environment, cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 @pytest.mark.slow
-def test_from_two_folders_to_what_changed(fitted, called):
-    after, out = fitted / "after", fitted / "adapt"
-    code, said, _ = called("adapt", fitted / "source.npz", after, "-o", fitted / "adapted.npz", "--out", out)
-    assert code == 0
-    assert "Changed: " in said
-    record = json.loads((out / "report.json").read_text())
-    found = record["parameters"]["Iy"]
+def test_from_two_folders_to_c_that_compiles(fitted, script):
+    assert "2 of 2 logs are ready" in json.loads((fitted / "runs" / "inspect" / "report.json").read_text())["answer"]
+    assert load_vehicle(fitted / "written.toml").rotors == 4
+    assert "Changed: " in ran(script, fitted, "adapt source.npz after -o adapted.npz")
+    found = json.loads((fitted / "runs" / "adapt" / "report.json").read_text())["parameters"]["Iy"]
     assert found["low"] < 0.02 * 1.2
     assert found["value"] == pytest.approx(0.02, rel=0.2)
-    page = (out / "report.html").read_text()
-    assert page.count("data:image/png;base64,") == 1
-    assert 'src="http' not in page
+    assert "times as exact as with frozen rates" in ran(script, fitted, "check source.npz after")
+    rmse = json.loads((fitted / "runs" / "check" / "report.json").read_text())["rmse"]
+    assert set(rmse) >= {"model", "no forces"}
+    ran(script, fitted, "export adapted.npz -o board --name iris")
+    for page in (fitted / "runs").glob("*/report.html"):
+        assert 'src="http' not in page.read_text()
+    if gcc := shutil.which("gcc"):
+        for source in ("iris.c", "iris_adaptation.c"):
+            compiled = [gcc, "-std=c99", "-Wall", "-Werror", "-c", source, "-o", "a.o"]
+            subprocess.run(compiled, check=True, cwd=fitted / "board")
 
 
 @pytest.mark.slow
-def test_predictions_are_compared_with_the_simplest(fitted, called):
-    options = ["check", fitted / "source.npz", fitted / "after", "--out", fitted / "check"]
-    code, said, _ = called(*options)
-    assert code == 0
-    assert "times as exact as with frozen rates" in said
-    assert set(json.loads((fitted / "check" / "report.json").read_text())["rmse"]) >= {"model", "no forces"}
+def test_ctrl_c_is_answered_while_a_program_is_compiled(tmp_path, script):
+    save(tmp_path / "body.npz", rigid_body(IRIS), {"dt": 0.02})
+    given = [script, "plan", "body.npz", "-o", "plan.csv", "--starts", "1", "--bandwidth", "1.9"]
+    environment = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path / "cache"), "HOME": str(tmp_path)}
+    with subprocess.Popen(given, stderr=subprocess.PIPE, text=True, cwd=tmp_path, env=environment) as process:
+        assert process.stderr is not None
+        assert "searching" in process.stderr.readline()
+        time.sleep(3)
+        began = time.perf_counter()
+        process.send_signal(signal.SIGINT)
+        assert process.wait(30) == 128 + signal.SIGINT
+        assert time.perf_counter() - began < 1
+        assert process.stderr.read() == "hybrid-jax plan: interrupted, nothing was written\n"
 
 
 @pytest.mark.slow
@@ -159,19 +201,26 @@ def test_nothing_changed_has_an_exit_code_of_its_own(fitted, tmp_path, called):
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_the_script(tmp_path):
-    """In an environment that sees the packages of this one, and nothing of the checkout."""
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "-w", tmp_path, ROOT]
-    subprocess.run(build, check=True)
-    venv.create(tmp_path / "env", system_site_packages=True, symlinks=True)
-    site = next((tmp_path / "env").glob("lib/python*/site-packages"))
-    (site / "parent.pth").write_text("\n".join(path for path in sys.path if path.endswith("site-packages")))
-    (wheel,) = tmp_path.glob("*.whl")
-    python = tmp_path / "env" / "bin" / "python"
-    install = [python, "-m", "pip", "install", "-q", "--no-deps", "--no-index", "--force-reinstall", wheel]
-    subprocess.run(install, check=True, env={}, cwd=tmp_path)
-    said = subprocess.run([python.with_name("hybrid-jax")], capture_output=True, text=True, env={}, cwd=tmp_path)
-    assert "fit" in said.stdout, said.stderr
-    where = [python, "-c", "import hybrid_jax; print(hybrid_jax.__file__)"]
-    found = subprocess.run(where, capture_output=True, text=True, env={}, cwd=tmp_path).stdout
-    assert Path(found.strip()).is_relative_to(tmp_path)
+def test_a_model_of_another_vehicle_is_told(fitted, tmp_path, called):
+    """Of a vehicle with five times the thrust no change of this one is learned."""
+    about, other = load(fitted / "source.npz").about, replace(IRIS, thrust_coefficient=5 * IRIS.thrust_coefficient)
+    save(tmp_path / "other.npz", rigid_body(other), about)
+    files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
+    code, _, said = called("adapt", tmp_path / "other.npz", fitted / "after", *files)
+    assert code == FAILED_CHECKS
+    assert "specific force over thrust per mass" in said
+    assert not (tmp_path / "adapted.npz").exists()
+
+
+@pytest.mark.slow
+def test_hover_tells_nothing(fitted, tmp_path, called):
+    """A vehicle of other inertia that hardly moves: nothing is learned of it, or nothing but what hover tells."""
+    rng, n = np.random.default_rng(0), 1000
+    x = np.tile([0, 0, 1.5, 1, *[0.0] * 9], (n, 1)) + rng.normal(0, 1e-3, (n, 13))
+    u = np.full((n, 4), IRIS.hover_speed) + rng.normal(0, 0.5, (n, 4))
+    (tmp_path / "hover.csv.gz").write_bytes(csv_of(0.01 * np.arange(n), x, u))
+    files = ["-o", tmp_path / "adapted.npz", "--out", tmp_path]
+    code, said, _ = called("adapt", fitted / "source.npz", tmp_path / "hover.csv.gz", *files)
+    assert code == NOTHING_CHANGED
+    assert "Nothing changed that these flights can tell." in said
+    assert not (tmp_path / "adapted.npz").exists()
