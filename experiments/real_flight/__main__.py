@@ -21,7 +21,7 @@ from experiments.real_flight.study import run_folds
 from experiments.real_flight.train import Experiment
 from experiments.runner import command
 from experiments.runner.stages import stages_of
-from hybrid_jax.cli.command import ChecksFailed, split_lists
+from hybrid_jax.cli.command import BAD_INPUT, ChecksFailed, split_lists
 from hybrid_jax.dynamics.vehicle_file import LAG, NEED_PURPOSE, VehicleModel, learned_by_field, vehicle_model_of
 from hybrid_jax.estimation.least_squares import fit_least_squares
 from hybrid_jax.flights.checks.cleaning import choose_time_constant
@@ -59,7 +59,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if not any(word.startswith(("--simulated", "--source", "--vehicle")) for word in given):
         command.check(NAME, ABOUT, given, PRESETS)  # a wrong option is named before flights are asked for
         print(GUIDE, file=sys.stderr)
-        sys.exit(command.BAD_INPUT)
+        sys.exit(BAD_INPUT)
     command.run(NAME, ABOUT, run, given, presets=PRESETS)
 
 

@@ -1,10 +1,8 @@
-"""Figures of models on recorded flights: errors against horizon and N, a predicted flight, output of the network."""
+"""Figures of models on recorded flights: errors against horizon and N, a predicted flight."""
 
-from collections.abc import Mapping, Sequence
-from itertools import pairwise
+from collections.abc import Mapping
 from typing import Any
 
-import jax
 import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
@@ -12,22 +10,19 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import NullFormatter
 
 from experiments.real_flight.config import NANODRONE_STEPS
-from experiments.real_flight.folds import Fold, motion_of_logs
 from experiments.real_flight.models import thrust_baseline
 from experiments.real_flight.scoring import QUANTITIES, SUM, TAGS, Cell, cell_name, cells, pooled, score_labels
 from experiments.real_flight.study import Outputs
 from experiments.real_flight.train import Experiment, TrainedModel
-from experiments.reporting.plots import COLOURS, COLUMN, PAGE, STYLE, legend_below, name_lines, subplots, tick_errors
+from experiments.reporting.plots import COLOURS, PAGE, STYLE, legend_below, subplots, tick_errors
 from experiments.reporting.results import Results
-from hybrid_jax.extrapolation import RANGE
 from hybrid_jax.flights.log import segments
 from hybrid_jax.flights.windows import cut_windows, flight_of, require_length
 from hybrid_jax.integrate import rollout_batch
-from hybrid_jax.state import BODY_RATES, POSITION, VELOCITY
+from hybrid_jax.state import BODY_RATES, VELOCITY
 
 MODEL_COLOURS = COLOURS | {"chosen": "#E69F00", "linear_residual": "#CC79A7", "thrust": "0.35", "hold": "0.65"}
 DASHES = {"fine_tuned": "-", "source_only": "-", "scratch": "--", "zero_shot": ":", "nominal": "-."}
-BINS, MIN_SAMPLES = 12, 10  # bins of speed, and samples of one that is drawn
 BASELINE: Cell = ("thrust", "nominal", 0)  # thrust with frozen body rates, which errors are drawn over
 WORST = 4.0  # times its error: no curve is drawn beyond
 MARGIN = 1.5  # factor in N on both sides of a single one
@@ -40,8 +35,6 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
     caption = f"mean error over {NANODRONE_STEPS} steps" if nanodrone else "RMSE"
     steps = f"Error against horizon over that of thrust with frozen rates, {caption}, test flights of all folds"
     figures = {"errors_by_step": (errors_by_step(experiment, outputs), steps)}
-    ranges = "Motion of test flights (median, 1 to 99 %) against that of the flights trained on (band)"
-    figures["ranges"] = (ranges_of_motion(outputs.folds), ranges)
     if any(rows["n_train"]):
         by_size = errors_by_size(rows, experiment.dt, "Error against the amount of target flight")
         figures["errors_by_size"] = (by_size, "Error over that of thrust with frozen rates, against N, target windows")
@@ -50,8 +43,6 @@ def make_figures(experiment: Experiment, outputs: Outputs) -> dict[str, tuple[Fi
     if hybrids:
         flight = predicted_flight(experiment, outputs, next(iter(hybrids)))
         figures["predicted_flight"] = (flight, "A part of a test flight and its predictions")
-        network = residual_by_speed(outputs, hybrids)
-        figures["residual_by_speed"] = (network, "Output of the network on test flights against speed")
     return figures
 
 
@@ -89,23 +80,6 @@ def errors_by_step(experiment: Experiment, outputs: Outputs) -> Figure:
     for axes in panels[1]:
         axes.set_xlabel("time since the start of the prediction [s]")
     return legend_below(figure, "Error over that of thrust with frozen rates", "mean over seeds; band: ± std")
-
-
-@mpl.rc_context(STYLE)
-def ranges_of_motion(folds: Sequence[Fold]) -> Figure:
-    """A panel for each kind of motion, a line for each test flight, before the range of its fold's training flights."""
-    tested = [(motion_of_logs([*fold.train, *fold.validation]), log) for fold in folds for log in fold.test]
-    figure, panels = subplots((PAGE, 1.7 + 0.18 * len(tested)), 1, 4, sharey=True)
-    for line, (known, log) in enumerate(tested):
-        for axes, (name, values) in zip(panels.flat, motion_of_logs([log]).items(), strict=True):
-            low, middle, high = np.quantile(values, (RANGE[0], 0.5, RANGE[1]))
-            band = {"height": 0.9, "color": "0.87", "label": "flights trained on, 1 to 99 %"}
-            axes.barh(line, np.ptp(ends := np.quantile(known[name], RANGE)), left=ends[0], **band)
-            axes.plot([low, high], [line, line], color=COLOURS["hybrid"], label="test flight, 1 to 99 %")
-            axes.plot(middle, line, "o", color=COLOURS["hybrid"], markersize=3.5, label="its median")
-            axes.set_xlabel(name)
-    name_lines(panels[0, 0], [flight_of(log) for _, log in tested])
-    return legend_below(figure, "What is asked of the models, and what they were trained on")
 
 
 @mpl.rc_context(STYLE)
@@ -166,27 +140,6 @@ def predicted_flight(experiment: Experiment, outputs: Outputs, mode: str) -> Fig
     return legend_below(figure, title, "each prediction starts at a dot, from the measured state")
 
 
-@mpl.rc_context(STYLE)
-def residual_by_speed(outputs: Outputs, hybrids: Mapping[str, TrainedModel]) -> Figure:
-    """Output of a network on test flights, in those of ṗ, v̇ and ω̇ that it changes, against speed: quartiles of bins."""
-    windows = cut_windows(outputs.folds[0].test, 1).windows
-    x, residuals = windows.x0, {}
-    for mode, trained in hybrids.items():
-        network = jax.jit(jax.vmap(_largest(trained).residual))
-        residuals[cell_name("hybrid", mode)] = np.asarray(network(x, windows.u[:, 0]))
-    every = {r"$\dot{p}$ [m/s]": POSITION, r"$\dot{v}$ [m/s²]": VELOCITY, r"$\dot{\omega}$ [rad/s²]": BODY_RATES}
-    parts = {name: part for name, part in every.items() if any(each[:, part].any() for each in residuals.values())}
-    figure = Figure(figsize=(max(COLUMN, PAGE / 3 * len(parts)), 3.2), layout="constrained")
-    for column, (name, part) in enumerate(parts.items(), 1):
-        axes = figure.add_subplot(1, len(parts), column)
-        for colour, (label, residual) in zip(COLOURS.values(), residuals.items(), strict=False):
-            size = np.linalg.norm(residual[:, part], axis=1)
-            _draw_bins(axes, np.linalg.norm(x[:, VELOCITY], axis=1), size, colour, label)
-        axes.set(xlabel="speed [m/s]", ylabel=f"added to {name}", ylim=(0, None))
-    meaning = "median over the samples of a bin; band: quartiles"
-    return legend_below(figure, "Output of the network against speed", meaning)
-
-
 def _liveliest(motion: np.ndarray, pieces: int) -> int:
     """The first of so many windows (n, t, k) in a row in which the vehicle moves most: each channel by its spread."""
     scaled = motion / (motion.std(axis=(0, 1)) + 1e-9)
@@ -229,14 +182,3 @@ def _draw_sizes(axes: Axes, found: Mapping[Cell, Results], sizes, label: str, qu
         low = np.maximum(means - spread, 0.5 * means)
         axes.fill_between(at, low, means + spread, color=MODEL_COLOURS[model], alpha=0.15, linewidth=0)
     _over_baseline(axes)
-
-
-def _draw_bins(axes: Axes, speed: np.ndarray, size: np.ndarray, colour: str, label: str) -> None:
-    edges = np.linspace(0, np.quantile(speed, 0.995), BINS + 1)
-    bins = [((low + high) / 2, size[(speed >= low) & (speed < high)]) for low, high in pairwise(edges)]
-    kept = [(at, np.quantile(values, (0.25, 0.5, 0.75))) for at, values in bins if len(values) >= MIN_SAMPLES]
-    if kept:
-        middle, quartiles = zip(*kept, strict=True)
-        low, median, high = np.transpose(quartiles)
-        axes.plot(middle, median, color=colour, marker="o", markersize=3.5, label=label)
-        axes.fill_between(middle, low, high, color=colour, alpha=0.18, linewidth=0)

@@ -3,10 +3,9 @@
 import argparse
 import contextlib
 import gc
-import io
 import signal
 import sys
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any, TypeVar
 
@@ -15,10 +14,9 @@ from rich.console import Console
 
 from experiments.runner.cache import source_digest
 from experiments.runner.options import Run
-from experiments.runner.run_record import OtherRun, recorded
+from experiments.runner.run_record import recorded
 from hybrid_jax import checks
-from hybrid_jax.cli.command import BAD_INPUT, FAILED_CHECKS, ChecksFailed, parsed
-from hybrid_jax.cli.flags import in_flags
+from hybrid_jax.cli.command import exit_codes, parsed
 from hybrid_jax.runtime import configure
 from hybrid_jax.sweep import hosts
 
@@ -42,7 +40,7 @@ def run(
     """
     given = sys.argv[1:] if arguments is None else arguments
     fresh = " without --fresh" if "--fresh" in given else ""
-    with _exit_codes(name, f"interrupted; the same command{fresh} goes on from here"):
+    with exit_codes(name, name, f"interrupted; the same command{fresh} goes on from here"):
         config = read(name, about, given, presets)
         checks.writable_folder("--out", config.out)
         checks.writable_folder("--cache", config.cache)
@@ -75,7 +73,7 @@ def run(
 
 def check(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, Run]) -> None:
     """End the process, as `run` does, if the command line is not one of this experiment."""
-    with _exit_codes(name, "interrupted"):
+    with exit_codes(name, name, "interrupted"):
         read(name, about, arguments, presets)
 
 
@@ -83,7 +81,7 @@ def call(
     name: str, kind: type[Options], command: Callable[[Options], None], arguments: Sequence[str] | None = None
 ) -> None:
     """Read the options, a dataclass with the command's description, and run a command. Errors as in `run`."""
-    with _exit_codes(name, "interrupted, nothing was written"):
+    with exit_codes(name, name, "interrupted, nothing was written"):
         command(parsed(kind, _program(name), arguments))
 
 
@@ -101,27 +99,6 @@ def read(name: str, about: str, arguments: Sequence[str], presets: Mapping[str, 
 
 def _program(name: str) -> str:
     return f"python -m experiments.{name}"
-
-
-@contextlib.contextmanager
-def _exit_codes(name: str, interrupted: str) -> Iterator[None]:
-    """End the process with one line on stderr and an exit code on bad input and on a signal."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
-    try:
-        yield
-    except (ValueError, OSError, ImportError) as error:
-        message = str(error) if isinstance(error, OtherRun) else " ".join(str(error).split())
-        print(f"{name}: {in_flags(name, message)}", file=sys.stderr)
-        sys.exit(BAD_INPUT)
-    except ChecksFailed as failed:
-        for line in failed.args:
-            print(f"{name}: {in_flags(name, line)}", file=sys.stderr)
-        sys.exit(FAILED_CHECKS)
-    except KeyboardInterrupt as stop:
-        print(f"{name}: {interrupted}", file=sys.stderr)
-        sys.exit(128 + (stop.args[0] if stop.args else signal.SIGINT))
 
 
 def _interrupt(number: int, frame) -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from experiments.reporting.results import leaves
 from experiments.runner.options import Run
-from hybrid_jax.cli.command import ChecksFailed
+from hybrid_jax.cli.command import ChecksFailed, Explained
 from hybrid_jax.io.datasets import versions
 from hybrid_jax.io.files import backup_path, json_text, json_value, read_json, write_atomic
 from hybrid_jax.runtime import hardware
@@ -30,7 +30,7 @@ def environment(stages: Mapping[str, float]) -> dict[str, Any]:
     }
 
 
-class OtherRun(ValueError):
+class OtherRun(Explained):
     """The unfinished run differs from the requested one; the message has one line per difference."""
 
 

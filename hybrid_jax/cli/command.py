@@ -45,6 +45,10 @@ hybrid-jax VERB --help says more, VERB --help-all all.
 Exit codes: 0 done, 2 bad input, 3 logs fail checks, 4 nothing changed (adapt)."""
 
 
+class Explained(ValueError):
+    """Bad input whose message has several lines."""
+
+
 class ChecksFailed(Exception):
     """Logs failed checks; `args` are lines for the user."""
 
@@ -134,10 +138,14 @@ def exit_codes(program: str, command: str, interrupted: str) -> Iterator[None]:
         command: whose options messages name; see `in_flags`.
         interrupted: what is said on Ctrl-C.
     """
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")  # a terminal or pipe that cannot show a letter ends no run
     try:
         yield
     except (ValueError, OSError, ImportError) as error:
-        _end(program, [in_flags(command, " ".join(str(error).split()))], BAD_INPUT)
+        message = str(error) if isinstance(error, Explained) else " ".join(str(error).split())
+        _end(program, [in_flags(command, message)], BAD_INPUT)
     except ChecksFailed as failed:
         _end(program, [in_flags(command, line) for line in failed.args], FAILED_CHECKS)
     except KeyboardInterrupt as stop:
