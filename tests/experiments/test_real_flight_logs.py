@@ -7,7 +7,6 @@ import pytest
 from recorded import CONFIG, DT, LOGS, SAMPLES, write
 
 from experiments.real_flight.logs import load_logs, require_distinct
-from hybrid_jax.flights.checks.cleaning import Cleaning, clean
 from hybrid_jax.flights.windows import require_common_interval
 from hybrid_jax.vehicle import IRIS
 
@@ -22,33 +21,6 @@ def test_logs_are_read_checked_and_cleaned(tmp_path):
         assert record["samples"] == SAMPLES
         assert len(record["checks"]) == 8 + 12
     assert require_common_interval(found.logs) == 0.02
-
-
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"low_pass": 60.0}, r"low_pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
-        ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
-        ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
-    ],
-)
-def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
-    with pytest.raises(ValueError, match=f"^/logs/chirp_run1.csv: {message}"):
-        clean(LOGS[0], Cleaning(**options), IRIS)
-
-
-@pytest.mark.parametrize(
-    ("option", "value", "expected"),
-    [
-        ("resample", 0.0, "positive"),
-        ("low_pass", -1.0, "positive"),
-        ("longest_gap", -0.1, "finite number of at least 0"),
-        ("delay", np.nan, "finite"),
-    ],
-)
-def test_invalid_cleaning_options_are_refused(option, value, expected):
-    with pytest.raises(ValueError, match=f"^{option} must be a {expected}.*{value}$"):
-        Cleaning(**{"resample": 0.01, option: value})
 
 
 @pytest.mark.parametrize(

@@ -2,9 +2,19 @@
 
 import numpy as np
 import pytest
+from recorded import LOGS
 from surface import refusal
 
-from hybrid_jax.flights.checks.cleaning import align_motors, delay_motors, in_flight, lag_motors, low_pass, resample
+from hybrid_jax.flights.checks.cleaning import (
+    Cleaning,
+    align_motors,
+    clean,
+    delay_motors,
+    in_flight,
+    lag_motors,
+    low_pass,
+    resample,
+)
 from hybrid_jax.flights.log import FlightLog, gaps, repeats, segments
 from hybrid_jax.flights.windows import cut_windows
 from hybrid_jax.trajectories import check
@@ -188,3 +198,30 @@ def test_lag_recovers_rotor_speeds_from_commands(flight):
     commands = speeds[:-1] + np.diff(speeds, axis=0) / (1 - np.exp(-step))
     commanded = FlightLog(flight.t[:-1], flight.x[:-1], np.maximum(commands, 0))
     np.testing.assert_allclose(lag_motors(commanded, 0.04)[0].u[50:], 0.5 * (speeds[50:-1] + speeds[51:]), rtol=0.01)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"low_pass": 60.0}, r"low_pass: cutoff must lie between 0 and half the sampling frequency 50 Hz, got 60"),
+        ({"resample": 5.0}, r"resample: no segment without gaps is as long as dt = 5.0 s"),
+        ({"delay": 5.0}, r"delay: no segment without gaps is longer than the lag of 5.0 s"),
+    ],
+)
+def test_impossible_cleaning_is_refused_with_log_and_option(options, message):
+    with pytest.raises(ValueError, match=f"^{LOGS[0].name}: {message}"):
+        clean(LOGS[0], Cleaning(**options), IRIS)
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "expected"),
+    [
+        ("resample", 0.0, "positive"),
+        ("low_pass", -1.0, "positive"),
+        ("longest_gap", -0.1, "finite number of at least 0"),
+        ("delay", np.nan, "finite"),
+    ],
+)
+def test_invalid_cleaning_options_are_refused(option, value, expected):
+    with pytest.raises(ValueError, match=f"^{option} must be a {expected}.*{value}$"):
+        Cleaning(**{"resample": 0.01, option: value})
