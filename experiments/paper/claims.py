@@ -210,7 +210,7 @@ def _bias(value: float | None, truth: float) -> float:
 
 QUICK = ("C1", "C2", "C6", "C9")  # what three seeds and the smallest and the largest N decide
 ONLY = {"C9": (COMPARISON,), "C10": ("param_shift",)}  # the others are about both shifts, not about the comparison
-_DEPENDS = "Under the parameter shift the rate of θ_p in fine-tuning, illegible in the paper, decides this."
+_DEPENDS = "After a change of inertia this is sensitive to the rate of θ_p in fine-tuning, an option."
 CLAIMS: Mapping[str, tuple[str, Predicate]] = {
     "C1": ("At every N, the mean test error of the fine-tuned hybrid is below that of fine-tuned no-physics (95 % "
            "interval of the paired difference, as for all claims about means).", _lower_error),

@@ -43,7 +43,7 @@ class Rates:
     physics: NotNegative = 1e-2
     """θ_p from a fresh start: pre-training, and target-only."""
     physics_fine_tuning: NotNegative = 1e-2
-    """θ_p in fine-tuning; illegible in the scan of the paper. Claims C8 and C10 of param_shift depend on it."""
+    """θ_p in fine-tuning; not confirmed in the paper. Claims C8 and C10 of param_shift are sensitive to it."""
     pretraining: NotNegative = 1e-4
     """θ_d, both models."""
     decay: tuple[Positive, ...] = ()
@@ -51,7 +51,7 @@ class Rates:
     hybrid: tuple[NotNegative, ...] = (1e-3, 1e-4, 1e-4, 1e-4, 1e-3)
     """θ_d of the hybrid, fine-tuned and target-only."""
     no_physics: tuple[NotNegative, ...] = (1e-4, 1e-4, 1e-4, 1e-4, 1e-5)
-    """The network without physics, fine-tuned (the scan of the paper is damaged in the first four)."""
+    """The network without physics, fine-tuned (not confirmed in the paper for the first four)."""
     no_physics_target_only: NotNegative = 1e-4
     """The network without physics, from a fresh start."""
     offset: Positive | None = None
