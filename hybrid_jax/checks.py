@@ -29,6 +29,19 @@ def is_traced(value: Any) -> bool:
     return isinstance(value, jax.core.Tracer)
 
 
+def not_traced(name: str, *arguments: Any) -> None:
+    """Refuse to be a part of `jax.jit`, `jax.vmap` or `jax.grad`: the function decides by numbers what it does next.
+
+    Raises:
+        TypeError: some argument is traced.
+    """
+    if any(map(is_traced, jax.tree.leaves(arguments))):
+        raise TypeError(
+            f"{name} cannot be called under jax.jit, jax.vmap or jax.grad, as it decides by numbers; "
+            "call it as it is, or hybrid_jax.sweep.sweep for many seeds, fields or sets of windows at once"
+        )
+
+
 def real_array(name: str, value: Any) -> Numbers:
     """The value as an array of real numbers; an array is returned unchanged."""
     try:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField, as_field
 from hybrid_jax.dynamics.composition import Hybrid
+from hybrid_jax.runtime import entry
 
 Derivative = Callable[[Float[Array, " d *b"], Float[Array, " m *b"]], Float[Array, " d *b"]]
 Solver = diffrax.AbstractSolver
@@ -158,6 +159,7 @@ def _prepared(solver: Solver, dtype) -> Solver:
     return solver
 
 
+@entry
 def rollout(
     field: AbstractVectorField,
     x0: Float[Array | np.ndarray, " d"],
@@ -190,6 +192,7 @@ def _integrate(field, x0, u, solver, dt, substeps):
     return integrate(field, x0, u, dt, solver, substeps)
 
 
+@entry
 def rollout_batch(
     field: AbstractVectorField,
     x0: Float[Array | np.ndarray, "n d"],

@@ -7,10 +7,11 @@ from jaxtyping import Array, Float
 
 from hybrid_jax import checks
 from hybrid_jax.chunks import in_chunks
-from hybrid_jax.dynamics.base import AbstractVectorField, continuous
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows
 from hybrid_jax.integrate import Solver
 from hybrid_jax.rollouts import predict
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.runtime import entry
+from hybrid_jax.trajectories import Trajectories
 
 CHUNK = 1000  # windows predicted at once
 
@@ -27,6 +28,7 @@ def mse(predicted: Float[Array, "*n t d"], truth: Float[Array, "*n t d"]) -> Flo
     return jnp.mean(jnp.sum(jnp.square(predicted - truth), axis=-1), axis=-1)
 
 
+@entry
 def rollout_mse(
     field: AbstractVectorField, windows: Trajectories, every: int = 1, solver: Solver | None = None, chunk: int = CHUNK
 ) -> Float[Array, ""]:
@@ -59,7 +61,7 @@ def window_mse(
         solver: by default `RK4`.
         chunk: windows predicted at a time.
     """
-    windows = continuous(field, check(windows, "windows"))
+    windows = check_windows(field, windows)
     checks.count("chunk", chunk)
     checks.count("every", every)
     if every > windows.horizon:

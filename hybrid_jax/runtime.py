@@ -5,10 +5,11 @@ import os
 import platform
 import tempfile
 import time
+import warnings
 import zlib
 from collections import Counter
 from collections.abc import Callable
-from functools import cache, partial
+from functools import cache, partial, wraps
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any, ParamSpec, TypeVar
@@ -40,6 +41,7 @@ THREADS = "OPENBLAS_NUM_THREADS"
 
 P = ParamSpec("P")
 R = TypeVar("R")
+_owner: dict[str, int] = {}  # the process that first computed
 
 
 def configure(folder: Path | None = None) -> None:
@@ -48,6 +50,8 @@ def configure(folder: Path | None = None) -> None:
     Args:
         folder: JAX keeps compiled programs in it, by default in `programs` of the user's cache folder for hybrid_jax.
             JAX_COMPILATION_CACHE_DIR goes first. Old programs are deleted in the default folder alone.
+
+    Warns if JAX has begun: its devices and XLA's options stay as they are, and the rest is set.
 
     Raises:
         ValueError: the folder cannot be written.
@@ -64,7 +68,14 @@ def configure(folder: Path | None = None) -> None:
         raise ValueError(f"{programs}: cannot be written: {error.strerror}; set {PROGRAMS}") from error
     if EXTRA not in (flags := os.environ.get(FLAGS, "")):
         os.environ[FLAGS] = f"{flags} {WHOLE_LOOPS}".strip()
-    jax.config.update("jax_num_cpu_devices", cores())
+    try:
+        jax.config.update("jax_num_cpu_devices", cores())
+    except RuntimeError:
+        warnings.warn(
+            f"JAX has begun, so that its {jax.local_device_count()} device(s) and XLA's options stay as they are; call "
+            "hybrid_jax.runtime.configure() before the first array is made. All else is set.",
+            stacklevel=2,
+        )
     jax.config.update("jax_compilation_cache_dir", str(programs))
     # XLA's own caches put their folder into the key of every program, so that a moved cache would be useless.
     jax.config.update("jax_persistent_cache_enable_xla_caches", "none")
@@ -87,6 +98,26 @@ def load_lapack() -> None:
     lapack.prepare_lapack_call("potrf_ffi", np.dtype("f4"))
     if alone:
         del os.environ[THREADS]  # it is for no other library and no child process
+
+
+def entry(function: Callable[P, R]) -> Callable[P, R]:
+    """Decorator of a public function that computes.
+
+    It computes with NumPy's promotion, also where the user told JAX to be strict with code of their own, and refuses a
+    process that was forked from one that has used JAX, where the threads of XLA are missing and a call never returns.
+    """
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> R:
+        if _owner.setdefault("process", os.getpid()) != os.getpid():
+            raise RuntimeError(
+                f"{function.__name__}: this process was forked from one that has used JAX, whose threads it lacks; "
+                "start it by multiprocessing.get_context('spawn')"
+            )
+        with jax.numpy_dtype_promotion("standard"), jax.numpy_rank_promotion("allow"):
+            return function(*args, **kwargs)
+
+    return call
 
 
 def jit_with(options: dict[str, bool | int] | None) -> Callable[[Callable[P, R]], Callable[P, R]]:

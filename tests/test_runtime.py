@@ -32,6 +32,32 @@ print(loop.lower(jax.numpy.ones((13, 100))).compile().as_text().count("xla_cpu_s
 PRECISION = f"""{CONFIGURED}
 print(jax.jit(lambda x: x @ x.T).lower(jax.numpy.ones((5, 5))).as_text().count("precision = [HIGHEST, HIGHEST]"))
 """
+LATE = """
+import warnings
+import jax
+from hybrid_jax.runtime import configure
+devices = len(jax.devices())
+with warnings.catch_warnings(record=True) as caught:
+    warnings.simplefilter("always")
+    configure()
+assert "JAX has begun" in str(caught[-1].message)
+print(devices == len(jax.devices()), jax.config.jax_persistent_cache_min_compile_time_secs == 0)
+"""
+FORK = """
+import os, warnings
+import jax.numpy as jnp
+import hybrid_jax as hj
+warnings.simplefilter("ignore")
+x0, u = jnp.zeros(2), jnp.zeros((3, 1))
+hj.rollout(lambda x, u: -x, x0, u, 0.1)
+if os.fork() == 0:
+    try:
+        hj.rollout(lambda x, u: -x, x0, u, 0.1)
+    except RuntimeError as error:
+        os._exit(7 * ("forked" in str(error) and "spawn" in str(error)))
+    os._exit(1)
+print(os.waitstatus_to_exitcode(os.wait()[1]))
+"""
 IMPORTS = f"""
 import importlib, pkgutil
 import benchmarks, experiments, hybrid_jax
@@ -53,6 +79,15 @@ def printed(program, *cache, **more):
 
 def test_no_module_makes_an_array_when_it_is_imported(tmp_path):
     assert printed(IMPORTS, tmp_path)[0] > 100  # or the number of cores would be fixed before configure sets it
+
+
+def test_after_jax_has_begun_what_can_be_set_is_set(tmp_path):
+    assert script("-c", LATE, env=os.environ | {"XDG_CACHE_HOME": str(tmp_path)}).split() == ["True", "True"]
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="the system has no fork")
+def test_a_fork_of_a_process_that_used_jax_is_refused_where_it_would_wait_for_ever():
+    assert printed(FORK) == [7]
 
 
 def test_a_small_loop_is_one_kernel_unless_the_user_has_flags_of_his_own(tmp_path):

@@ -34,7 +34,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
-from hybrid_jax.runtime import FAST_COMPILE, jit_with, load_lapack
+from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
 from hybrid_jax.training.channels import scaled_loss
@@ -179,6 +179,7 @@ class Adaptation:
         return json_value({name: value for name, value in found.items() if name != "field"})
 
 
+@entry
 def adapt(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -207,6 +208,7 @@ def adapt(
     Raises:
         ValueError: an unknown method, malformed, too few or other windows, or a field that the method cannot adapt.
     """
+    checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)
     windows = check_windows(field, windows)
     if learned_from is not None:
@@ -226,9 +228,9 @@ def adapt(
         physics = type(physics_of(field)).__name__
         raise ValueError(f"field: {physics} has {size} parameters, no named physics to fit; use method='fine_tune'")
     if (reason := check_savable(field)) is not None:
-        warnings.warn(reason, stacklevel=2)
+        warnings.warn(reason, stacklevel=3)
     if overlap(windows):
-        warnings.warn(OVERLAP, stacklevel=2)
+        warnings.warn(OVERLAP, stacklevel=3)
     load_lapack()
     solution = method.solve(field, train, held_out, settings)
     if not isinstance(solution, Solution):

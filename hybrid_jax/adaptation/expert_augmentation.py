@@ -23,6 +23,7 @@ from hybrid_jax.estimation.least_squares import Solver, Theta, ravel_parameters
 from hybrid_jax.integrate import rollout
 from hybrid_jax.io.structure import portable
 from hybrid_jax.metrics import mse
+from hybrid_jax.runtime import entry
 from hybrid_jax.training.objective import Objective, Settings
 from hybrid_jax.training.stages import cut
 from hybrid_jax.trajectories import Trajectories, check, split
@@ -117,6 +118,7 @@ class ExpertAugmented(eqx.Module):
         return rollout(self.with_parameters(self.estimate(past)), past.x[-1], u, past.dt, solver)
 
 
+@entry
 def expert_augmented(
     expert: Hybrid, past: Trajectories, key: PRNGKeyArray, *, box: tuple[float, float] = (0.5, 2.0), hidden: int = 128
 ) -> ExpertAugmented:

@@ -15,10 +15,12 @@ from hybrid_jax import checks
 from hybrid_jax.adaptation.adapting import Adaptation, Parameter
 from hybrid_jax.estimation.least_squares import ravel_parameters
 from hybrid_jax.estimation.uncertainty import check_level, named_parameters
+from hybrid_jax.runtime import entry
 
 SOURCES = 3  # at least so many: the variance between two says nothing
 
 
+@entry
 def pool(results: Sequence[Adaptation], level: float = 0.95) -> dict[str, Parameter]:
     """The parameters that every result fitted, each with an interval from within and between the results.
 

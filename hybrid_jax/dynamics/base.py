@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
@@ -125,10 +126,10 @@ def state_space(field: AbstractVectorField, d: int | None = None) -> StateSpace:
 
 
 def check_windows(field: AbstractVectorField, windows: Trajectories, name: str = "windows") -> Trajectories:
-    """The windows, where need be with other numbers for the same states, so that none jumps.
+    """The windows, where need be with other numbers for the same states, so that none jumps, and in double precision.
 
-    An angle that is given within a turn, or the sign of a quaternion, may jump where the state does not. Traced windows
-    are returned as they are.
+    An angle that is given within a turn, or the sign of a quaternion, may jump where the state does not. A field whose
+    parameters are in double precision needs windows that are. Traced windows are returned as they are.
 
     Args:
         field: it says what a state is.
@@ -142,13 +143,17 @@ def check_windows(field: AbstractVectorField, windows: Trajectories, name: str =
     space = state_space(field, windows.x0.shape[-1])
     for part, states in (("x0", windows.x0), ("x", windows.x)):
         space.check(f"{name}: {part}", states)
-    return continuous(field, windows)
-
-
-def continuous(field: AbstractVectorField, windows: Trajectories) -> Trajectories:
-    """As `check_windows`, of windows that were checked."""
-    x = state_space(field, windows.x0.shape[-1]).continuous(windows.x0, windows.x)
+    windows = _as_precise(field, windows)
+    x = space.continuous(windows.x0, windows.x)
     return windows if x is windows.x else replace(windows, x=x)
+
+
+def _as_precise(field, windows: Trajectories) -> Trajectories:
+    """The windows in double precision if the field has a parameter that is, since a step of the solver keeps a type."""
+    double = any(eqx.is_inexact_array(leaf) and leaf.dtype == jnp.float64 for leaf in jax.tree.leaves(field))
+    if not double or windows.x0.dtype == jnp.float64:
+        return windows
+    return replace(windows, **{name: getattr(windows, name).astype(jnp.float64) for name in ("x0", "u", "x")})
 
 
 class _Function(AbstractVectorField):

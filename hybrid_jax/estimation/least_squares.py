@@ -18,6 +18,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, ravel_l
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_physics
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, minimise, move_of_rows
 from hybrid_jax.integrate import compact, rollout
+from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.trajectories import Trajectories
 
@@ -49,6 +50,7 @@ class LeastSquaresFit(eqx.Module):
         return self.status == Status.OK
 
 
+@entry
 def fit_least_squares(
     field: AbstractVectorField,
     windows: Trajectories,

@@ -28,6 +28,7 @@ from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.integrate import RK4
 from hybrid_jax.records import Between, Record, Signal, on_grid
+from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
 CONTINUOUS = 1e-6  # what a segment's end may be off, over the size of a state, where that state has no process noise
@@ -69,6 +70,7 @@ class RecordFit(eqx.Module):
         return tuple(name for name, each in self.intervals.items() if not np.isfinite(float(each.high - each.low)))
 
 
+@entry
 def fit_records(
     model: StateSpaceModel,
     records: Sequence[Record],
@@ -150,6 +152,7 @@ def fit_records(
         return _result(search, end._replace(steps=total), gridded, errors, robust, level)
 
 
+@entry
 def simulate(
     model: StateSpaceModel,
     record: Record,
@@ -187,6 +190,7 @@ def simulate(
         return found, np.asarray(states[0, 0])
 
 
+@entry
 def predict(
     model: StateSpaceModel, past: Record, future: Record, *, dt: float, between: Between = "held", **options: Any
 ) -> dict[str, Float[np.ndarray, "n k"]]:

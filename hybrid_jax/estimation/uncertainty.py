@@ -38,6 +38,7 @@ from hybrid_jax.estimation.normal_equations import (
     masked,
     normal_equations,
 )
+from hybrid_jax.runtime import entry
 from hybrid_jax.trajectories import Trajectories
 
 Kind = Literal["sandwich", "homoscedastic"]
@@ -57,6 +58,7 @@ class Interval(NamedTuple):
     high: Float[Array | np.ndarray, "*runs"]
 
 
+@entry
 def covariance_of(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -141,6 +143,7 @@ def sandwich(equations: NormalEquations, fitted: int, cluster: int) -> Float[Arr
     return _covariance(equations, "sandwich", 1, fitted, cluster)
 
 
+@entry
 def intervals(
     field: AbstractVectorField, covariance: Float[Array, "p p"], level: float = 0.95, degrees: int | None = None
 ) -> dict[str, Interval]:
@@ -223,6 +226,7 @@ class DisturbanceSelection(eqx.Module):
     standard_error: Float[Array, ""]
 
 
+@entry
 def select_disturbance(
     field: AbstractVectorField,
     windows: Trajectories,

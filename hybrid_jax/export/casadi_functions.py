@@ -7,6 +7,7 @@ import jax
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.export.program import Size, program_of, sizes_of
+from hybrid_jax.runtime import entry
 
 if TYPE_CHECKING:
     import casadi
@@ -14,6 +15,7 @@ if TYPE_CHECKING:
 MOST_STATES = 512  # a field on a grid of thousands would be a graph of millions of scalar operations
 
 
+@entry
 def casadi_function(
     field: AbstractVectorField,
     *,
@@ -42,6 +44,7 @@ def casadi_function(
     return _function(field, None, state_size, input_size, name, smooth, "xdot")
 
 
+@entry
 def casadi_step(
     field: AbstractVectorField,
     dt: float,
@@ -65,6 +68,7 @@ def casadi_step(
     return _function(field, float(dt), state_size, input_size, name, smooth, "xnext")
 
 
+@entry
 def acados_model(
     field: AbstractVectorField,
     *,

@@ -22,6 +22,7 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.export.program import program_of, sizes_of
 from hybrid_jax.io.archive import load_archive, save_archive
+from hybrid_jax.runtime import entry
 
 FORMAT = "hybrid_jax program 1"
 PLATFORMS = ("cpu", "cuda", "rocm", "tpu")
@@ -67,6 +68,7 @@ class Program:
         return self._call(x, u)
 
 
+@entry
 def export_program(
     path: str | Path,
     field: AbstractVectorField,

@@ -40,6 +40,7 @@ from hybrid_jax.identification.prediction_error import (
     slopes_between,
 )
 from hybrid_jax.identification.recordings import Layout, Windows, cut
+from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
 ROUNDS = 3  # of weights
@@ -82,6 +83,7 @@ class Identified(NamedTuple):
         return self.status == Status.OK
 
 
+@entry
 def identify(
     field: AbstractVectorField,
     recordings: Sequence[Recording],
@@ -188,6 +190,7 @@ def identify_in_turn(
     )
 
 
+@entry
 def prediction_errors(
     field: AbstractVectorField,
     recordings: Sequence[Recording],

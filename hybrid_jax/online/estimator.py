@@ -36,6 +36,7 @@ from hybrid_jax.online.multiple_model import Verdict
 from hybrid_jax.online.samples import HUGE, Sample, SampleHistory, classify
 from hybrid_jax.online.state import DISTURBANCE, Flags, Numbers, OnlineState, check_sizes, flags_of, named_priors
 from hybrid_jax.online.tuning import Tuning
+from hybrid_jax.runtime import entry
 from hybrid_jax.state_space import StateSpace
 
 FASTEST = 3.0  # share of its prior standard deviation that a parameter may walk in a second
@@ -117,6 +118,7 @@ class OnlineAdaptation(AbstractEstimator):
         given = checks.list_of("hypotheses", hypotheses, Hypothesis)
         self.hypotheses = tuple(subspace_of(hypothesis, self.names, self.scales) for hypothesis in given)
 
+    @entry
     def begin(self, x: Float[Array, " d"]) -> OnlineState:
         """Before the first sample x, at the field's own parameters."""
         x, indices = jnp.asarray(x, float), getattr(disturbance_of(self.field), "indices", None)
@@ -142,6 +144,7 @@ class OnlineAdaptation(AbstractEstimator):
             restarts=zero,
         )
 
+    @entry
     def update(
         self,
         state: OnlineState,
@@ -172,6 +175,7 @@ class OnlineAdaptation(AbstractEstimator):
         begun = consistency.again(begun, state, model.variances)
         return consistency.sound(self._merged(state, filtered, judged, sample, history), begun)
 
+    @entry
     def estimate(self, state: OnlineState) -> tuple[Float[Array, " p"], Float[Array, "p p"]]:
         """The last good θ as a change of the field's own, and its covariance, in the physics' own parametrisation.
 
@@ -185,11 +189,13 @@ class OnlineAdaptation(AbstractEstimator):
             covariance = multiple_model.covariance(state.mixture, self._models(), joint, tuning.least)
         return scales * state.trusted, scales[:, None] * covariance * scales
 
+    @entry
     def model(self, state: OnlineState) -> AbstractVectorField:
         """The field at the last good estimate, with its disturbance."""
         theta, unravel = ravel_parameters(self.field)
         return unravel((theta + jnp.asarray(self.scales, theta.dtype) * state.trusted).astype(theta.dtype))
 
+    @entry
     def intervals(self, state: OnlineState, level: float = 0.95) -> dict[str, Interval]:
         """Parameters and disturbance with their intervals, in physical units; see `hybrid_jax.intervals`.
 
@@ -199,6 +205,7 @@ class OnlineAdaptation(AbstractEstimator):
         """
         return intervals(self.model(state), self.estimate(state)[1], level)
 
+    @entry
     def flags(self, state: OnlineState) -> Flags:
         """What is wrong with samples, parameters and model, or was found.
 

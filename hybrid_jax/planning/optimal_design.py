@@ -35,7 +35,7 @@ from hybrid_jax.planning.input_designs import (
     InputSeries,
     Trajectory,
 )
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, entry
 from hybrid_jax.state import BODY_RATES, POSITION, QUATERNION, SENSOR_NOISE, STATE_SIZE, VELOCITY
 from hybrid_jax.trajectories import windows_of
 
@@ -77,6 +77,7 @@ class Excitation:
         return float(np.linalg.slogdet(self.information)[1])
 
 
+@entry
 def excitation(
     model: AbstractVectorField,
     parameters: Sequence[str] | None,
@@ -270,7 +271,7 @@ def _excited(search: _Search, begun, wanted: tuple[str, ...]) -> tuple[Bool[Arra
     least = float(rounding(windows_of(x, u, search.design.dt, steps=search.window), search.noise)) ** 2
     seen = jnp.asarray(gram > least)
     for name in (name for name, known in zip(names, seen, strict=True) if not known):
-        warnings.warn(f"excitation: no input excites {name}; it is left out", stacklevel=3)
+        warnings.warn(f"excitation: no input excites {name}; it is left out", stacklevel=4)
     asked = jnp.asarray([name in wanted for name in names]) & seen
     if not asked.any():
         raise ValueError(f"parameters: no input excites any of {', '.join(wanted)}")

@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.metrics import window_mse
-from hybrid_jax.runtime import FAST_COMPILE
+from hybrid_jax.runtime import FAST_COMPILE, entry
 from hybrid_jax.status import Status
 from hybrid_jax.sweep import hosts
 from hybrid_jax.sweep.lanes import LaneMap, count, lane, load_balance
@@ -52,6 +52,7 @@ class Progress:
     seconds: float
 
 
+@entry
 def sweep(
     states: FitState,
     plans: RunConfig,
@@ -109,6 +110,7 @@ def sweep(
     return states
 
 
+@entry
 def evaluate(
     fields: AbstractVectorField, windows: Trajectories, every: int, settings: Settings, min_lanes: int = 0
 ) -> Float[np.ndarray, " lanes"]:

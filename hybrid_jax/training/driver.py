@@ -20,7 +20,7 @@ from hybrid_jax.dynamics.composition import check_batch_norm
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.networks.standardise import with_scaling
-from hybrid_jax.runtime import FAST_COMPILE, jit_with
+from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with
 from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
 from hybrid_jax.training.fitting import ADAM, FitState, Optimiser, RunConfig, make_run_config
@@ -79,6 +79,7 @@ class FitInterrupted(KeyboardInterrupt):
         self.result = result
 
 
+@entry
 def fit(
     field: AbstractVectorField,
     train: Trajectories,
@@ -140,6 +141,7 @@ def checked_arguments(
     field: Learner, train: Trajectories, validation: Trajectories, key, settings: Settings | None, optimiser, weight
 ) -> tuple[PyTree, Shared, float]:
     """The training data, what is shared by all stages, and λ: the arguments of `fit`, checked, with their defaults."""
+    checks.not_traced("fit", field, train, validation, key)
     if settings is None:
         settings = Settings(batch_size=min(Settings.batch_size, len(check(train, "train"))))
     checks.instance("settings", settings, Settings)
@@ -175,11 +177,9 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
     for name, windows in data.items():
         if isinstance(field, AbstractVectorField):
             try:
-                x0, *_ = checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
+                checked(field, windows.x0, windows.u, windows.dt, settings.solver, windows=True)
             except ValueError as error:
                 raise ValueError(f"{name}: {error}") from error
-            if x0.dtype != jnp.result_type(windows.x0):
-                raise ValueError(f"{name}: x0 must be {x0.dtype}, the precision of the field, got {windows.x0.dtype}")
             check_dt(windows, data["train"], name)
             check_batch_norm(field, *(np.asarray(part).T for part in (windows.x0[:2], windows.u[:2, 0])))
 
@@ -187,7 +187,7 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
 def ready(field: Learner, train: Trajectories) -> Learner:
     """The field with its scaling set. Warns if a file of it could not be loaded without more information."""
     if (reason := check_savable(field)) is not None:
-        warnings.warn(reason, stacklevel=3)
+        warnings.warn(reason, stacklevel=4)
     return with_scaling(field, train) if isinstance(field, AbstractVectorField) else field
 
 

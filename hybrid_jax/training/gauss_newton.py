@@ -15,16 +15,17 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float, PyTree
 
 from hybrid_jax import checks
-from hybrid_jax.dynamics.base import AbstractVectorField, continuous, trainable
+from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.estimation.levenberg_marquardt import State, begin, in_python, minimise, move_of_equations
 from hybrid_jax.integrate import RK4, Solver, checked, integrate
 from hybrid_jax.networks.grids import GridNetwork
+from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 from hybrid_jax.training.driver import ready
 from hybrid_jax.training.loss import correlation_rows
 from hybrid_jax.training.sensitivities import with_sensitivities
-from hybrid_jax.trajectories import Trajectories, check
+from hybrid_jax.trajectories import Trajectories
 
 MOST = 1000  # parameters: the cost of a step grows with their square
 FIRST = 1e-2  # μ at the start
@@ -81,6 +82,7 @@ PENALTIES: dict[str, Rows] = {
 }
 
 
+@entry
 def fit_gauss_newton(
     field: AbstractVectorField,
     windows: Trajectories,
@@ -109,7 +111,8 @@ def fit_gauss_newton(
         ValueError: malformed windows or others than the field's; no parameters, or too many; an unknown penalty, or
             one of a field that is no `Hybrid`; a weight that is negative.
     """
-    windows = continuous(field, check(windows, "windows"))
+    checks.not_traced("fit_gauss_newton", field, windows)
+    windows = check_windows(field, windows)
     checked(field, windows.x0, windows.u, windows.dt, solver, windows=True)
     checks.not_negative("weight", weight)
     checks.count("max_steps", max_steps)

@@ -14,6 +14,7 @@ from jaxtyping import PRNGKeyArray, PyTree
 from hybrid_jax import checks
 from hybrid_jax.dynamics.base import trainable
 from hybrid_jax.io.archive import named_leaves
+from hybrid_jax.runtime import entry
 from hybrid_jax.training.driver import FitResult, Report, checked_arguments, drive, ready
 from hybrid_jax.training.fitting import FitState, Optimiser, make_run_config, start
 from hybrid_jax.training.objective import Learner, Settings
@@ -89,6 +90,7 @@ def judged(state: FitState, validation: PyTree, settings: Settings) -> FitState:
 _judged = eqx.filter_jit(judged)
 
 
+@entry
 def fit_in_stages(
     field: Learner,
     train: Trajectories,

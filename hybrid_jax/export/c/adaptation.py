@@ -14,6 +14,7 @@ from hybrid_jax.codegen.printer import CPrinter
 from hybrid_jax.codegen.tables import Tables
 from hybrid_jax.export.c.fields import body_of, check_name, written
 from hybrid_jax.export.program import Size, sizes_of
+from hybrid_jax.runtime import entry
 
 HEADER = """\
 /* A filter that adapts a model while it runs, written by hybrid_jax.
@@ -71,6 +72,7 @@ $update
 """
 
 
+@entry
 def export_adaptation_c(
     folder: str | Path,
     adaptation: Any,
