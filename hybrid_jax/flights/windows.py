@@ -60,7 +60,8 @@ def load_windows(
 ) -> Trajectories:
     """Read all logs of a folder, check them against the vehicle and cut them into windows.
 
-    Windows never cross a gap or a repeated sample. What a check warns of is a one-line warning.
+    Windows never cross a gap or a repeated sample. What a check warns of is a one-line warning. A model takes motors as
+    held over an interval: faster ones are averaged over it, and of some that were sampled once in it you are warned.
 
     Args:
         folder: holds one log per flight, of any format of `read_recording`; other files are passed over.

@@ -172,6 +172,14 @@ def test_the_suggested_shift_repairs_the_lag(flight):
     assert table(repaired)[LAG].verdict == OK
 
 
+def test_motors_that_are_sampled_at_the_start_of_an_interval_are_told_from_means(flight):
+    sampled = with_parts(flight[1:], u=(flight.u[1:] + flight.u[:-1]) / 2)
+    check = table(noisy(sampled, np.random.default_rng(3)))[LAG]
+    assert (check.verdict, "motors are samples, not held" in check.suggestion) == (WARNS, True), check
+    assert check.value == pytest.approx(-5, abs=1.5)
+    assert table(delay_motors(sampled, check.value / 1000)[0])[LAG].verdict == OK
+
+
 def test_gaps_and_repeats_hide_no_other_mistake(flight):
     kept = np.ones(len(flight), bool)
     kept[101::50] = False

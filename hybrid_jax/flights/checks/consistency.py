@@ -48,6 +48,7 @@ POSSIBLE = 2.5  # factor of thrust per mass, either way, that a load or damage m
 NOISE = 0.2  # share of the least motion below which two records count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
 FATAL_LAG = 40.0  # ms
+SAMPLED = (-1.0, -0.4)  # intervals by which the gyro precedes motors sampled at the start of each: half of one
 LAG = "motor_time_constant"  # its name in the vehicle file
 LEAST_MOTION = {"velocity": 0.05, "rates": 0.03, "acceleration": 0.2}  # RMS in m/s, rad/s, m/s²
 
@@ -176,6 +177,10 @@ def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:
     lagging = _at_most(GYRO, abs(lag), "ms", limit, shift)
     # Models bear a lag of some samples: they predict worse, but what they learn is not wrong.
     lagging = replace(lagging, verdict=WARNS) if limit < abs(lag) <= FATAL_LAG else lagging
+    if SAMPLED[0] < found.lag / log.dt < SAMPLED[1]:
+        told = f"motors are samples, not held or means over the interval, and change by {100 * found.change:.0f} %"
+        told += f" in it, which falsifies inertia: log means or faster, or take means of two: delay={found.lag:.4f}"
+        lagging = replace(lagging, verdict=WARNS, suggestion=told)
     return [
         judged(ORDER, min(found.as_is[:2]), "correlation", ORDER_LIMIT, "" if ordered else advice),
         _spin(log, vehicle, found.yaw_sign * found.correlations[2]),

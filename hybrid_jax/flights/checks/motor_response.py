@@ -29,6 +29,7 @@ class Response(NamedTuple):
     yaw_sign: int  # −1 if every rotor spins opposite to the vehicle file
     lag: float  # time by which angular acceleration follows the motors [s]; negative if it precedes them
     correlations: list[float]  # of roll and pitch at that order and lag, of yaw (its size) at its best lag near it
+    change: float  # of the torque about roll and pitch from one sample to the next, as a share of its size
     as_is: list[float]  # of roll, pitch and yaw for the motors in their present order, at that lag
 
 
@@ -53,7 +54,10 @@ def respond(log: FlightLog, vehicle: Vehicle) -> Response | None:
     sign = -1 if yaw < 0 else 1
     found = [*table[at, best, :2].tolist(), float(abs(yaw))]
     lag = (at - reach + _vertex(score[:, best], int(at))) * log.dt
-    return Response(tuple(orders(len(arms))[best].tolist()), sign, float(lag), found, table[at, 0].tolist())
+    order = orders(len(arms))[best]
+    turning = squares @ mix[:2, np.argsort(order)].T
+    change = float(np.sqrt((np.diff(turning, axis=0) ** 2).mean() / (turning**2).mean()))
+    return Response(tuple(order.tolist()), sign, float(lag), found, change, table[at, 0].tolist())
 
 
 @cache
