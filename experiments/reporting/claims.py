@@ -8,6 +8,7 @@ from experiments.reporting.tables import Table
 
 Evidence = TypeVar("Evidence")
 Part = tuple[bool | None, str]  # whether a hypothesis holds in one case, None if undecided, and the numbers behind that
+SUMMED = {False: "fail", None: "undecided"}
 OUTCOMES = {True: "✓ holds", False: "✗ fails", None: "– undecided"}
 
 
@@ -70,15 +71,13 @@ def decided(table: Table) -> Table:
 
 
 def summary(verdicts: Sequence[Verdict]) -> list[str]:
-    """One sentence: how many hypotheses hold, and which fail or are undecided, of those that the results can judge."""
+    """One sentence: how many hypotheses hold, fail and are undecided, of those that the results can judge."""
     judged = [each for each in verdicts if not each.lacks_data]
     if not judged:
         return []
-    names = {holds: [each.id for each in judged if each.holds is holds] for holds in OUTCOMES}
-    words = [f"{len(names[True])} of {len(judged)} hypotheses hold"]
-    words += [f"{', '.join(names[False])} fail{'s' * (len(names[False]) == 1)}"] * bool(names[False])
-    words += [f"{', '.join(names[None])} {'is' if len(names[None]) == 1 else 'are'} undecided"] * bool(names[None])
-    return [f"{'; '.join(words)}."]
+    counts = {words: sum(each.holds is holds for each in judged) for holds, words in SUMMED.items()}
+    others = [f"{count} {words}" for words, count in counts.items() if count]
+    return [f"{sum(each.holds is True for each in judged)} of {len(judged)} hypotheses hold{', '.join(['', *others])}."]
 
 
 def to_json(verdicts: Sequence[Verdict]) -> dict[str, list[dict[str, Any]]]:

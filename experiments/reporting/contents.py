@@ -6,8 +6,9 @@ from typing import Any
 
 from experiments.reporting import claims
 from experiments.reporting.claims import Verdict
+from experiments.reporting.questions import QUESTIONS, Asked
 from experiments.reporting.results import Results
-from experiments.reporting.tables import Table
+from experiments.reporting.tables import Table, narrowed
 
 MEANINGLESS = "The smoke preset only shows that everything works: its numbers mean nothing, so no hypothesis is judged."
 
@@ -35,6 +36,24 @@ class Report:
     def conclusions(self) -> list[str]:
         """What the page begins with."""
         return [MEANINGLESS] if self.meaningless else [*self.conclusion, *claims.summary(self.claims)]
+
+    @property
+    def asked(self) -> Asked:
+        return QUESTIONS.get(self.experiment, Asked(self.experiment))
+
+    def main_table(self) -> Table | None:
+        """The one table that is not folded, in few columns."""
+        plain = [table for table in self.shown() if not (table.verdicts or table.folded)]
+        named = [table for table in plain if self.asked.table in table.title] or plain
+        return narrowed(named[0]) if named else None
+
+    def folded_tables(self) -> list[Table]:
+        """The other tables, and the main one if it has lost columns."""
+        return [table for table in self.shown() if table != self.main_table()]
+
+    def figures_in_order(self) -> dict[str, str]:
+        """The figures, the main one first."""
+        return dict(sorted(self.figures.items(), key=lambda item: item[0] != self.asked.figure))
 
     def shown(self) -> list[Table]:
         """The tables of the page; numbers that mean nothing have no verdicts."""

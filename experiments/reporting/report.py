@@ -2,6 +2,7 @@
 
 import json
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -62,9 +63,9 @@ def lines_of(record: dict[str, Any]) -> str:
 
 def shown_page(report: Report, out: Path) -> Page:
     """report.html as the console script writes its pages; figures are read from `out`."""
-    title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
+    _, _, introduction = report.head.partition("\n")
     said = [" ".join(re.sub(r"[*`]", "", each).split()) for each in re.split(r"\n\s*\n|(?:^|\n)- ", introduction)]
-    tables = [Cells(table.title, table.header, table.lines) for table in report.shown()]
+    main, tables = report.main_table(), [_cells(table) for table in report.folded_tables()]
     about = {"Environment": report.environment, "Configuration": report.config}
     known = [
         Cells(name, ("", ""), [(key, json.dumps(value, ensure_ascii=False)) for key, value in leaves(each, ", ")])
@@ -72,35 +73,49 @@ def shown_page(report: Report, out: Path) -> Page:
     ]
     asked = Cells("The question, the models and the measures", ("",), [(each,) for each in said if each])
     return Page(
-        title.lstrip("# "),
+        report.asked.question,
         " ".join(report.conclusions()),
-        tables[0] if tables else None,
-        [(caption, (out / path).read_bytes()) for path, caption in report.figures.items()],
-        report.warnings,
-        details=[*([asked] if asked.lines else []), *tables[1:], *known],
+        _cells(main) if main else None,
+        [(caption, (out / path).read_bytes()) for path, caption in report.figures_in_order().items()],
+        [*report.warnings, *report.asked.meaning],
+        details=[*([asked] if asked.lines else []), *tables, *known],
         notes=report.notes,
     )
 
 
+def _cells(table: Table) -> Cells:
+    return Cells(table.title, table.header, table.lines)
+
+
 def page(report: Report) -> str:
-    """report.md: head, tables, figures, notes, environment and configuration."""
-    title, _, introduction = (report.head or f"# {report.experiment}").partition("\n")
-    said = [" ".join(map(plain, report.conclusions())), *map(plain, report.warnings), introduction.strip()]
-    parts = [title, *(text for text in said if text)]
-    for table in report.shown():
-        title, lines = plain(table.title), markdown(table)
-        parts += [folded(title, lines)] if table.folded else [f"## {title}", lines]
-    if report.figures:
-        captions = {path: plain(caption) for path, caption in report.figures.items()}
-        parts += ["## Figures", *(f"![{caption}]({path})\n\n*{caption}*" for path, caption in captions.items())]
-    parts += ["## Notes", "\n".join(f"- {plain(note)}" for note in report.notes)] if report.notes else []
+    """report.md: question, answer, one figure, one table and what they mean; the rest is folded."""
+    _, _, introduction = report.head.partition("\n")
+    figures = [f"![{plain(text)}]({path})\n\n*{plain(text)}*" for path, text in report.figures_in_order().items()]
+    answer, main = " ".join(map(plain, report.conclusions())), report.main_table()
+    parts = [
+        f"# {report.asked.question}",
+        f"**{answer}**" if answer else "",
+        *map(plain, report.warnings),
+        *figures[:1],
+    ]
+    parts += [f"## {plain(main.title)}", markdown(main)] if main else []
+    parts += ["## What this means for you", bullets(report.asked.meaning)] if report.asked.meaning else []
+    parts += ["## Details", f"This is the report of `experiments.{report.experiment}`."]
+    parts += [folded("Question, models and measures", introduction.strip())] if introduction.strip() else []
+    parts += [folded(plain(table.title), markdown(table)) for table in report.folded_tables()]
+    parts += [folded("More figures", "\n\n".join(figures[1:]))] if figures[1:] else []
+    parts += [folded("Notes", bullets(report.notes))] if report.notes else []
     lines = []
     for name, value in leaves(report.environment, ", "):
         shown = ", ".join(str(item) for item in value) if isinstance(value, list) else str(value)
         lines.append((name + (" [s]" if name.startswith("seconds, ") else ""), shown))
     config = f"```json\n{json_text(report.config)}```"
     parts += [folded("Environment", markdown(Table("", ("", ""), lines))), folded("Configuration", config)]
-    return "\n\n".join(parts) + "\n"
+    return "\n\n".join(part for part in parts if part) + "\n"
+
+
+def bullets(lines: Sequence[str]) -> str:
+    return "\n".join(f"- {plain(line)}" for line in lines)
 
 
 def folded(title: str, content: str) -> str:

@@ -129,6 +129,17 @@ def best_cells(table: Table) -> set[tuple[int, int]]:
     return {place for own in groups.values() if len(own) > 1 for place in own if own[place] == min(own.values())}
 
 
+def narrowed(table: Table, most: int = 6) -> Table:
+    """The table with its labels, its best columns and the first of the others, in at most so many columns."""
+    best = [column for _, column in sorted(best_cells(table), key=lambda place: place[1])]
+    wanted = list(dict.fromkeys([*range(table.labels), *best, *range(len(table.header))]))[:most]
+    kept = sorted(wanted)
+    lines = [[line[i] for i in kept] for line in table.lines]
+    return (
+        table if len(kept) == len(table.header) else table._replace(header=[table.header[i] for i in kept], lines=lines)
+    )
+
+
 def markdown(table: Table) -> str:
     lines = [table.header, ["---"] * len(table.header), *table.lines]
     return "\n".join(f"| {' | '.join(plain(cell) for cell in line)} |" for line in lines)

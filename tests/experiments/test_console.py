@@ -23,7 +23,9 @@ ANSI = re.compile(r"\x1b\[[0-9;]*m")
 
 
 def tables_of(page):
-    for title, block in re.findall(r"^## (.*)\n\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE):
+    for title, block in re.findall(
+        r"^(?:## |.*<summary>)(.*?)(?:</summary>)?\n\n((?:\|.*\n)+)", page.read_text(), flags=re.MULTILINE
+    ):
         header, _, *lines = (row[2:-2].split(" | ") for row in block.splitlines())
         yield Table(title, header, lines)
 

@@ -205,7 +205,7 @@ def test_simulated_run_writes_a_complete_report(simulated):
         (chosen,) = (r for r in report["rows"] if (r["model"], r["fold"]) == ("chosen", fold["tested_on"]))
         assert chosen["recipe"] == selected["chosen"] in selected["scores"]
     page = (out / "report.md").read_text()
-    parts = "Checks: of each log", "Error to expect", "Test flights against", "RMSE at step"
+    parts = "Error to expect", "Checks: of each log", "Test flights against", "RMSE at step"
     assert sorted(parts, key=page.index) == [*parts]
     for figure in report["figures"]:
         assert (out / figure).read_bytes().startswith(b"\x89PNG")

@@ -102,6 +102,8 @@ def test_parameters_of_two_domains_have_the_truth_of_each():
 def test_page_has_everything_once(tmp_path):
     rows = changed(make_rows(), "no_physics", "fine_tuned", 500, test_mse=math.inf, status="diverged")
     report = make_report(rows, figures={"a/scores.png": "Scores | all"}, notes=["Odd|note."], floor=1.234e-3)
+    (tmp_path / "a").mkdir()
+    (tmp_path / "a/scores.png").write_bytes(b"\x89PNG")
     write_report(tmp_path, report)
     page = (tmp_path / "report.md").read_text()
     for claim in report.claims:
@@ -111,6 +113,8 @@ def test_page_has_everything_once(tmp_path):
     assert "0.00123" in page
     assert f"3 of {len(rows)} runs have a test error that is not finite" in page
     assert "∞ (3 of 3 seeds not finite" in page
+    first, table = page.index("](a/scores.png)"), page.index("## Test error")
+    assert page.index("# The inertia of a quadrotor changes") < first < table < page.index("## What this means")
     tables = [line for line in page.splitlines() if line.startswith("|")]
     assert all(line.endswith("|") for line in tables)
 

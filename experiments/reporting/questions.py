@@ -1,0 +1,93 @@
+"""What a reader of a report wants first: the question as its title, one table, one figure, and what they mean."""
+
+from typing import NamedTuple
+
+
+class Asked(NamedTuple):
+    """Of an experiment.
+
+    Attributes:
+        question: the title of the report.
+        meaning: sentences on what the result means for a reader.
+        table: a part of the title of the one table that is not folded; by default the first without verdicts.
+        figure: the name of the one figure that is not folded; by default the first.
+    """
+
+    question: str
+    meaning: tuple[str, ...] = ()
+    table: str = ""
+    figure: str = ""
+
+
+_PAPER = (
+    "Use physics whenever you have some: without it, a hundred trajectories are not enough.",
+    "If the change is in the parameters or a steady force, prefer least squares or `hj.adapt` to fine-tuning.",
+)
+QUESTIONS = {
+    "param_shift": Asked("The inertia of a quadrotor changes: how much data does a model need?", _PAPER, "Test error"),
+    "external_force": Asked("A side wind sets in: how much data does a model need?", _PAPER, "Test error"),
+    "changes": Asked(
+        "Which method adapts to one flight of ten seconds?",
+        (
+            "Start with the defaults of `hj.adapt`; do not fine-tune a network on ten seconds of data.",
+            "The flights move. After a hover the data determine too little, and no method can know what changed.",
+        ),
+    ),
+    "coverage": Asked(
+        "Do 95 % intervals contain the true value?",
+        (
+            "Pool at least three source models: the interval of one is too narrow.",
+            "This holds where physics has every force that acts; elsewhere an interval can miss the true value.",
+        ),
+    ),
+    "comparison": Asked(
+        "Which of ten methods adapts best to a hundred trajectories?",
+        ("Fit few parameters if you have little data; a network needs many flights and validation data.",),
+    ),
+    "ablation": Asked(
+        "Which choices of the method matter?",
+        (
+            "Keep the network from reading the horizontal position and yaw.",
+            "Reduce the noise of the flights before the change: nothing else harms as much.",
+        ),
+        "Residual",
+        "residual.png",
+    ),
+    "closed_loop": Asked(
+        "Does adaptation make a vehicle fly better?",
+        ("Yes in a steady wind, with a network that does not read the position; add a disturbance observer.",),
+        "less is better), external force",
+        "errors_external_force.png",
+    ),
+    "online": Asked(
+        "The vehicle changes in the air: how soon does it fly well again?",
+        ("Name the changes that you expect: with such hypotheses the filter is nearly as good as knowing the change.",),
+        "load of 20 % off centre, from 1 s",
+    ),
+    "excitation": Asked(
+        "How much does a planned flight narrow the intervals?",
+        ("Plan the flight before you record it: ten seconds are enough, a hover is not.",),
+        "Half-width",
+        "intervals.png",
+    ),
+    "reaction_diffusion": Asked(
+        "Can a hybrid learn a partial differential equation from one trajectory?",
+        (
+            "Yes, if you can say what is missing: for a reaction use a network that reads each point alone.",
+            "Train several random networks and keep the one with the least loss.",
+        ),
+        "Forecasts",
+    ),
+    "worlds": Asked(
+        "Is an adapted model ever worse than its source?",
+        ("Look at the first rows before you adapt to a hover or to slow flight.",),
+    ),
+    "real_flight": Asked(
+        "How well does a model predict flights that it has not seen?",
+        (
+            "Compare with the baselines: a model that is no better than frozen body rates has not learned to turn.",
+            "Fitted parameters of a real flight predict, but they need not be those of the vehicle.",
+        ),
+        "Error to expect",
+    ),
+}
