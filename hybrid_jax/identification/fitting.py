@@ -27,7 +27,7 @@ from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.estimation import uncertainty
 from hybrid_jax.estimation.elimination import descend, reduced
 from hybrid_jax.estimation.least_squares import ravel_parameters
-from hybrid_jax.estimation.normal_equations import NormalEquations, inverses, masked
+from hybrid_jax.estimation.normal_equations import NormalEquations, inverse, inverses, masked
 from hybrid_jax.estimation.uncertainty import Interval
 from hybrid_jax.flights.recording import Recording
 from hybrid_jax.identification import slow_commands
@@ -44,6 +44,7 @@ from hybrid_jax.runtime import entry
 from hybrid_jax.status import Status
 
 ROUNDS = 3  # of weights
+CANDIDATES = 8  # windows for each one that is fitted
 CLUSTER = 2.0  # s of windows that are taken as one observation,
 FEWEST_CLUSTERS = 6  # of which there are so many, though, if there are as many windows
 OF_FORCE = {"curve", "time_constant", "time_constants", "voltage_exponent", "mass", "k", "k_rotors", "drag"}
@@ -122,17 +123,18 @@ def identify(
     checks.count("rounds", rounds)
     if isinstance(physics, Actuated) and physics.reads_voltage:
         _require_voltage(recordings)
-    windows, inputs, columns = cut(recordings, layout, told, measured)
+    windows, inputs, columns = cut(recordings, layout, told, measured, CANDIDATES * layout.most)
     moves, measurable = _free(field, free), _measurable(field, recordings)
-    if len(windows.start) <= moves.sum():
-        raise ValueError(
-            f"{recordings[0].name}: {len(windows.start)} windows for {moves.sum()} parameters; record more"
-        )
+    if (n := min(len(windows.start), layout.most)) <= moves.sum():
+        raise ValueError(f"{recordings[0].name}: {n} windows for {moves.sum()} parameters; record more")
     with jax.enable_x64(True):
         field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
         theta, unravel = ravel_parameters(field)
         spread = jnp.concatenate([windows.spread, np.tile(layout.disturbance, (len(windows.start), 1))], axis=1)
         problem = Problem(windows, inputs, columns, {name: _first_scale(windows, name) for name in columns}, spread)
+        if len(windows.start) > layout.most:
+            problem = _telling(field, problem, layout, theta, moves & measurable)
+        windows, spread = problem.windows, problem.spread
         changes, status, errors = jnp.zeros_like(spread), Status.RUNNING, {}
         for _ in range(rounds):
             linearised = partial(normal_equations, field, problem, layout)
@@ -207,13 +209,26 @@ def prediction_errors(
     """
     layout = Layout() if layout is None else layout
     told = "command" if isinstance(physics_of(field), Actuated) else "rotor_speed"
-    windows, inputs, columns = cut(recordings, layout, told, measured)
+    windows, inputs, columns = cut(recordings, layout, told, measured, layout.most)
     with jax.enable_x64(True):
         field = jax.tree.map(lambda leaf: jnp.asarray(leaf, float) if eqx.is_inexact_array(leaf) else leaf, field)
         problem = Problem(windows, inputs, columns, {name: jnp.ones(1) for name in columns}, jnp.zeros(()))
         zero = jnp.zeros((len(windows.start), TANGENT + 6))
         found = all_errors(field, ravel_parameters(field)[0], zero, problem, layout)
     return {name: np.where(windows.there[name][..., None], np.asarray(part), np.nan) for name, part in found.items()}
+
+
+def _telling(field, problem: Problem, layout: Layout, theta, moves) -> Problem:
+    """The problem with the windows that tell most of the parameters: those of greatest leverage tr G⁻¹ Gᵢ.
+
+    Gᵢ is what a window tells at the start of the search, and G what all of them do, so a few seconds that alone tell a
+    parameter are taken. What was measured has no part in it.
+    """
+    equations = normal_equations(field, problem, layout, theta, jnp.zeros_like(problem.spread))
+    gram = masked(reduced(equations, len(theta)).equations, moves).gram
+    leverage = jnp.einsum("pq,nqp->n", inverse(jnp.sum(gram, axis=0)).matrix, gram)
+    kept = np.sort(np.argsort(-np.asarray(leverage), kind="stable")[: layout.most])
+    return problem._replace(windows=jax.tree.map(lambda part: part[kept], problem.windows), spread=problem.spread[kept])
 
 
 def _weighted(field, theta, changes, problem: Problem, layout: Layout) -> Problem:

@@ -31,7 +31,7 @@ class Layout:
     Attributes:
         dt: of the solver's steps and of the grid on which measurements are compared [s].
         steps: intervals of a window.
-        most: windows at most, spread evenly.
+        most: windows at most. `identify` takes those that tell most of its parameters; others are spread evenly.
         span: of the samples before a window that its initial state is estimated from [s].
         initial: "estimated" from these samples, or "sample", the last one before the window, taken as exact.
         warm: of the commands before a window that the rotors' speeds at its start follow from [s].
@@ -87,13 +87,14 @@ class Inputs(NamedTuple):
 
 
 def cut(
-    recordings: Sequence[Recording], layout: Layout, told: str = "command", measured: Sequence[str] = ()
+    recordings: Sequence[Recording], layout: Layout, told: str, measured: Sequence[str], most: int
 ) -> tuple[Windows, Inputs, dict[str, tuple[int, ...]]]:
     """The windows in flight that no gap crosses, the inputs, and the axes of each quantity that is compared.
 
     Args:
         told: the quantity that is the field's input, "command" or "rotor_speed".
         measured: what is compared, by default all of `MEASURED` that every recording has, but for the input.
+        most: windows at most, spread evenly.
 
     Raises:
         ValueError: a recording lacks a quantity, or no window is left: name and what was expected.
@@ -105,9 +106,9 @@ def cut(
             if name not in each.signals:
                 raise ValueError(f"{each.name}: has no {name}, needed to identify; it has {', '.join(each.signals)}")
     begin, parts, inputs = 0.0, [], []
-    most = max(slow_commands.count(each.signals[told], layout.dt * layout.steps) for each in recordings)
+    bridges = max(slow_commands.count(each.signals[told], layout.dt * layout.steps) for each in recordings)
     for i, each in enumerate(recordings):
-        parts.append(_windows(each, layout, told, names, begin, i, most))
+        parts.append(_windows(each, layout, told, names, begin, i, bridges))
         t, values = slow_commands.lines(each.signals[told], layout.dt)
         inputs.append((t + begin, values))
         begin += max(signal.t[-1] for signal in each.signals.values()) + BREAK
@@ -118,7 +119,7 @@ def cut(
             f"{recordings[0].name}: no {span:.3g} s in flight without a gap in {', '.join((told, *names))}"
         )
     windows = jax.tree.map(lambda *each: np.concatenate(each), *parts)
-    kept = np.unique(np.linspace(0, len(windows.start) - 1, layout.most).round().astype(int))
+    kept = np.unique(np.linspace(0, len(windows.start) - 1, most).round().astype(int))
     columns = {name: columns_of(name, recordings) for name in names}
     return (
         jax.tree.map(lambda part: part[kept], windows),

@@ -37,7 +37,8 @@ def pilot_of(late):
     def pilot(x, shake):
         tilt = 2 * x[4:6]
         push = -0.06 * tilt - 0.02 * x[10:12]
-        return hover + shake[0] + (push[0] + shake[1]) * roll + (push[1] + shake[2]) * pitch
+        turn = shake[3] * np.array(TRUTH.spin)
+        return hover + shake[0] + (push[0] + shake[1]) * roll + (push[1] + shake[2]) * pitch + turn
 
     def tick(carry, shake):
         x, queue = carry
@@ -51,16 +52,17 @@ def pilot_of(late):
     return jax.jit(lambda shakes: jax.lax.scan(tick, start, shakes)[1])
 
 
-def recorded(delay=0.0, noise=1.0, hold=20, smooth=0.0):
+def recorded(delay=0.0, noise=1.0, hold=20, smooth=0.0, turning=(0.0, 0.0)):
     """A hover shaken in thrust, roll and pitch, with a pilot that keeps it level, and all that can be measured.
 
-    The shakes are held for `hold` steps and filtered by 1 / (1 − smooth z⁻¹).
+    The shakes are held for `hold` steps and filtered by 1 / (1 − smooth z⁻¹). Yaw is shaken between two times [s].
     """
     rng, n = np.random.default_rng(0), round(SECONDS / DT)
     shakes = np.repeat(rng.normal(size=(n // hold + 1, 3)) * [0.06, 0.01, 0.01], hold, axis=0)[:n]
     shakes = scipy.signal.lfilter([np.sqrt(1 - smooth**2)], [1.0, -smooth], shakes, axis=0)
-    told, measured = pilot_of(round(delay / DT))(jnp.asarray(shakes))
     t, signals = DT * np.arange(1, n + 1), {}
+    yaw = np.where((t > turning[0]) & (t < turning[1]), 0.08 * np.sign(np.sin(8 * t)), 0.0)
+    told, measured = pilot_of(round(delay / DT))(jnp.asarray(np.column_stack([shakes, yaw])))
     for name, size in NOISE.items():
         y = np.array(measured[name])
         y += noise * size * rng.normal(size=y.shape)
@@ -118,6 +120,17 @@ def test_what_a_log_does_not_tell_has_an_interval_as_wide_as_that(twin):
     for name in ("Ix", "Iz", "torque_coefficient"):
         assert float(found.intervals[name].high) > 5 * float(found.intervals[name].value), name
     assert np.isfinite(float(found.intervals["k"].high))
+
+
+def test_windows_are_taken_where_they_tell_something():
+    """Yaw is shaken for a tenth of the log only: of 24 windows spread over all of it, its torque has no interval."""
+    body = hj.rigid_body(replace(TRUTH, torque_coefficient=0.5 * TRUTH.torque_coefficient), ("torque_coefficient",))
+    field = actuated(body, replace(ACTUATOR, time_constants=0.07))
+    found = identify(field, [only(recorded(turning=(6.0, 7.5)), "rates")], replace(LAYOUT, most=24))
+    value, low, high = map(float, found.intervals["torque_coefficient"])
+    assert found.windows == 24
+    assert low < TRUTH.torque_coefficient < high < 4 * low
+    assert value == pytest.approx(TRUTH.torque_coefficient, rel=0.15)
 
 
 def test_an_estimated_initial_state_predicts_better_than_one_noisy_sample(twin):
