@@ -21,8 +21,9 @@ from hybrid_jax.dynamics.composition import Frozen
 from hybrid_jax.dynamics.disturbance import physics_of
 from hybrid_jax.dynamics.outputs import StateSpaceModel
 from hybrid_jax.estimation import elimination, record_search, shooting, uncertainty
-from hybrid_jax.estimation.elimination import End, descend
-from hybrid_jax.estimation.least_squares import Solver, ravel_parameters
+from hybrid_jax.estimation.elimination import End, descend, reduced
+from hybrid_jax.estimation.least_squares import FINE, Solver, ravel_parameters, warn_of_steps
+from hybrid_jax.estimation.normal_equations import inverse
 from hybrid_jax.estimation.record_search import TINY
 from hybrid_jax.estimation.shooting import Problem
 from hybrid_jax.estimation.uncertainty import Interval
@@ -50,6 +51,8 @@ class RecordFit(eqx.Module):
         covariance: of the learned numbers (p, p), in the order of `ravel_learned`.
         steps: of Levenberg–Marquardt, all rounds together.
         status: how the last round ended.
+        discretisation: by how many standard errors half the solver's step would move the learned number that it moves
+            most; 0 if there is none.
     """
 
     model: StateSpaceModel
@@ -63,6 +66,7 @@ class RecordFit(eqx.Module):
     covariance: Float[np.ndarray, "p p"]
     steps: int
     status: Status
+    discretisation: float
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -88,6 +92,8 @@ def fit_records(
     level: float = 0.95,
 ) -> RecordFit:
     """Fit the learned numbers of a model to what was measured, whatever was measured, and the initial states.
+
+    It warns if half the solver's step would give others, see `RecordFit.discretisation`.
 
     Args:
         model: the start of the search.
@@ -149,7 +155,9 @@ def fit_records(
             if i < rounds - 1:
                 sizes = {name: jnp.asarray(_size(each, robust)) for name, each in errors.items()}
                 search = search._replace(problem=Problem(model, sizes, robust, dt, problem.solver, substeps))
-        return _result(search, end._replace(steps=total), gridded, errors, robust, level)
+        found = _result(search, end._replace(steps=total), gridded, errors, robust, level)
+    warn_of_steps(found.discretisation, f"a smaller dt, or substeps={2 * substeps}")
+    return found
 
 
 @entry
@@ -250,7 +258,24 @@ def _result(search: record_search.Search, end: End, gridded, errors, robust: flo
     model = dataclasses.replace(model, start=start[0])
     ends = np.asarray(search.predicted(end.theta, end.own)[1])[:, -1, -1]
     times = np.array([(each.start, each.start + len(each.u) * search.problem.dt) for each in gridded])
-    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status)
+    moved = _discretisation(search, end, errors)
+    return RecordFit(model, start, deviation, ends, times, found, rms, aside, covariance, end.steps, end.status, moved)
+
+
+def _discretisation(search: record_search.Search, end: End, errors) -> float:
+    """How far a step of Gauss and Newton leads with half the solver's step, in standard errors of white noise."""
+    if not (p := len(search.theta)):
+        return 0.0
+    y, there = search.segments.y, search.segments.there
+    size = {name: _size(each, np.inf) + FINE * np.std(y[name][there[name]], axis=0) for name, each in errors.items()}
+    sums = []
+    for substeps in (1, 2):
+        problem = dataclasses.replace(search.problem, scale=size, substeps=substeps * search.problem.substeps)
+        sums.append(reduced(search._replace(problem=problem).equations(end.theta, end.own), p).equations)
+    found = inverse(jnp.sum(sums[0].gram, axis=0))
+    step = found.matrix @ jnp.sum(sums[1].score - sums[0].score, axis=0)
+    error = jnp.sqrt(jnp.diagonal(found.matrix))
+    return float(jnp.max(jnp.where(found.told, jnp.abs(step) / jnp.where(error > 0, error, 1), 0.0)))
 
 
 def _covariance(search: record_search.Search, end: End) -> tuple[Float[np.ndarray, "p p"], Float[np.ndarray, "r s"]]:

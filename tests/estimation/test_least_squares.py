@@ -1,5 +1,7 @@
 """Laws of fitting θ_p by least squares."""
 
+import warnings
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -12,7 +14,8 @@ from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.rigid_body import LEARNED, RigidBody
 from hybrid_jax.estimation.least_squares import fit_least_squares, ravel_parameters
-from hybrid_jax.integrate import rollout_batch
+from hybrid_jax.estimation.uncertainty import covariance_of
+from hybrid_jax.integrate import RK4, rollout_batch
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.trajectories import Trajectories
 from hybrid_jax.vehicle import IRIS
@@ -45,6 +48,31 @@ def test_a_linear_problem_meets_its_closed_form_in_any_unit(unit):
     np.testing.assert_allclose(found.field.gains, gains, rtol=1e-5)
     # One step would do without damping; with 1e-3 of it each step leaves 1e-3 of the error.
     assert found.steps <= 6
+
+
+class Coil(AbstractVectorField):
+    """The current in a coil of resistance 1 Ω, a motor's without its rotor."""
+
+    log_inductance: jax.Array
+
+    def __call__(self, x, u):
+        return (u - x) / jnp.exp(self.log_inductance)
+
+
+@pytest.mark.parametrize(("substeps", "biased"), [(1, True), (4, False)])
+def test_a_step_that_biases_a_parameter_is_said(substeps, biased):
+    """Steps of 10 ms of a coil with 15 ms: the estimate is off by standard errors, and with more steps it is not."""
+    random, truth = np.random.default_rng(0), Coil(jnp.log(0.015))
+    x0, u = random.normal(size=(400, 1)), np.repeat(random.normal(size=(400, 5, 1)), 2, axis=1)
+    x = np.asarray(rollout_batch(truth, x0, u, 0.01, RK4(substeps=8)))
+    windows = Trajectories(x0, u, x + 2e-3 * random.normal(size=x.shape), 0.01)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        found = fit_least_squares(Coil(jnp.log(0.03)), windows, solver=RK4(substeps=substeps))
+    error = np.asarray(jnp.sqrt(covariance_of(found.field, windows, solver=RK4(substeps=substeps))))[0, 0]
+    off = abs(float(found.field.log_inductance) - np.log(0.015)) / error
+    assert (off > 4) == biased == bool(said)
+    assert float(found.discretisation) == pytest.approx(off, rel=0.5) if biased else found.discretisation < 0.1
 
 
 def test_the_residual_of_a_hybrid_is_held():

@@ -73,6 +73,13 @@ def test_parameters_and_starts_are_recovered_within_their_errors(fitted):
     assert fitted.status.name == "OK"
 
 
+def test_steps_that_are_too_long_are_said(records, fitted):
+    assert fitted.discretisation < 0.1
+    with pytest.warns(UserWarning, match=r"half the solver's step would move a parameter by .* substeps=2"):
+        coarse = fit_records(model_of(pendulum()), records, dt=0.2, solver=diffrax.Heun())
+    assert coarse.discretisation > 1
+
+
 def test_multiple_shooting_ends_where_the_simulation_does_from_a_worse_start(records, fitted):
     shot = fit_records(model_of(pendulum(2.0, 1.0)), records, dt=0.02, segment=0.5)
     for name, interval in shot.intervals.items():
