@@ -4,12 +4,15 @@ Physics: water leaves each tank through a hole, and over its edge when it is ful
 Cascaded tanks benchmark combining soft and hard nonlinearities, 2016). The record is on nonlinearbenchmark.org.
 """
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import hybrid_jax as hj
 from experiments.identification.record import Benchmark, main
+from hybrid_jax.networks.mlp import ResidualNetwork, residual_network
+from hybrid_jax.networks.normalisation import ChannelScaling
 
 FULL, EDGE, LEVEL = 10.0, 0.03, 0.02  # V at which the sensor saturates; widths of smooth corners [V]
 WEIR = 0.1
@@ -51,22 +54,11 @@ class Tanks(hj.AbstractVectorField):
         return jnp.stack([pump * u[0] - out[0] - over[0], falls - out[1] - over[1]])
 
 
-class Residual(hj.AbstractVectorField):
-    """One hidden layer of tanh units, of levels and pump.
-
-    Attributes:
-        inner: weights of the hidden units (h, 3).
-        bias: of the hidden units (h,).
-        outer: weights of the outputs (2, h).
-    """
-
-    inner: jax.Array
-    bias: jax.Array
-    outer: jax.Array
-
-    def __call__(self, x, u):
-        z = (jnp.concatenate([x, u]) - MIDDLE) / SIZE
-        return RATE * (self.outer @ jnp.tanh(self.inner @ z + self.bias))
+def residual(hidden: int) -> ResidualNetwork:
+    """One hidden layer of tanh units, of levels and pump, that adds nothing yet."""
+    scaling = ChannelScaling(tuple(MIDDLE.tolist()), tuple(SIZE.tolist()), (RATE, RATE))
+    made = residual_network(2, 1, jax.random.key(0), hidden=hidden, scaling=scaling, norm="none", activation="tanh")
+    return eqx.tree_at(lambda made: (made.weight_out, made.bias_out), made, (jnp.zeros((2, hidden)), jnp.zeros(2)))
 
 
 def physics() -> Tanks:
@@ -91,12 +83,9 @@ def candidate(size: float | None, hidden: int = 6):
     near = {"offset": 0.3, "edge": 0.7, "log_weir": 0.7, "caught": 1.5, "power": 0.1}
     if size is None:
         return model(physics()), {f"field.{name}": value for name, value in near.items()}
-    random = np.random.default_rng(0)
-    inner, bias = random.normal(size=(hidden, 3)), random.normal(size=hidden)
-    residual = Residual(*map(jnp.asarray, (inner, bias, np.zeros((2, hidden)))))
     prior = {f"field.physics.{name}": value for name, value in near.items()}
-    prior |= {"field.residual.inner": 0.7, "field.residual.bias": 0.7, "field.residual.outer": size}
-    return model(hj.Hybrid(physics(), residual)), prior
+    prior |= {"field.residual": 0.7, "field.residual.weight_out": size, "field.residual.bias_out": size}
+    return model(hj.Hybrid(physics(), residual(hidden))), prior
 
 
 BENCHMARK = Benchmark(
