@@ -80,7 +80,7 @@ class Options(LogOptions):
     steps: Annotated[int, RARE] = 20
     """Steps of a window. Short ones resist slow disturbances, long ones tell slow effects."""
     windows: Annotated[int, RARE] = 300
-    """Windows at most, spread evenly over the logs."""
+    """Windows at most: half are those that tell most of what is learned, the others are spread evenly."""
 
     @property
     def layout(self) -> Layout:

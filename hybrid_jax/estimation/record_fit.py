@@ -266,12 +266,16 @@ def _discretisation(search: record_search.Search, end: End, errors) -> float:
     """How far a step of Gauss and Newton leads with half the solver's step, in standard errors of white noise."""
     if not (p := len(search.theta)):
         return 0.0
-    y, there = search.segments.y, search.segments.there
-    size = {name: _size(each, np.inf) + FINE * np.std(y[name][there[name]], axis=0) for name, each in errors.items()}
-    sums = []
-    for substeps in (1, 2):
-        problem = dataclasses.replace(search.problem, scale=size, substeps=substeps * search.problem.substeps)
-        sums.append(reduced(search._replace(problem=problem).equations(end.theta, end.own), p).equations)
+    problem, segments = search.problem, search.segments
+    halved = search._replace(problem=dataclasses.replace(problem, substeps=2 * problem.substeps))
+    now, fine = (each.predicted(end.theta, end.own)[0] for each in (search, halved))
+    size = {name: FINE * np.std(segments.y[name][segments.there[name]], axis=0) for name in now}
+    size = {name: jnp.asarray(each + _size(errors[name], np.inf)) for name, each in size.items()}
+    # Samples that are off by as much leave the errors that half the step does, without another program.
+    moved = segments._replace(y={name: each - (fine[name] - now[name]) for name, each in segments.y.items()})
+    search = search._replace(problem=dataclasses.replace(problem, scale=size))
+    both = (search._replace(segments=each).equations(end.theta, end.own) for each in (segments, moved))
+    sums = [reduced(each, p).equations for each in both]
     found = inverse(jnp.sum(sums[0].gram, axis=0))
     step = found.matrix @ jnp.sum(sums[1].score - sums[0].score, axis=0)
     error = jnp.sqrt(jnp.diagonal(found.matrix))

@@ -219,15 +219,19 @@ def prediction_errors(
 
 
 def _telling(field, problem: Problem, layout: Layout, theta, moves) -> Problem:
-    """The problem with the windows that tell most of the parameters: those of greatest leverage tr G⁻¹ Gᵢ.
+    """The problem with fewer windows: half of them tell most of the parameters, the others are spread evenly.
 
-    Gᵢ is what a window tells at the start of the search, and G what all of them do, so a few seconds that alone tell a
-    parameter are taken. What was measured has no part in it.
+    Most is told by those of greatest leverage tr G⁻¹ Gᵢ, where Gᵢ is what a window tells at the start of the search,
+    and G what all of them do. So a few seconds that alone tell a parameter are among them. What was measured has no
+    part in it. The other half stands for the whole, which a model that is wrong somewhere should fit on average.
     """
     equations = normal_equations(field, problem, layout, theta, jnp.zeros_like(problem.spread))
     gram = masked(reduced(equations, len(theta)).equations, moves).gram
     leverage = jnp.einsum("pq,nqp->n", inverse(jnp.sum(gram, axis=0)).matrix, gram)
-    kept = np.sort(np.argsort(-np.asarray(leverage), kind="stable")[: layout.most])
+    order, most = np.argsort(-np.asarray(leverage), kind="stable"), layout.most // 2
+    others = np.sort(order[most:])
+    even = others[np.linspace(0, len(others) - 1, layout.most - most).round().astype(int)]
+    kept = np.sort(np.concatenate([order[:most], even]))
     return problem._replace(windows=jax.tree.map(lambda part: part[kept], problem.windows), spread=problem.spread[kept])
 
 

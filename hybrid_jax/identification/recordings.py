@@ -31,7 +31,7 @@ class Layout:
     Attributes:
         dt: of the solver's steps and of the grid on which measurements are compared [s].
         steps: intervals of a window.
-        most: windows at most. `identify` takes those that tell most of its parameters; others are spread evenly.
+        most: windows at most, spread evenly; of those that `identify` fits, half are those that tell most.
         span: of the samples before a window that its initial state is estimated from [s].
         initial: "estimated" from these samples, or "sample", the last one before the window, taken as exact.
         warm: of the commands before a window that the rotors' speeds at its start follow from [s].

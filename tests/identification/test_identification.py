@@ -123,12 +123,12 @@ def test_what_a_log_does_not_tell_has_an_interval_as_wide_as_that(twin):
 
 
 def test_windows_are_taken_where_they_tell_something():
-    """Yaw is shaken for a tenth of the log only: of 24 windows spread over all of it, its torque has no interval."""
+    """Yaw is shaken for a tenth of the log only: of 36 windows spread over all of it, its torque has no interval."""
     body = hj.rigid_body(replace(TRUTH, torque_coefficient=0.5 * TRUTH.torque_coefficient), ("torque_coefficient",))
     field = actuated(body, replace(ACTUATOR, time_constants=0.07))
-    found = identify(field, [only(recorded(turning=(6.0, 7.5)), "rates")], replace(LAYOUT, most=24))
+    found = identify(field, [only(recorded(turning=(6.0, 7.5)), "rates")], replace(LAYOUT, most=36))
     value, low, high = map(float, found.intervals["torque_coefficient"])
-    assert found.windows == 24
+    assert found.windows == 36
     assert low < TRUTH.torque_coefficient < high < 4 * low
     assert value == pytest.approx(TRUTH.torque_coefficient, rel=0.15)
 
