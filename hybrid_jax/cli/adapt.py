@@ -1,5 +1,6 @@
 """`hybrid-jax adapt`: what changed, and a model of it."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -8,6 +9,7 @@ import tyro
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import Adaptation, Parameter, adapt
+from hybrid_jax.adaptation.auto import NETWORKS
 from hybrid_jax.cli import errors, page
 from hybrid_jax.cli.command import NOTHING_CHANGED, step
 from hybrid_jax.cli.logs import LISTS, FlightOptions, Flights, windows_of
@@ -17,6 +19,7 @@ from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import save
 
 __all__ = ["LISTS", "Options", "run"]
+Change = tuple[str, float, Parameter]  # a name, its value before, and after
 MOST = 600  # windows
 SHOWN = 5  # parameters beside the answer
 LACKED = (
@@ -51,23 +54,29 @@ def run(options: Options) -> int:
     with step(f"adapting to {len(windows)} windows") as told:
         found = adapt(known.field, windows)
         told(f"chose {found.chosen}")
-    same = found.chosen == "source"
+    changed = _changed(known, found)
+    same = not changed and found.chosen not in NETWORKS
     if not same:
         about = {**known.about} | {"adapted_from": str(options.source), "expected": found.expected}
         about |= {"learned_from": known.about["learned_from"] | flights.contents}
         save(options.output, found.field, json_value(about))
     model = None if same else options.output
-    page.write(options.out, "adapt", _page(options, known, flights, found), found.to_dict() | {"model": model})
+    page.write(options.out, "adapt", _page(options, known, flights, found, changed), found.to_dict() | {"model": model})
     return NOTHING_CHANGED if same else 0
 
 
-def _page(options: Options, known: Known, flights: Flights, found: Adaptation) -> page.Page:
+def _changed(known: Known, found: Adaptation) -> list[Change]:
+    """The parameters whose intervals leave the value before out, the surest first."""
     before = {name: float(value) for name, value in named_parameters(known.field).items()}
     changed = [
         (name, before.get(name, 0.0), one) for name, one in found.parameters.items() if _other(one, before, name)
     ]
-    changed.sort(key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
-    own, lacked = ([each for each in changed if (each[0] in before) == of] for of in (True, False))
+    return sorted(changed, key=lambda each: -abs(each[2].value - each[1]) / max(each[2].high - each[2].low, 1e-30))
+
+
+def _page(options: Options, known: Known, flights: Flights, found: Adaptation, changed: Sequence[Change]) -> page.Page:
+    learned = named_parameters(known.field)
+    own, lacked = ([each for each in changed if (each[0] in learned) == of] for of in (True, False))
     curves = {
         name: errors.rmse_by_flight(field, flights.logs, known.steps)
         for name, field in (("before", known.field), ("adapted", found.field))
@@ -76,7 +85,7 @@ def _page(options: Options, known: Known, flights: Flights, found: Adaptation) -
     what = "; ".join(f"{name} from {value:.3g} to {one}" for name, value, one in own[:2])
     told = f"Changed: {what}." if own else "These flights differ from the model, and no parameter of its own says how."
     todo = [f"On flights that were not used here: hybrid-jax check {options.output} FLIGHTS."]
-    if found.chosen == "source":
+    if not changed and found.chosen not in NETWORKS:
         told = "Nothing changed that these flights can tell."
         todo = ["Keep the model; if something did change, fly what excites the vehicle more."]
     rows = [(name, f"{value:.4g}", str(one)) for name, value, one in [*own, *lacked][:SHOWN]]
