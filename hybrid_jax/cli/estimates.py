@@ -98,7 +98,7 @@ def estimate(recordings: Sequence[Recording]) -> Estimate:
     count = usable[0].rotors if usable else 0
     pieces = [piece for each in usable if each.rotors == count for piece in _pieces(each)]
     if not pieces:
-        raise ValueError("--write-vehicle: no log holds motors in flight; see the page for what to log")
+        raise ValueError("vehicle file: no log holds motors in flight; hybrid-jax inspect says what to log")
     commands = pieces[0].commands
     pieces = [piece for piece in pieces if piece.commands == commands]
     fits = {lag: _regress(pieces, lag) for lag in TIME_CONSTANTS}

@@ -15,7 +15,8 @@ from hybrid_jax.adaptation import METHODS, Adaptation, adapt
 from hybrid_jax.cli import errors, identify, page
 from hybrid_jax.cli.choice import choose, expected
 from hybrid_jax.cli.command import step
-from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, read_flights, windows_of
+from hybrid_jax.cli.inspect import inspected, write_vehicle
+from hybrid_jax.cli.logs import LISTS, STEPS, FlightOptions, Flights, raw_logs, read_flights, windows_of
 from hybrid_jax.dynamics.base import AbstractVectorField
 from hybrid_jax.dynamics.baselines import FrozenRates
 from hybrid_jax.dynamics.composition import Hybrid
@@ -37,7 +38,7 @@ __all__ = ["LISTS", "Options", "run"]
 TRAINED, VALIDATED = 2000, 500  # windows
 FOLDS = 3  # at most so many groups of flights are left out in turn
 HIDDEN, RATE, EPOCHS = 32, 3e-3, 60
-IDENTIFIED = ("output", "vehicle", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
+IDENTIFIED = ("output", "learn", "anyway", "out", "columns", "topics", "motor_order")  # options of both
 PHYSICS = "theta_least_squares"
 QUANTILES = np.linspace(0.01, 0.99, 99)
 FROZEN, CANDIDATES = "thrust, rates frozen", ("physics", "hybrid")  # the simplest first
@@ -58,8 +59,9 @@ class Options(FlightOptions):
     """Folder of logs."""
     output: Annotated[Path, tyro.conf.arg(aliases=["-o"])]
     """File for the model."""
-    vehicle: Path
-    """Vehicle file: what is known, and in `learn` what is not. See docs/howto/vehicle.md."""
+    vehicle: Path | None = None
+    """Vehicle file: what is known, and in `learn` what is not. See docs/howto/vehicle.md. By default one is written
+    from the logs into the folder of the page, with a mass of 1 kg and arms of 0.1 m: results are right up to these."""
     learn: tuple[str, ...] = ()
     """Parameters to learn, in place of those of the vehicle file."""
     dt: float = 0.01
@@ -74,10 +76,12 @@ def run(options: Options) -> int:
     checks.positive("--dt", options.dt)
     checks.writable_folder("--out", options.out)
     checks.writable_folder("--output", options.output.parent)
-    if _identified(options):
+    path = options.vehicle or _written(options)
+    known = load_vehicle_model(path)
+    if _identified(options, known):
         own = {name: getattr(options, name) for name in IDENTIFIED}
-        return identify.run(identify.Options(folder=options.before, **own))
-    model = _vehicle_model(options)
+        return identify.run(identify.Options(folder=options.before, vehicle=path, **own))
+    model = _learning(options, path, known)
     flights = read_flights(options.before, model.vehicle, options.dt, options)
     if len(flights.logs) < 2:
         raise ValueError(f"{options.before}: holds one flight; two at least, of which one is left out to judge by")
@@ -105,22 +109,30 @@ def run(options: Options) -> int:
     return 0
 
 
-def _identified(options: Options) -> bool:
-    """Whether the first log that can be read lacks what training on flights needs, by what it measured."""
-    actuator = load_vehicle_model(options.vehicle).actuator
+def _written(options: Options) -> Path:
+    """A vehicle file of what the logs tell."""
+    path = options.out / "vehicle.toml"
+    with step(f"writing {path}, as no --vehicle is given"):
+        read, _ = raw_logs(options.before, lambda log: inspected(log, None, options))
+        write_vehicle(path, [log for _, log in read], options.before)
+    return path
+
+
+def _identified(options: Options, known: VehicleModel) -> bool:
+    """Whether the first log lacks what training on flights needs, by what it measured."""
     paths = find_logs(options.before)[0] if options.before.is_dir() else [options.before]
     found = next((read_recording(path, **options.reading) for path in paths if path.exists()), None)
     if found is None:
         return False  # which is refused where all logs are read
-    commands = actuator is not None and not options.polynomial and "rotor_speed" not in found.signals
+    commands = known.actuator is not None and not options.polynomial and "rotor_speed" not in found.signals
     return commands or bool({*missing_states(found)} - {"motors"})
 
 
-def _vehicle_model(options: Options) -> VehicleModel:
-    model = load_vehicle_model(options.vehicle)
+def _learning(options: Options, path: Path, model: VehicleModel) -> VehicleModel:
+    """The vehicle with the names that are learned."""
     learn = tuple(name for name in options.learn or model.learn if name != LAG)
     if not learn:
-        raise ValueError(f"{options.vehicle}: learn: names nothing; give --learn Ix Iy, or what else is not known")
+        raise ValueError(f"{path}: learn: names nothing; give --learn Ix Iy, or what else is not known")
     return VehicleModel(model.vehicle, model.terms, model.actuator, learn, model.purpose)
 
 

@@ -4,7 +4,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -118,15 +118,12 @@ def run(options: Options) -> int:
     rows = [{"log": log.name, "result": log.result} for log in logs]
     page.write(options.out, "inspect", _page(options, logs, left), {"rows": rows})
     if options.write_vehicle is not None:
-        found = estimate(trusted(logs))
-        name = options.folder.resolve().stem
-        write_atomic(options.write_vehicle, vehicle_text(found, name, options.mass, options.arm))
-        print(f"{options.write_vehicle}: written; read its comments before it is used")
+        write_vehicle(options.write_vehicle, logs, options.folder, options.mass, options.arm)
     return BAD_INPUT if all(log.recording is None for log in logs) else 0  # the lines above say why
 
 
-def inspected(path: Path, vehicle: Vehicle | None, options: Options) -> Inspected:
-    """Read and check one log; what refuses it is part of the result."""
+def inspected(path: Path, vehicle: Vehicle | None, options: Any) -> Inspected:
+    """Read and check one log, by the options of this verb or of `fit`; what refuses it is part of the result."""
     name = printable(path.name)
     try:
         raw = read_log(path, **options.reading)
@@ -140,12 +137,20 @@ def inspected(path: Path, vehicle: Vehicle | None, options: Options) -> Inspecte
     )
 
 
+def write_vehicle(
+    path: Path, logs: Sequence[Inspected], folder: Path, mass: float | None = None, arm: float | None = None
+) -> None:
+    """Write a vehicle file of what logs of a folder tell."""
+    write_atomic(path, vehicle_text(estimate(trusted(logs)), folder.resolve().stem, mass, arm))
+    print(f"{path}: written; read its comments before it is used")
+
+
 def trusted(logs: Sequence[Inspected]) -> list[Recording]:
     """The recordings that a vehicle file may rest on; which are not is printed."""
     left = [log.name for log in logs if any(check.name not in BORNE for check in log.failed)]
     kept = [log.recording for log in logs if log.recording is not None and log.name not in left]
     if not kept:
-        raise ValueError("--write-vehicle: no log flew and passed its checks; mend the logs as the page says")
+        raise ValueError("vehicle file: no log flew and passed its checks; hybrid-jax inspect says what mends them")
     if left:
         print(f"left out of the vehicle file, as checks failed: {', '.join(left)}")
     return kept
