@@ -17,7 +17,6 @@ import jax
 import numpy as np
 import pytest
 from PIL import Image
-from recorded import LOGS, write
 from smoke import ROOT
 
 from experiments.real_flight.simulated import csv_of, vehicle_toml
@@ -231,10 +230,10 @@ def test_hover_tells_nothing(fitted, tmp_path, called):
     assert not (tmp_path / "adapted.npz").exists()
 
 
-def test_without_a_vehicle_file_one_is_written_first(tmp_path, called, monkeypatch):
-    write(tmp_path / "flights", LOGS[:2])
+@pytest.mark.slow
+def test_without_a_vehicle_file_one_is_written_first(fitted, tmp_path, called, monkeypatch):
     monkeypatch.setattr("hybrid_jax.cli.fit._learning", mock.Mock(side_effect=ValueError("learning")))
-    code, said, why = called("fit", tmp_path / "flights", "-o", tmp_path / "m.npz", "--out", tmp_path / "fit")
+    code, said, why = called("fit", fitted / "before", "-o", tmp_path / "m.npz", "--out", tmp_path / "fit")
     assert (code, why.splitlines()[-1]) == (BAD_INPUT, "hybrid-jax fit: learning")
     assert "vehicle.toml: written" in said
     assert load_vehicle(tmp_path / "fit" / "vehicle.toml").mass == 1
