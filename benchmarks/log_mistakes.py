@@ -131,10 +131,11 @@ MISTAKES: dict[str, dict[str, tuple[Callable[[Parts], Parts], str]]] = {
         "25 Hz, lines": (drawn, "25 Hz"),
         "one gap of most of it": (columns("t", lambda t: np.where(t > t[-1] / 2, t + 100, t)), "most of the log"),
     },
-    "motors": {
+    "motors, limits": {
         "one twice": (columns("u", lambda u: u[:, [0, 0, 2, 3]]), "equal in every sample"),
         "one not logged": (columns("u", lambda u: u * [1, 0, 1, 1]), "u1 never changes"),
         "another instance": (columns("u", lambda u: 0 * u), "another topic, instance"),
+        "gyro clipped": (columns("w", lambda w: np.clip(w, *np.quantile(w, [0.02, 0.98], axis=0))), "saturates"),
         "beyond the largest": (columns("u", lambda u: u + 800 * (u > np.quantile(u, 0.99))), "max_rotor_speed"),
     },
 }  # fmt: skip

@@ -77,6 +77,8 @@ def changed(row, field, cell):
         (lambda rows: [HEADER.replace(",qz", ""), *rows], ("row 1", "field qz", "column map")),
         (lambda rows: [",stamp", "0,1"], ("row 1", "no such column among stamp;")),  # a table with its index
         (lambda rows: [HEADER.replace("vy", "vx"), *rows], ("row 1", "field vx", "2 times")),
+        (changed(2, "t", "2026-11-27 12:00:00.5"), ("row 2", "field t", "is a date: write the time in seconds")),
+        (changed(2, "vy", "[1 2 3]"), ("row 2", "field vy", "a list in a cell")),
         (changed(41, "u3", "12 rpm"), ("row 41", "field u3", "'12 rpm'")),
         (changed(43, "u1", "-900"), ("sample 41", "field u1", "negative")),
         (lambda rows: [HEADER, *rows[:9], rows[9] + ",1", *rows[10:]], ("row 11", "19 fields", "18")),
@@ -105,7 +107,7 @@ def test_rows_that_tell_nothing_are_gaps(flight, written, cell):
     kept = np.delete(np.arange(len(flight)), [*range(300, 310), *range(500, 505), 40])
     np.testing.assert_allclose(log.x, flight.x[kept], atol=1e-12)
     assert len(raw.recording.signals["rates"]) >= len(flight) - 6
-    assert any("velocity is no number in 15 samples, the first at 3 s" in note for note in raw.recording.notes)
+    assert any("velocity stands in 1190 of 1200 rows" in note for note in raw.recording.notes)
 
 
 def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):
@@ -123,6 +125,10 @@ def test_joined_tables_of_several_rates_have_the_times_of_each(flight, written):
     (line,) = [c.suggestion for c in raw.checks(None, 0.01) if c.name == "slowest signal"]
     assert "attitude 25 Hz, motors 50 Hz" in line
     log = raw.flight(0.02)
+    apart = [[*row[:14], *[""] * 4] for row in rows] + [[row[0], *[""] * 13, *row[14:]] for row in rows]
+    apart = [",".join(row) for row in sorted(apart, key=lambda row: float(row[0]))]  # two rows at each time
+    again = read_log(written("\n".join([HEADER, *apart]))).flight(0.02)
+    np.testing.assert_array_equal(again.x, log.x)
     np.testing.assert_allclose(log.x[:, 7:10], flight.x[1 : 2 * len(log) : 2, 7:10], atol=1e-9)
 
 

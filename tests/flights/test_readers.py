@@ -13,6 +13,7 @@ from hybrid_jax.flights import load_logs
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import to_flight
 from hybrid_jax.flights.formats.column_map import SCALES, of_unit
+from hybrid_jax.flights.formats.raw import XYZ, Samples, record
 from hybrid_jax.flights.load import find_logs, read_recording
 from hybrid_jax.flights.log import COLUMNS, FlightLog
 from hybrid_jax.vehicle import IRIS
@@ -197,6 +198,9 @@ def test_events_and_armings_without_frames_are_no_damage(flight, written):
     assert "damage" not in recording.facts
     assert len(recording.signals["rates"]) >= 199
     assert any("2 times the vehicle was armed" in note for note in recording.notes)
+    two = read_recording(written(blackbox(flight[:90]) + whole, "two.bbl"))
+    assert any("holds 2 flights: the longest is read" in note for note in two.notes)
+    assert len(two.signals["rates"]) >= 199
     reasoned = blackbox(flight[:200], events=b"E\xffEnd of log (disarm reason:4)\0", ended=False)
     assert "damage" not in read_recording(written(reasoned, "reasoned.bbl")).facts
 
@@ -251,6 +255,24 @@ def test_the_filter_of_a_crazyflie_is_read(flight, written):
     signals = read_recording(written(usd(columns, np.round(flight.t * 1e6).astype(int)))).signals
     np.testing.assert_allclose(signals["position"].values, flight.x[:, :3], atol=1e-6)
     np.testing.assert_allclose(signals["attitude"].values, flight.x[:, 3:7], atol=1e-6)
+
+
+def test_events_of_a_crazyflie_have_their_own_times(flight, written):
+    ticks = np.round(flight.t * 1e6).astype(int)
+    pwm = {f"pwm.m{i + 1}_pwm": 60 * u[::2] for i, u in enumerate(flight.u.T)}
+    gyro = dict(zip(STATES[-3:], np.rad2deg(flight.x[:, 10:]).T, strict=True))
+    signals = read_recording(written(usd(gyro, ticks, event=(pwm, ticks[::2])))).signals
+    np.testing.assert_allclose(signals["rates"].values, flight.x[:, 10:], atol=1e-5)
+    np.testing.assert_allclose(signals["command"].t, flight.t[::2], atol=1e-9)
+    np.testing.assert_allclose(signals["command"].values, 60 * flight.u[::2] / 65536, atol=1e-6)
+
+
+def test_two_clocks_are_named(flight):
+    """Stamps since boot beside those since 1970, as of mavros without a time sync."""
+    parts = {"rates": (flight.t, flight.x[:, 10:], "/imu"), "position": (flight.t + 1.7e9, flight.x[:, :3], "/odom")}
+    samples = {name: Samples(t, values, XYZ, source) for name, (t, values, source) in parts.items()}
+    (line,) = [line for line in failures(check_recording(record("bag", samples)), "log") if "no time in common" in line]
+    assert "/odom from 1700000000 to 1700000012 s" in line
 
 
 @pytest.mark.parametrize("many", [False, True])

@@ -5,17 +5,19 @@ The format: docs.px4.io, "ULog File Format", version 1.
 
 import gzip
 import struct
+from collections import Counter
 
 import numpy as np
 import pytest
 from scipy.interpolate import CubicSpline
 from surface import refusal
-from writers import OUTPUTS, PX4_STATES, START, commands, escs, outputs, stamped, ulog
+from writers import OUTPUTS, PX4_STATES, START, commands, escs, message, outputs, stamped, ulog
 
-from hybrid_jax.flights.attitude import BODIES
+from hybrid_jax.flights.attitude import BODIES, WORLDS
 from hybrid_jax.flights.checks.suitability import check_recording, failures
 from hybrid_jax.flights.conversion import px4_topics, to_flight
-from hybrid_jax.flights.formats.ulog import read_ulog
+from hybrid_jax.flights.formats import raw
+from hybrid_jax.flights.formats.ulog import SOURCES, read_ulog
 from hybrid_jax.flights.load import reordered
 from hybrid_jax.vehicle import IRIS
 
@@ -145,6 +147,32 @@ def test_advice_for_the_next_flight_is_complete_for_its_version(version):
     assert listed >= {"vehicle_local_position", "vehicle_attitude", "sensor_combined", "battery_status", "esc_status"}
     assert ("actuator_motors" in listed, "vehicle_angular_velocity" in listed) == (version > (1, 12), version > (1, 9))
     assert "actuator_outputs" in listed
+
+
+@pytest.mark.parametrize(
+    ("quantity", "topic", "fields"), [(name, *place) for name, places in SOURCES.items() for place in places]
+)
+def test_every_topic_of_a_quantity_is_read_in_its_frame(written, quantity, topic, fields):
+    values = np.random.default_rng(0).normal(size=(50, len(fields)))
+    values /= np.linalg.norm(values, axis=1, keepdims=True) if quantity == "attitude" else 1
+    counts = Counter(field.split("[")[0] for field in fields)
+    form = "".join(f"float[{n}] {name};" if "[" in " ".join(fields) else f"float {name};" for name, n in counts.items())
+    formats = {topic: f"uint64_t timestamp;uint64_t timestamp_sample;{form}"}
+    content = ulog({topic: stamped(0.01 * np.arange(50), values)}, formats)
+    found = read_ulog(written(content)).signals[quantity].values
+    own = raw.attitude(values, "NED", "FRD") if quantity == "attitude" else values
+    frame = WORLDS["NED"] if quantity in ("position", "velocity") else BODIES["FRD"]
+    np.testing.assert_allclose(found, own @ frame.T if len(fields) == 3 else own, atol=1e-6)
+
+
+def test_what_the_estimator_calls_invalid_resets_and_dropouts_are_said(written):
+    form = "uint64_t timestamp;float x;float y;float z;uint8_t xy_valid;uint8_t z_valid;uint8_t z_reset_counter;"
+    rows = [struct.pack("<Q3f3B", START + 10_000 * i, i, 0, 0, i >= 10, 1, i >= 30) for i in range(50)]
+    content = ulog({"vehicle_local_position": rows}, {"vehicle_local_position": form})
+    recording = read_ulog(written(content + message("O", struct.pack("<H", 120))))
+    assert len(recording.signals["position"]) == 40
+    for words in ("not valid in 10 of 50", "reset the position (z_reset_counter) at 0.3 s", "longest of 120 ms"):
+        assert any(words in note for note in recording.notes)
 
 
 @pytest.mark.parametrize("missing", PX4_STATES)

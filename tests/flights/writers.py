@@ -14,14 +14,20 @@ STATES += ["stateEstimate.vz", *(f"stateEstimate.q{axis}" for axis in "wxyz"), "
 MOTORS = [f"motor.m{i}" for i in range(1, 5)]
 
 
-def usd(columns, ticks, kinds=None):
-    """Bytes of a µSD log of one event type: name → values, and times in µs."""
+def usd(columns, ticks, kinds=None, event=None):
+    """Bytes of a µSD log: name → values, and times in µs; of another event type at its own times, too."""
     names, kinds = list(columns), kinds or {}
-    head = struct.pack("<BHHH", 0xBC, 2, 1, 7) + b"fixedFrequency\0" + struct.pack("<H", len(names))
+    head = struct.pack("<BHHH", 0xBC, 2, 1 + bool(event), 7) + b"fixedFrequency\0" + struct.pack("<H", len(names))
     head += b"".join(f"{name}({kinds.get(name, 'f')})\0".encode() for name in names)
     form = "<HQ" + "".join(kinds.get(name, "f") for name in names)
     rows = zip(ticks.tolist(), *(np.asarray(columns[name]).tolist() for name in names), strict=True)
-    body = head + b"".join(struct.pack(form, 7, *row) for row in rows)
+    records = [struct.pack(form, 7, *row) for row in rows]
+    if event:
+        head += struct.pack("<H", 9) + b"own\0" + struct.pack("<H", len(event[0]))
+        head += b"".join(f"{name}(f)\0".encode() for name in event[0])
+        own = zip(event[1].tolist(), *(np.asarray(values).tolist() for values in event[0].values()), strict=True)
+        records += [struct.pack("<HQ" + "f" * len(event[0]), 9, *row) for row in own]
+    body = head + b"".join(records)
     return body + struct.pack("<I", zlib.crc32(body))
 
 

@@ -47,6 +47,7 @@ IMPROVES = 0.7  # share of the difference of two records that may remain when a 
 POSSIBLE = 2.5  # factor of thrust per mass, either way, that a load or damage may make
 NOISE = 0.2  # share of the least motion below which two records count as equal
 CLEAR = 1.0  # multiple of the least motion needed to check a single axis
+AT_LIMIT = 10  # samples, and times as often as a value usually stands, from which on it is a limit
 FATAL_LAG = 40.0  # ms
 SAMPLED = (-1.0, -0.4)  # intervals by which the gyro precedes motors sampled at the start of each: half of one
 LAG = "motor_time_constant"  # its name in the vehicle file
@@ -148,7 +149,7 @@ def _thrust_advice(ratio: float, log: FlightLog, vehicle: Vehicle) -> str:
 
 
 def _columns(log: FlightLog) -> Check:
-    """Check for equal motors and constant columns: a column was read twice or not recorded."""
+    """Check for equal motors, constant columns and gyros at their limit: read twice, not recorded or saturated."""
     values = np.hstack([log.x[:, VELOCITY.start :], log.u]).T
     names = (*STATE_NAMES[VELOCITY.start :], *input_names(log.u.shape[1]))
     columns: dict[str, np.ndarray] = dict(zip(names, values, strict=True))
@@ -157,8 +158,16 @@ def _columns(log: FlightLog) -> Check:
     alike = [(a, b) for a, b in combinations(moving, 2) if a[0] == b[0] == "u" and (columns[a] == columns[b]).all()]
     problems = [f"{a} and {b} are equal in every sample" for a, b in alike]
     problems += [f"{name} never changes" for name in columns if name[0] in kinds and name not in moving]
+    gyros = [name for name in moving if name[0] == "w"]
+    problems += [f"{name} saturates: widen its range" for name in gyros if _saturates(columns[name])]
     advice = f"{'; '.join(problems)}: log what was measured, or name its columns"
     return _at_most("columns", float(len(problems)), "suspect", 0.0, advice)
+
+
+def _saturates(values: np.ndarray) -> bool:
+    """Whether the largest or smallest value stands far more often than others do."""
+    usual = AT_LIMIT * len(values) / len(np.unique(values))
+    return max((values == values.max()).sum(), (values == values.min()).sum()) > max(AT_LIMIT, usual)
 
 
 def _motors(log: FlightLog, vehicle: Vehicle) -> list[Check]:

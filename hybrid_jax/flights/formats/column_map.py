@@ -176,16 +176,12 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Record
     column_map = library_map(path) if column_map is None else column_map
     parts, stated, frames = _parts(path, column_map), column_map.quantities, column_map.frames
     t, found, notes = parts.pop("time")[:, 0], {}, list(notes_on_end(path))
-    timed = np.isfinite(t)
-    notes += [f"{(~timed).sum()} rows without a time: left out"] * (not timed.all())
     for name, values in parts.items():
         quantity, axes = {"body_rates": "rates", "motors": "rotor_speed"}.get(name, name), raw.XYZ
         source = f"columns {' '.join(stated[name].columns)}"
-        told = timed & np.isfinite(values).all(axis=1)
-        seldom = told.sum() < raw.LOST * timed.sum()
-        notes += [f"{source}: {name} stands in {told.sum()} of {len(t)} rows"] * bool(seldom)
-        rows = told if seldom else timed
-        values = values[rows]
+        told = np.isfinite(t) & np.isfinite(values).all(axis=1)
+        notes += [f"{source}: {name} stands in {told.sum()} of {len(t)} rows"] * (not told.all())
+        values = values[told]
         if name == "attitude":
             values = raw.attitude(_attitude(values, stated[name], path), frames.world, frames.body)
             axes = raw.WXYZ
@@ -200,7 +196,7 @@ def read_mapped(path: str | Path, column_map: ColumnMap | None = None) -> Record
         else:
             values = raw.body(values, frames.body)
             quantity = "body_velocity" if name == "velocity" else quantity
-        found[quantity] = raw.Samples(t[rows], values, axes, source)
+        found[quantity] = raw.Samples(t[told], values, axes, source)
     return raw.record(path, found, notes=notes, facts={"format": "CSV"})
 
 
