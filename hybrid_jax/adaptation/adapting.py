@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from hybrid_jax import checks
 from hybrid_jax.adaptation import ridge
-from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice
+from hybrid_jax.adaptation.auto import NETWORKS, Auto, Choice, has_network
 from hybrid_jax.adaptation.expectation import Expected, expected_errors, lines_of
 from hybrid_jax.adaptation.methods import FineTune, LeastSquares, Method, Ridge, Solution, Source, scale_of
 from hybrid_jax.adaptation.selection import correlated, geometric_mean, longest_chain, overlap
@@ -34,6 +34,7 @@ from hybrid_jax.integrate import checked, compact
 from hybrid_jax.io.files import json_value
 from hybrid_jax.io.models import check_savable
 from hybrid_jax.metrics import rollout_mse
+from hybrid_jax.networks.standardise import motion_of
 from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with, load_lapack
 from hybrid_jax.state_space import StateSpace
 from hybrid_jax.status import Status
@@ -46,6 +47,8 @@ NAMED = 50  # physics with more parameters is a network, and its weights are not
 NOT_LEAST_SQUARES = "they are valid for least squares only, where no network is trained on the same windows"
 NOT_FINITE = "the fit diverged; are dt and all units right?"
 NOT_FITTED = "no parameter was fitted"
+NO_MOTION = "field: it does not say what it learned from, and all its errors count as changes: pass learned_from="
+FEW = "windows: {} do not determine {} parameters; where they tell nothing the source stays"
 OVERLAP = "windows overlap: blocks left out share samples with the others, so the errors to expect are too small"
 
 METHODS: Mapping[str, Method] = {
@@ -107,6 +110,7 @@ class Adaptation:
         degrees: degrees of freedom of the covariance, one less than the clusters of windows that touch, or None.
         candidates: of "auto": the error on left-out windows, without unit, by name.
         chosen: of "auto": the name of the candidate that was taken.
+        refused: of "auto": candidates that explain no more than the source may err where nothing has changed.
         expected: of "auto": errors on a flight that was not seen, by horizon and quantity: value, low, high.
         units: of the quantities in `expected`.
         outside: by quantity the share of samples, 0 to 1, unlike those that the source learned from.
@@ -127,6 +131,7 @@ class Adaptation:
     degrees: int | None = None
     candidates: dict[str, float] = attribute(default_factory=dict)
     chosen: str | None = None
+    refused: tuple[str, ...] = ()
     expected: Expected = attribute(default_factory=dict)
     units: dict[str, str] = attribute(default_factory=dict)
     outside: dict[str, float] = attribute(default_factory=dict)
@@ -151,6 +156,9 @@ class Adaptation:
             others = ", ".join(f"{name} {error}" for name, error in known.items() if name != self.chosen)
             chosen = f"{self.chosen} {self.candidates[self.chosen]:.3g}"
             lines.append(f"Chosen by the error on left-out windows: {chosen} (others: {others}).")
+        better = [name for name in self.refused if self.candidates[name] < self.candidates[str(self.chosen)]]
+        if better:
+            lines.append(f"Refused: {', '.join(better)}: the source may err as much where nothing has changed.")
         if self.expected:
             lines.append("RMSE to expect on a flight not seen (80% intervals, from blocks left out of these windows):")
             lines += lines_of(self.expected, self.units)
@@ -164,6 +172,11 @@ class Adaptation:
             width = max(map(len, self.parameters))
             lines.append(f"Parameters ({note}):")
             lines += [f"  {name:<{width}}  {parameter}" for name, parameter in self.parameters.items()]
+            told = [name for name, one in self.parameters.items() if one.has_interval and one.high < np.inf]
+            rest = [name for name in self.parameters if name not in told]
+            if rest and self.chosen is not None:
+                names = f"{', '.join(told) or 'no parameter'}, and not {', '.join(rest)}"
+                lines.append(f"These windows tell {names}; hj.excitation plans a flight that does.")
             if unseen := [name for name, one in self.parameters.items() if one.high == np.inf]:
                 names = ", ".join(unseen)
                 lines.append(f"Warning: these windows do not determine {names}: other values fit them as well.")
@@ -200,7 +213,9 @@ def adapt(
         method: a name in `METHODS`, or a value such as `FineTune(seed=1)`; see `Method` for one of your own.
         validation: windows for early stopping and penalties. By default the last fifth of `windows` is held out where
             the method needs some.
-        learned_from: windows that the source was trained on; the report warns where these windows are unlike them.
+        learned_from: windows that the source was trained on, by default those that `hj.fit` keeps in its networks.
+            "auto" changes nothing that may be an error of the source on other motion than theirs, and the report warns
+            where these windows are unlike them.
         settings: by default RK4, minibatches of at most 100, and the objective `scaled_loss(field, windows)`, so that
             units do not matter. Settings of your own have the objective that they name, by default the plain MSE.
         level: confidence level of the intervals.
@@ -211,6 +226,7 @@ def adapt(
     checks.not_traced("adapt", field, windows, validation, learned_from)
     name, method = _named(method)
     windows = check_windows(field, windows)
+    learned_from = motion_of(field) if learned_from is None else learned_from
     if learned_from is not None:
         learned_from = check_windows(field, learned_from, "learned_from")
         check_like(learned_from, windows, "learned_from")
@@ -231,8 +247,13 @@ def adapt(
         warnings.warn(reason, stacklevel=3)
     if overlap(windows):
         warnings.warn(OVERLAP, stacklevel=3)
+    motion = {"learned_from": learned_from} if getattr(method, "uses_motion", False) else {}
+    if motion and learned_from is None and has_network(field):
+        warnings.warn(NO_MOTION, stacklevel=3)
+    if motion and len(windows) <= size:
+        warnings.warn(FEW.format(len(windows), size), stacklevel=3)
     load_lapack()
-    solution = method.solve(field, train, held_out, settings)
+    solution = method.solve(field, train, held_out, settings, **motion)
     if not isinstance(solution, Solution):
         raise ValueError(f"method: {name}.solve must return a Solution, got {type(solution).__name__}")
     mse = partial(_mse, solver=compact(settings.solver))
@@ -278,6 +299,7 @@ def _chosen(choice: Choice, windows: Trajectories, space: StateSpace) -> dict[st
     return {
         "candidates": dict(zip(choice.names, geometric_mean(choice.errors.mse).tolist(), strict=True)),
         "chosen": choice.names[int(choice.taken)],
+        "refused": tuple(name for name, one in zip(choice.names, np.asarray(choice.supported), strict=True) if not one),
         "expected": expected_errors(ends, (round(seconds, 9), round(chain, 9)), space),
         "units": {one.name: one.unit for one in space.quantities},
     }

@@ -36,10 +36,14 @@ class Anchored(NamedTuple):
     Attributes:
         changes: of the network's weights.
         errors: on each of b blocks (k, c, b).
+        removed: of the mean square of all errors, to first order.
+        fitted: how many directions the penalty leaves free.
     """
 
     changes: Float[Array, "k c w"]
     errors: BlockErrors
+    removed: Float[Array, "k c"]
+    fitted: Float[Array, "k c"]
 
 
 def fit_anchored(
@@ -83,13 +87,17 @@ def fit_anchored(
             basis = jax.lax.fori_loop(0, ITERATIONS, iterate, basis)
         effects = jnp.moveaxis(jax.lax.map(push, basis, batch_size=TOGETHER), 0, -1)
         gram, score = jnp.einsum("ner,nes->nrs", effects, effects), jnp.einsum("ner,ne->nr", effects, residuals)
-        largest = jnp.linalg.eigvalsh(jnp.sum(gram, axis=0))[-1]
+        all_gram, all_score = jnp.sum(gram, axis=0), jnp.sum(score, axis=0)
+        values = jnp.maximum(jnp.linalg.eigvalsh(all_gram), 0.0)
+        rows = residuals.size / windows.x0.shape[1]
 
         def of_penalty(penalty):
-            held = penalty * largest * jnp.eye(rank, dtype=gram.dtype)
-            step = -jnp.linalg.solve(jnp.sum(gram, axis=0) + held, jnp.sum(score, axis=0))
+            held = penalty * values[-1] * jnp.eye(rank, dtype=gram.dtype)
+            step = -jnp.linalg.solve(all_gram + held, all_score)
+            removed = -(2 * all_score + all_gram @ step) @ step / rows
+            fitted = jnp.sum(values / (values + penalty * values[-1]))
             without = left_out_steps(gram, score, places, counted, held) @ basis
-            return step @ basis, jax.lax.map(error, (without, *own, counted))
+            return step @ basis, jax.lax.map(error, (without, *own, counted)), removed, fitted
 
         return jax.lax.map(of_penalty, jnp.asarray(penalties, gram.dtype))
 

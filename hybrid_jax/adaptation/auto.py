@@ -14,12 +14,12 @@ from hybrid_jax.adaptation.anchored import fit_anchored, parts_of, with_change
 from hybrid_jax.adaptation.methods import Method, Solution, scale_of
 from hybrid_jax.adaptation.plausible import Plausible, groups_of
 from hybrid_jax.adaptation.selection import BLOCKS, BlockErrors, blocks_of, fit_candidates, simplest
+from hybrid_jax.adaptation.support import Errors, Unchanged, alike, errors_of, unchanged
 from hybrid_jax.dynamics.base import AbstractVectorField, trainable
 from hybrid_jax.dynamics.composition import Hybrid
 from hybrid_jax.dynamics.disturbance import physics_of, sized, with_disturbance
 from hybrid_jax.dynamics.rigid_body import corrected
-from hybrid_jax.estimation.least_squares import Scale, Solver, check_determined, ravel_parameters
-from hybrid_jax.estimation.starts import smoothed
+from hybrid_jax.estimation.least_squares import Scale, Solver, ravel_parameters
 from hybrid_jax.estimation.uncertainty import named_parameters
 from hybrid_jax.runtime import FAST_COMPILE, jit_with
 from hybrid_jax.status import ended
@@ -52,6 +52,7 @@ class Choice(NamedTuple):
         names: of the candidates.
         errors: of each candidate on each of b blocks that were left out (c, b).
         taken: the index of the candidate that was taken.
+        supported: which candidates explain more than an error of the source would let them, see `support` (c,).
         parameters: names of the p parameters of the extended physics, see `extended`.
         free: which of these each candidate fitted (c, p).
         theta: their values in each candidate, in the physics' own parametrisation (c, p).
@@ -61,6 +62,7 @@ class Choice(NamedTuple):
     names: tuple[str, ...]
     errors: BlockErrors
     taken: Int[Array, ""]
+    supported: Bool[Array, " c"]
     parameters: tuple[str, ...]
     free: Bool[Array, "c p"]
     theta: Float[Array, "c p"]
@@ -88,33 +90,53 @@ class Auto(Method):
     plausible: Plausible = PLAUSIBLE
     uses_validation: ClassVar[bool] = False
     has_intervals: ClassVar[bool] = True
+    uses_motion: ClassVar[bool] = True
 
-    def solve(self, field, train: Trajectories, validation: Trajectories, settings: Settings) -> Solution:
-        check_determined(field, len(train))
+    def solve(self, field, train, validation, settings: Settings, learned_from: Trajectories | None = None) -> Solution:
+        """See `Method.solve`.
+
+        Args:
+            learned_from: windows that the source was trained on; without any, or if traced, nothing is refused.
+        """
+        jax.eval_shape(lambda: ravel_parameters(field)[0])  # refuses physics without parameters
         traced = any(map(checks.is_traced, jax.tree.leaves((field, train))))  # then the outer program has the options
         # Of the settings these alone matter; as an array, another scale asks for no other program.
-        scale = scale_of(settings.objective, train.x0.shape[-1])
-        return (Auto._solution if traced else _compiled)(self, field, train, settings.solver, scale)
+        scale, solver = scale_of(settings.objective, train.x0.shape[-1]), settings.solver
+        found = (errors_of if traced else _errors_of)(field, train, solver, scale)
+        expected = Unchanged(-jnp.ones(()), jnp.ones(()))  # supports everything
+        if learned_from is not None and not traced:
+            own = _errors_of(field, alike(learned_from, train), solver, scale)
+            expected = unchanged(field, train, found, own, learned_from)
+        return (Auto._solution if traced else _compiled)(self, field, train, solver, scale, found, expected)
 
-    def _solution(self, field, train: Trajectories, solver: Solver, scale: Scale) -> Solution:
+    def _solution(
+        self, field, train: Trajectories, solver: Solver, scale: Scale, found: Errors, expected: Unchanged
+    ) -> Solution:
         n, d = train.x0.shape
+        starts, noise = found.starts, found.noise
         larger = extended(field, d)
         fitted = free_parameters(larger)
         left = n - blocks_of(n, self.blocks)[0].shape[1]  # windows that fit a block's prediction
         fitted = {name: free for name, free in fitted.items() if name == "source" or free.sum() < left}
         free, sizes = np.stack([*fitted.values()]), np.array([each.sum() for each in fitted.values()])
-        starts, noise = smoothed(field, train, solver, scale)
         held = jnp.sqrt(noise) / self.plausible.sizes(larger, train)
         fits = fit_candidates(larger, train, free, solver, self.max_steps, scale, self.blocks, starts, held)
-        own = simplest(fits.errors.mse, sizes)
-        choice = Choice((*fitted,), fits.errors, own, (*named_parameters(larger),), jnp.asarray(free), fits.theta, None)
+        supported = expected.supports(fits.mse[0] - fits.mse, sizes).at[0].set(True)
+        own = taken_of(fits.errors, supported, sizes)
+        parameters = (*named_parameters(larger),)
+        choice = Choice((*fitted,), fits.errors, own, supported, parameters, jnp.asarray(free), fits.theta, None)
         if self.networks and has_network(larger):
-            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks, starts)
+            choice = _with_network(larger, choice, sizes, train, solver, scale, self.blocks, starts, expected)
         status = ended(fits.converged[own], fits.converged[own] | jnp.isfinite(fits.errors.mse[own]).all())
         return Solution(candidate(larger, choice, choice.taken), fits.steps[own], status, choice)
 
 
-_compiled = jit_with(FAST_COMPILE)(Auto._solution)
+_compiled, _errors_of = jit_with(FAST_COMPILE)(Auto._solution), jit_with(FAST_COMPILE)(errors_of)
+
+
+def taken_of(errors: BlockErrors, supported: Bool[Array, " c"], sizes: np.ndarray) -> Int[Array, ""]:
+    """The simplest candidate near the best, of those that are supported."""
+    return simplest(jnp.where(supported[:, None], errors.mse, jnp.inf), sizes)
 
 
 def candidate(larger: AbstractVectorField, choice: Choice, index: Int[Array, ""] | int) -> AbstractVectorField:
@@ -148,18 +170,20 @@ def has_network(field: AbstractVectorField) -> bool:
     )
 
 
-def _with_network(larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks, starts) -> Choice:
+def _with_network(
+    larger, choice: Choice, sizes: np.ndarray, windows, solver, scale, blocks, starts, expected: Unchanged
+) -> Choice:
     """The choice with two more candidates: the one taken so far with its output layer or its network changed."""
     adapted, parts = candidate(larger, choice, choice.taken), parts_of(larger)
     steps = fit_anchored(adapted, windows, np.stack([*parts.values()]), solver, scale, blocks=blocks, starts=starts)
     # Penalties are in the order of their strength, so that the first of several as good changes least.
     order = np.arange(steps.errors.mse.shape[1])
     best = jnp.stack([simplest(errors, order) for errors in steps.errors.mse])
-    taken = jax.tree.map(lambda leaf: leaf[np.arange(len(parts)), best], steps.errors)
-    errors = jax.tree.map(lambda *both: jnp.concatenate(both), choice.errors, taken)
+    steps = jax.tree.map(lambda leaf: leaf[np.arange(len(parts)), best], steps)
+    errors = jax.tree.map(lambda *both: jnp.concatenate(both), choice.errors, steps.errors)
+    supported = jnp.concatenate([choice.supported, expected.supports(steps.removed, steps.fitted)])
     sizes = np.concatenate([sizes, sizes.max() + 1 + np.arange(len(parts))])
-    changes = steps.changes[np.arange(len(parts)), best]
-    unchanged = jnp.zeros((len(choice.names), changes.shape[1]), changes.dtype)
+    zeros = jnp.zeros((len(choice.names), steps.changes.shape[1]), steps.changes.dtype)
 
     def repeated(values):
         return jnp.concatenate([values, jnp.broadcast_to(values[choice.taken], (len(parts), *values.shape[1:]))])
@@ -167,9 +191,10 @@ def _with_network(larger, choice: Choice, sizes: np.ndarray, windows, solver, sc
     return Choice(
         (*choice.names, *parts),
         errors,
-        simplest(errors.mse, sizes),
+        taken_of(errors, supported, sizes),
+        supported,
         choice.parameters,
         repeated(choice.free),
         repeated(choice.theta),
-        jnp.concatenate([unchanged, changes]),
+        jnp.concatenate([zeros, steps.changes]),
     )

@@ -48,12 +48,14 @@ class Fits(NamedTuple):
     Attributes:
         theta: the parameters of each candidate, in the order of `ravel_parameters` (c, p).
         errors: of each candidate on each block (c, b).
+        mse: of each candidate on all windows, over scale.
         steps: evaluations of the Jacobian of each fit.
         converged: whether each fit stopped before the most steps, at a finite error.
     """
 
     theta: Float[Array, "c p"]
     errors: BlockErrors
+    mse: Float[Array, " c"]
     steps: Int[Array, " c"]
     converged: Bool[Array, " c"]
 
@@ -100,7 +102,7 @@ def fit_candidates(
             return predict_block(at(theta), windows, starts, counted, solver, scale)
 
         errors = jax.lax.map(error, (without, *own, counted))
-        return theta, errors, found.steps, found.converged
+        return theta, errors, found.mse, found.steps, found.converged
 
     return Fits(*jax.lax.map(one, jnp.asarray(free)))
 

@@ -194,7 +194,7 @@ def trainable(field: Any) -> Any:
     """
 
     def fixed(node) -> bool:
-        return isinstance(node, RunningStats | AbstractInferenceOnly)
+        return isinstance(node, RunningStats | AbstractInferenceOnly | Trajectories)
 
     return jax.tree.map(lambda node: not fixed(node) and eqx.is_inexact_array(node), field, is_leaf=fixed)
 

@@ -17,13 +17,20 @@ from hybrid_jax import checks
 from hybrid_jax.dynamics.batching import AbstractBatchNorm, Moments, RunningStats, expand_trailing, record_moments
 from hybrid_jax.networks.activations import Activation
 from hybrid_jax.networks.normalised_layer import normalised_layer, row_means
+from hybrid_jax.trajectories import Trajectories
 
 UNROLLED_INPUTS = 2  # up to this many, W z is a sum: on a CPU, to call a matrix product costs more
 Channels = tuple[float, ...]
 
 
 class AbstractScaling(eqx.Module):
-    """What a network does to its input [x, u] and to its output. Training leaves it alone."""
+    """What a network does to its input [x, u] and to its output. Training leaves it alone.
+
+    Attributes:
+        learned_from: some of the windows that the network was trained on, see `standardise.with_motion`.
+    """
+
+    learned_from: Trajectories | None = eqx.field(default=None, kw_only=True)
 
     @abstractmethod
     def concatenate(self, x: Float[Array, " n *b"], u: Float[Array, " m *b"]) -> Float[Array, " n+m *b"]:

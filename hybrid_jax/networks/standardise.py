@@ -1,5 +1,8 @@
 """Set the scaling of networks from the training windows: inputs of mean 0 and deviation 1, outputs of the size of ẋ."""
 
+from dataclasses import replace
+from functools import partial
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -17,6 +20,7 @@ from hybrid_jax.networks.normalisation import AbstractScaling, Channels, Channel
 from hybrid_jax.trajectories import Trajectories
 
 SAMPLES, SMALL = 10_000, 64  # intervals that are looked at, at most, of a state of so many numbers; fewer of a larger
+KEPT, MOST = 50_000, 100  # numbers and windows of its motion that a network keeps, at most
 FLOOR = 0.01  # least scale of an input over the size of its mean, and of an output over the size of ẋ
 
 
@@ -39,6 +43,27 @@ class _Probe(AbstractBatchNorm, AbstractScaling):
 
     def outputs(self, y):
         return jnp.zeros_like(y) if self.seen is None else y
+
+
+def with_motion(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
+    """The field with some of the windows that it is trained on in the scaling of each network, for `hj.adapt`.
+
+    Args:
+        field: a field that contains networks; one without is returned as it is.
+        windows: those that the field is trained on.
+    """
+    places = np.linspace(0, len(windows) - 1, min(len(windows), max(1, KEPT // windows[0].x.size), MOST)).astype(int)
+    if not (networks := _networks(field)):
+        return field
+    kept = [jax.tree.map(partial(jnp.asarray, dtype=n.weight_in.dtype), windows[places]) for n in networks]
+    scalings = [replace(network.scaling, learned_from=own) for network, own in zip(networks, kept, strict=True)]
+    return eqx.tree_at(_all_scalings, field, scalings)
+
+
+def motion_of(field: AbstractVectorField) -> Trajectories | None:
+    """Some of the windows that a field was trained on, see `with_motion`; None if it does not hold any."""
+    scalings = (network.scaling for network in _networks(field))
+    return next((one.learned_from for one in scalings if one.learned_from is not None), None)
 
 
 def with_scaling(field: AbstractVectorField, windows: Trajectories) -> AbstractVectorField:
@@ -101,8 +126,16 @@ def _is_grid(node) -> bool:
 
 def _unset(field: AbstractVectorField) -> list[ResidualNetwork]:
     """The networks whose `ChannelScaling` is not set yet."""
+    return [network for network in _networks(field) if eqx.tree_equal(network.scaling, ChannelScaling())]
+
+
+def _all_scalings(field: AbstractVectorField) -> list[AbstractScaling]:
+    return [network.scaling for network in _networks(field)]
+
+
+def _networks(field: AbstractVectorField) -> list[ResidualNetwork]:
     nodes = jax.tree.leaves(field, is_leaf=lambda node: isinstance(node, ResidualNetwork))
-    return [n for n in nodes if isinstance(n, ResidualNetwork) and eqx.tree_equal(n.scaling, ChannelScaling())]
+    return [node for node in nodes if isinstance(node, ResidualNetwork)]
 
 
 def _scalings(field: AbstractVectorField) -> list[AbstractScaling]:

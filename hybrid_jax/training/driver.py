@@ -19,7 +19,7 @@ from hybrid_jax.dynamics.base import AbstractVectorField, check_windows, trainab
 from hybrid_jax.dynamics.composition import check_batch_norm
 from hybrid_jax.integrate import check_callable, checked
 from hybrid_jax.io.models import check_savable
-from hybrid_jax.networks.standardise import with_scaling
+from hybrid_jax.networks.standardise import with_motion, with_scaling
 from hybrid_jax.runtime import FAST_COMPILE, entry, jit_with
 from hybrid_jax.status import Status
 from hybrid_jax.training import fitting
@@ -185,10 +185,10 @@ def _check_field(field: Learner, data: dict[str, Trajectories], settings: Settin
 
 
 def ready(field: Learner, train: Trajectories) -> Learner:
-    """The field with its scaling set. Warns if a file of it could not be loaded without more information."""
+    """The field with its scaling and its motion set. Warns if a file of it could not be loaded without more."""
     if (reason := check_savable(field)) is not None:
         warnings.warn(reason, stacklevel=4)
-    return with_scaling(field, train) if isinstance(field, AbstractVectorField) else field
+    return with_motion(with_scaling(field, train), train) if isinstance(field, AbstractVectorField) else field
 
 
 def drive(state: FitState, plan: RunConfig, data: PyTree, shared: Shared, progress: Report | bool | None) -> FitResult:

@@ -248,7 +248,11 @@ def test_a_method_that_makes_no_sense_is_refused(method, options, said):
         (Nothing(), {}, "field: its physics, Nothing, has no parameter to fit"),
         (Nothing(), {"method": "fine_tune"}, "field: Nothing has nothing to train"),
         (Weights(jnp.zeros(60)), {}, "field: Weights has 60 parameters, no named physics to fit; use"),
-        (Weights(jnp.zeros(45)), {}, "windows: 40 are too few for the 45 parameters of Weights, at least 46"),
+        (
+            Weights(jnp.zeros(45)),
+            {"method": "least_squares"},
+            "windows: 40 are too few for the 45 parameters of Weights, at least 46",
+        ),
         (hj.rigid_body(hj.IRIS), {}, "field: RigidBody does not take a state"),
     ],
 )

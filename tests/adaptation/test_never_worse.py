@@ -1,9 +1,11 @@
 """Seconds that excite nothing, after which nothing changed, must not make a model worse on flight that moves."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import hybrid_jax as hj
+from hybrid_jax.dynamics.disturbance import disturbed
 from hybrid_jax.dynamics.terms import Terms
 
 DRAG = np.array([0.4, 0.3, 0.1])
@@ -14,7 +16,7 @@ def body(drag):
     return hj.rigid_body(hj.IRIS, terms=Terms(drag=tuple((drag * DRAG).tolist())))
 
 
-def flown(seed, size, noise=1.0, count=100, steps=10):
+def flown(seed, size, noise=1.0, count=100, steps=10, force=None):
     """Windows of hover, of a `size` from 0 to 1, about 1 m/s; every measured state has its own noise."""
     rng = np.random.default_rng(seed)
     x0 = np.zeros((count, 13))
@@ -24,7 +26,8 @@ def flown(seed, size, noise=1.0, count=100, steps=10):
     x0[:, 7:10], x0[:, 10:13] = 2 * size * rng.normal(size=(count, 3)), 1.2 * size * rng.normal(size=(count, 3))
     shakes = 0.12 * rng.normal(size=(count, 1, 4)) + 0.05 * rng.normal(size=(count, steps, 4))
     u = (hj.IRIS.hover_speed * (1 + size * shakes)).astype(np.float32)
-    x = np.asarray(hj.rollout_batch(body(1.0), x0.astype(np.float32), u, 0.01))
+    truth = body(1.0) if force is None else disturbed(body(1.0), jnp.array([force, *[0.0] * 5]))
+    x = np.asarray(hj.rollout_batch(truth, x0.astype(np.float32), u, 0.01))
     x0, x = (a + noise * NOISE * rng.normal(size=a.shape) for a in (x0, x))
     for states in (x0, x):
         states[..., 3:7] /= np.linalg.norm(states[..., 3:7], axis=-1, keepdims=True)
@@ -48,6 +51,15 @@ def test_hover_still_or_lively_and_slow_flight_with_more_noise_make_no_model_wor
     found = ratios([(0.003,), (0.01,), (0.03,), (0.1,), (0.01, 3.0), (0.1, 3.0)])
     assert found.mean() <= 1.05
     assert found.max() <= 1.2
+
+
+@pytest.mark.parametrize(("force", "taken"), [(0.05, False), (1.0, True)])
+def test_hover_changes_what_the_source_does_not_err_on_its_own_motion(force, taken):
+    hover, moving = flown(0, 0.003, 0.3, force=force), flown(98, 1.0)
+    found = hj.adapt(body(0.5), hover, learned_from=moving)
+    assert "force" in found.refused or taken
+    assert (found.chosen == "source") != taken
+    assert "hj.excitation plans a flight" in found.report()
 
 
 @pytest.mark.slow

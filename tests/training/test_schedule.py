@@ -12,7 +12,7 @@ from pendulum import DAMPING, LENGTH, pendulum, swings
 from hybrid_jax import Hybrid, Settings, residual_network
 from hybrid_jax.metrics import rollout_mse
 from hybrid_jax.networks.mlp import zero_output
-from hybrid_jax.networks.standardise import with_scaling
+from hybrid_jax.networks.standardise import with_motion, with_scaling
 from hybrid_jax.training.fitting import make_run_config
 from hybrid_jax.training.stages import Stage, cut, fit_in_stages, rates_by_group
 
@@ -23,7 +23,7 @@ SETTINGS = Settings(batch_size=20)
 @cache
 def hybrid():
     network = zero_output(residual_network(2, 1, jax.random.key(1), hidden=8, norm="none"))
-    return with_scaling(Hybrid(pendulum(0.6), network), TRAIN)
+    return with_motion(with_scaling(Hybrid(pendulum(0.6), network), TRAIN), TRAIN)
 
 
 def trained(stages, field=None, train=TRAIN, **options):
